@@ -1,4 +1,1 @@
-"""Calibration: from recordings to simulator parameters with intervals, and to what the data cannot tell.
-
-Methods are found by name in their registry and know robots only by what the core defines.
-"""
+"""Calibration: simulator parameters from recordings, their intervals, and what the data do not show."""

@@ -1,4 +1,4 @@
-"""The table of calibration methods: a name, and the function that makes the method. Imported on use."""
+"""The table of calibration methods: name and factory, imported on use."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ METHODS: dict[str, str] = {
     "midpoint-linear": "deal_hw.calib.baselines.simple:LinearMidpoint",
     "nominal": "deal_hw.calib.baselines.simple:Nominal",
 }
-"""Name -> ``module:callable`` without arguments. ``default`` is the search that won on the tuning seeds."""
+"""Name -> ``module:callable`` without arguments. ``default`` did best on the tuning seeds."""
 
 NO_DATA_METHODS = frozenset({"midpoint", "midpoint-linear", "nominal", "deal-paper-flat"})
-"""Rows that must not read the data, so they are never refined."""
+"""Baselines that must not read the data. They are never refined."""
 
 CLOSED_LOOP_METHODS = frozenset(
     {"deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "easi", "easi-log", "bo-critic"}
@@ -50,24 +50,20 @@ CLOSED_LOOP_METHODS = frozenset(
 """Methods that run the recordings' policy in every simulator."""
 
 PAPER_POPULATION = 200
-"""Simulators of the DEAL paper's Table 4."""
+"""Number of simulators in the DEAL paper's Table 4."""
 
 WHOLE_METHODS = frozenset({"output-error", "local", "gait", "mujoco-sysid"})
-"""Methods that decide themselves what follows their search, or stand for somebody else: never refined."""
+"""Methods with their own refinement, or that represent another tool. They are never refined."""
 
 
 def check_method(name: str) -> None:
-    """Raise where there is no such method.
-
-    Raises:
-        UnknownNameError: The name is not in the table; the message lists the table.
-    """
+    """Raise `UnknownNameError`, which lists the table, where there is no such method."""
     if name not in METHODS:
         raise UnknownNameError("calibration method", name, METHODS)
 
 
 def usual_population(name: str) -> int:
-    """Return how many members a method has where nobody says."""
+    """Return a method's default population."""
     paper = name in CLOSED_LOOP_METHODS or name.startswith("deal-paper")
     return PAPER_POPULATION if paper else Budget().population
 
@@ -75,21 +71,13 @@ def usual_population(name: str) -> int:
 def usual_budget(
     name: str, population: int | None = None, generations: int | None = None, *, refine: bool = True
 ) -> Budget:
-    """Return a method's budget; what is not given is what the method usually has."""
+    """Return a method's budget; a population or a number of generations of None means its default."""
     members = population or usual_population(name)
     return Budget(population=members, generations=generations or Budget().generations, refine=refine)
 
 
 def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem]:
-    """Return a new method.
-
-    Args:
-        name: A name in `METHODS`.
-        refine: Refine what the search finds; no-data baselines and whole methods stay what they are.
-
-    Raises:
-        UnknownNameError: The name is not in the table.
-    """
+    """Return a new method; see `check_method`. ``refine`` has no effect on baselines and whole methods."""
     check_method(name)
     module, _, attribute = METHODS[name].partition(":")
     search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
@@ -98,5 +86,5 @@ def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem
     from deal_hw.calib.pipeline import CalibrationPipeline
     from deal_hw.calib.validation.verdict import Validation
 
-    # Who names a search wants it run, also where the model's own values could be refined without one.
+    # A user who names a search wants it to run, even where refining the nominal values would be enough.
     return CalibrationPipeline(search, name, Validation(local_first=name == "default"))

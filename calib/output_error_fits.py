@@ -1,16 +1,16 @@
-"""Output-error fits for recordings of a real robot, which no simulator explains to the noise.
+"""Output-error fits for recordings of a real robot, which no simulator explains down to the noise.
 
-Three questions have no answer there that holds for every robot: how far a prediction may be off, whether a
-search that stops early or a fit that goes on predicts other motion better, and over which window to fit. So
+The right residual scale, the right window length, and whether to stop early differ between robots. So:
 
-1. a fit from the model's own values over short windows says what residuals to expect;
-2. the search is run with these;
-3. by cross-validation on the recordings that are fitted, motion by motion, the search's estimate, fits over
-   short and long windows (robust or not, with a latency or none, held to the model's own values or hardly)
-   and the mean of fits over all window lengths predict what they have not seen;
-4. what predicts best is fitted to all, two halves of the data are compared, and what goes with what is said.
+1. A fit over short windows from the nominal values measures the size of the residuals.
+2. The search runs with this residual scale.
+3. Cross-validation over the motions compares candidates by their prediction of unseen data. Candidates are
+   the search's estimate, fits over short and long windows, and the mean of the fits over all window lengths.
+   Fits differ in the loss (robust or not), in the latency (free or none) and in the prior width.
+4. The best candidate is fitted to all data. Two halves of the data are compared, and confounded parameters
+   are listed.
 
-Recordings that are held out take no part in any of this.
+Held-out recordings take no part in any of this.
 """
 
 from __future__ import annotations
@@ -59,25 +59,25 @@ class OutputErrorSettings:
     """Settings of :class:`OutputErrorFits`.
 
     Attributes:
-        windows_s: Windows of the fits, one from where the one before ended [s]. What the model lacks pulls
-            each window's fit elsewhere; their mean may be nearer than any of them.
-        priors: How far the model's own values hold, as a share of the range: as far as the range itself, or
-            hardly. By what a candidate's name ends with.
-        search_s: The search is to find the neighbourhood: so much of the recordings, evenly spread, says
-            where it is [s].
-        stretch_s: Recordings are divided into stretches of this length for it [s].
-        folds: Motions are left out in so many turns, a single motion third by third.
-        compared_s: Starts are compared in windows of this length: even a far one does not diverge [s].
+        windows_s: Windows of the fits [s]; each fit starts where the one before ended. Model error biases
+            each window length differently; the mean may be better than any of them.
+        priors: Width of the prior around the nominal values, as a share of the range, by the suffix of a
+            candidate's name.
+        search_s: Length of data for the search, spread evenly over the recordings [s]. The search only has to
+            find the neighbourhood.
+        stretch_s: Recordings are divided into stretches of this length for the search [s].
+        folds: Number of folds over the motions; a single motion is split in time.
+        compared_s: Window in which start points are compared [s]; short, so that poor ones do not diverge.
         half_iterations: Most steps of the fit of each half.
-        mismatch_s: Windows in which the model is held against the sensors' noise: start states are fitted, so
-            even a residual that needs longer to build up shows as far as it matters to a controller [s]. 0:
-            the fit's own residual, from smoothed start states.
-        first: The fit from the model's own values that says what residuals to expect.
+        mismatch_s: Windows with fitted start states in which the residual is compared with the sensors' noise
+            [s]. Errors that build up more slowly do not matter to a controller. 0: the fit's own residual,
+            from smoothed start states.
+        first: The fit from the nominal values that measures the residuals.
         robust: Large residuals weigh less (Huber) in all fits.
-        fitted_s: So much of the recordings, evenly spread in stretches, is fitted [s]; infinite for all.
-        hold_first: Intervals hold the first fit's estimate, too, and the covariance its distance: what the
-            model lacks pulls each length of windows elsewhere.
-        force_std: All forces may be off together by this share: no motion on feet tells them from the mass,
+        fitted_s: Length of data that is fitted, spread evenly in stretches [s]; infinite for all.
+        hold_first: Intervals include the first fit's estimate, and the covariance its distance, because model
+            error biases each window length differently.
+        force_std: Common relative error of all forces [-]. No motion on feet separates it from the mass,
             which is known by other means.
     """
 
@@ -102,38 +102,34 @@ class OutputErrorSettings:
 
     @property
     def variants(self) -> Mapping[str, Recipe]:
-        """Fits over the longest window in other ways, by name."""
+        """Other fits over the longest window, by name."""
         return {
             "long, robust": Recipe(seconds=self.long_s, robust=True),
             "long, no latency": Recipe(seconds=self.long_s, latency=False),
         }
 
     def recipe(self, name: str) -> Recipe:
-        """Return how a candidate's residuals are weighed, for intervals and the split-half check."""
+        """Return the residual weights of a candidate, for intervals and the split-half check."""
         prior_std = self.priors[self.prior_of(name)]
         long = Recipe(seconds=self.long_s, prior_std=prior_std, robust=self.robust)
         return self.variants.get(name, long)
 
     def prior_of(self, name: str) -> str:
-        """Return which of the priors a candidate's name ends with."""
+        """Return the key of the prior in a candidate's name."""
         return next((words for words in self.priors if words and name.endswith(words)), "")
 
 
 @dataclass(frozen=True)
 class OutputErrorFits(Fits):
-    """Searches, fits predictions, and takes what cross-validation says predicts best.
-
-    Attributes:
-        settings: How.
-    """
+    """A search, candidate fits, and the choice of the best predictor by cross-validation."""
 
     settings: OutputErrorSettings = field(default_factory=OutputErrorSettings)
 
     def best(self, run: CalibrationRun) -> FitOutcome:
-        """Search, fit all candidates, take the one that predicts best. See :meth:`Fits.best`."""
+        """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
         settings, problem = self.settings, run.problem
         if run.settings.cross_validation:
-            problem = _whole(problem)
+            problem = _joined_stretches(problem)
         if np.isfinite(settings.fitted_s):
             parts = [p for e in problem.episodes for p in stretches(e, settings.stretch_s) if p.usable.any()]
             problem = problem.on(spread(parts, settings.fitted_s), problem.known_std)
@@ -141,7 +137,7 @@ class OutputErrorFits(Fits):
         first = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
         run.offer("search", searched)
-        # Drawn after the search, so that a resumed run draws the same.
+        # Drawn after the search, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
         choice = Choice("long", {}, settings.long_s, note="without folds")
         if run.settings.cross_validation:
@@ -150,18 +146,18 @@ class OutputErrorFits(Fits):
         members = self._members(run, problem, _member(first), searched, choice.chosen)
         theta, latency_s = members[choice.chosen]
         recipe = settings.recipe(choice.chosen)
-        told = dataclasses.replace(recipe, latency=True)
-        fit = fit_output_error(problem, theta, latency_s, told, iterations=0, central=True)
+        with_latency = dataclasses.replace(recipe, latency=True)
+        fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
         known = _known(problem, fit)
         split = self._split_half(problem, fit, recipe, known)
         known = widened_by_split_half(problem, known, theta, split)
         if settings.hold_first:
-            known = _holding(problem, known, theta, first.theta)
+            known = _including(problem, known, theta, first.theta)
         if settings.force_std:
             known = _scaled_together(problem, known, theta, settings.force_std)
         facts: dict[str, Any] = {}
         if run.local is not None:
-            # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
+            # With fitted start states the residual shows model error, not smoothing error.
             local = with_rows(run.local)
             known, facts["physics_step"] = with_step(run.problem, local, known, theta)
         chi2, left = float(np.mean((fit.scale / problem.noise.position_std) ** 2)), None
@@ -169,7 +165,7 @@ class OutputErrorFits(Fits):
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
             chi2 = left.normal.cost / max(left.normal.count, 1)
         if run.local is not None and left is not None:
-            # Where the local fit lost its way it has seen a part of the recordings alone.
+            # A local fit that diverged has seen only a part of the recordings.
             lost = run.local.chi2 >= REFINEMENT.local_hopeless
             judged = (problem, with_rows(left)) if lost else (run.problem, local)
             if unexplained(judged[1]):
@@ -187,7 +183,7 @@ class OutputErrorFits(Fits):
                 problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
             ],
             "split_half": split.to_json(),
-            "confounded": [pair.to_json() for pair in found],
+            "confounded": [dataclasses.asdict(pair) for pair in found],
         }
         known = dataclasses.replace(
             known,
@@ -199,7 +195,7 @@ class OutputErrorFits(Fits):
         )
 
     def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
-        """Return the search's problem: part of the recordings, and residuals as large as a first fit's."""
+        """Return the search's problem: part of the recordings, and the first fit's residuals as scale."""
         parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
         std = problem.known_std
         if std is None:
@@ -208,7 +204,7 @@ class OutputErrorFits(Fits):
         return problem.on(spread([p for p in parts if p.usable.any()], self.settings.search_s), std)
 
     def _choose(self, run: CalibrationRun, problem: Problem, seed: int) -> Choice:
-        """Fit every candidate to the data without each fold and compare what they predict of it."""
+        """Fit every candidate without each fold and compare the predictions of that fold."""
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = (
@@ -218,7 +214,7 @@ class OutputErrorFits(Fits):
         )
 
         def fits(train: Problem, fold: int) -> dict[str, Member]:
-            question = f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?"
+            question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"
             run.say("cross-validation", question)
             first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, settings.first)
             rng = np.random.default_rng([seed, fold])
@@ -240,15 +236,7 @@ class OutputErrorFits(Fits):
         searched: CalibrationResult,
         only: str | None = None,
     ) -> dict[str, Member]:
-        """Return what each candidate makes of a problem.
-
-        Args:
-            run: The calibration.
-            problem: All data, or those of a fold.
-            short: The fit over short windows.
-            searched: The search's result.
-            only: Name of the one candidate that is wanted; None for all.
-        """
+        """Return every candidate's estimate, or ``only`` one; ``short`` is the fit over short windows."""
         settings = self.settings
         windows_s = settings.windows_s if run.settings.cross_validation else (settings.long_s,)
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
@@ -275,7 +263,7 @@ class OutputErrorFits(Fits):
     def _split_half(
         self, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
     ) -> SplitHalf:
-        """Fit two halves of the recordings, motion by motion, from the whole's estimate and compare."""
+        """Fit two halves of the motions from the estimate on all data, and compare."""
         space, before = problem.space, problem.steps
         estimates, halves = [], []
         for mask in fold_masks(problem, 2):
@@ -308,17 +296,16 @@ class OutputErrorFits(Fits):
 def output_error_method(search: CalibrationMethod[Problem] | None = None) -> CalibrationPipeline:
     """Return `output-error`: output-error fits by cross-validation, after the local fit and a search.
 
-    Args:
-        search: The search; `eki` by default.
+    The default search is `eki`.
     """
     return CalibrationPipeline(search or Eki(), "output-error", fits=OutputErrorFits())
 
 
 def local() -> CalibrationPipeline:
-    """Return `local`: the fits over short and then long windows alone, from the model's own values.
+    """Return `local`: only the fits over short and then long windows, from the nominal values.
 
-    For a robot whose model is near (within a factor two or so) and in which motion is damped: it costs a
-    twentieth of a search. What its residual does not explain it says like `output-error`.
+    It suits a robust, damped motion and a model within a factor of about two. It costs a twentieth of a
+    search.
     """
     return CalibrationPipeline(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
 
@@ -335,24 +322,23 @@ GAIT = OutputErrorSettings(
     hold_first=True,
     force_std=0.05,
 )
-"""Half a step of the gait, and a quarter: shorter windows are ruled by the errors of their start states, in
-longer ones most feet land or slide. A robot that weighs itself by its motors' efforts is taken to be right to
-5 %."""
+"""Half a step of the gait, and a quarter. In shorter windows, errors of the start states dominate. In longer
+ones most feet land or slide. Mass from the motors' efforts is assumed right to 5 %."""
 FORCES = ("servo_stiffness", "servo_damping", "dof_frictionloss")
 """Kinds of parameters that scale with all forces."""
 
 
 def gait() -> CalibrationPipeline:
-    """Return `gait`: short, robust fits of a robot that walks, from the model's own values.
+    """Return `gait`: short, robust fits of a walking robot, from the nominal values.
 
-    Smoothed start states, and none that are fitted: each landing of a foot would be explained by them.
+    Start states are smoothed, not fitted: fitted ones would explain each landing of a foot.
     """
     settings = Validation(local_first=False, cross_validation=False)
     return CalibrationPipeline(Nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
 
 def _scaled_together(problem: Problem, known: Uncertainty, theta: FloatArray, std: float) -> Uncertainty:
-    """Return what is known where all forces may be off together by a share, one standard deviation."""
+    """Add a common relative error of all forces, ``std``, to what is known."""
     space = problem.space
     factor = np.array([1.0 + std * (p.kind in FORCES) for p in space])
     moved = space.to_scale(theta * factor)
@@ -365,8 +351,8 @@ def _scaled_together(problem: Problem, known: Uncertainty, theta: FloatArray, st
     return dataclasses.replace(known, interval=interval, covariance=covariance)
 
 
-def _holding(problem: Problem, known: Uncertainty, theta: FloatArray, other: FloatArray) -> Uncertainty:
-    """Return what is known, with another estimate, (K,), inside of the intervals."""
+def _including(problem: Problem, known: Uncertainty, theta: FloatArray, other: FloatArray) -> Uncertainty:
+    """Widen intervals and covariance to include another estimate, (K,)."""
     apart = problem.space.to_scale(other) - problem.space.to_scale(theta)
     low, high = known.interval.T
     covariance = known.covariance.copy()
@@ -375,16 +361,15 @@ def _holding(problem: Problem, known: Uncertainty, theta: FloatArray, other: Flo
     return dataclasses.replace(known, interval=interval, covariance=covariance)
 
 
-def _whole(problem: Problem) -> Problem:
-    """Return the problem with stretches that follow each other in one piece, so that long windows fit."""
+def _joined_stretches(problem: Problem) -> Problem:
+    """Return the problem with consecutive stretches joined, so that long windows fit."""
     episodes = joined(problem.episodes)
     return problem.on(episodes, problem.known_std) if len(episodes) < len(problem.episodes) else problem
 
 
 def _error(problem: Problem, rmse: FloatArray) -> float:
-    """Return the mean error of channels, (M,); the geometric one where their units differ."""
-    C, units = problem.coordinates, problem.robot.coordinate_units
-    if len({units[c % C] + "/s" * int(c >= C) for c in problem.channels}) == 1:
+    """Return the mean error of the channels, (M,); the geometric mean where units differ."""
+    if len(set(problem.channel_units)) == 1:
         return float(np.mean(rmse))
     return float(np.exp(np.mean(np.log(rmse))))
 
@@ -394,7 +379,7 @@ def _member(fit: OutputErrorFit) -> Member:
 
 
 def _mean(problem: Problem, members: Sequence[Member]) -> Member:
-    """Return the mean of estimates, parameters in their own scale."""
+    """Return the mean estimate, with each parameter in its own scale."""
     scaled = [problem.space.to_scale(theta) for theta, _ in members]
     theta = problem.space.from_scale(np.mean(scaled, axis=0))
     return theta, float(np.mean([latency_s for _, latency_s in members]))

@@ -1,9 +1,9 @@
-"""The whole calibration: checks, a local fit, a search where that is not the answer, uncertainty, validation.
+"""The whole calibration: checks, a local fit, a search where that is not enough, uncertainty, validation.
 
-Simulated or real, fixed or floating base: the same :class:`CalibrationPipeline`. How it goes on where the
-local fit does not explain the recordings is a strategy, :class:`Fits`. :class:`Refinement` searches and
-refines down to the sensors' noise; :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits predictions
-of a robot that no model explains.
+:class:`CalibrationPipeline` is the same for simulated and real robots, with a fixed or a floating base. A
+:class:`Fits` strategy continues where the local fit does not explain the recordings. :class:`Refinement`
+searches and refines down to the sensors' noise. :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits
+predictions of a robot that no model explains.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RestartSettings:
-    """When a search is run again from other draws.
+    """When to repeat a search from other random draws.
 
     Attributes:
         restarts: Most searches after the first.
-        same: Two searches whose unexplained chi2 differ by a smaller share say that the model is wrong, not
-            the search.
-        fewest_generations: With fewer left in the budget another search would not get anywhere.
-        explained: Searched no more once chi2 is below this: noise explains the recordings.
+        same: Relative difference of chi2 below which two searches agree. Then the model is wrong, not the
+            search.
+        fewest_generations: Fewest generations left in the budget for another search.
+        explained: Chi2 below which noise explains the recordings, and no search follows.
     """
 
     restarts: int = 2
@@ -65,15 +65,15 @@ class RestartSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitOutcome:
-    """What a way of fitting ended with.
+    """Result of a fitting strategy.
 
     Attributes:
-        searched: What the search found, or what stands for it.
+        searched: Result of the search, or its substitute.
         theta: The estimate, (K,).
         latency_s: Its latency [s].
-        chi2: Mean squared residual over the noise's.
-        known: What is known there.
-        facts: What else the provenance says: plain JSON values.
+        chi2: Mean squared residual over the noise variance.
+        known: Uncertainty of the estimate.
+        facts: More entries for the provenance: plain JSON values.
     """
 
     searched: CalibrationResult
@@ -86,17 +86,17 @@ class FitOutcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationRun:
-    """What the stages of one calibration work with.
+    """State shared by the stages of one calibration.
 
     Attributes:
         problem: Recordings and simulator.
-        budget: What the searches may use.
+        budget: Limits of the searches.
         rng: The only source of randomness.
         search: The search.
-        attempts: Runs it on all recordings, and keeps what it found.
-        settings: Which checks.
-        local: The local fit, where there is one.
-        progress: Called now and then.
+        attempts: Runs the search on all recordings and stores its results.
+        settings: Which checks to run.
+        local: The local fit, if there is one.
+        progress: Receives progress reports.
     """
 
     problem: Problem
@@ -109,12 +109,12 @@ class CalibrationRun:
     progress: ProgressCallback | None = None
 
     def say(self, stage: str, message: str) -> None:
-        """Report what is being done."""
+        """Report the stage that begins."""
         if self.progress is not None:
             self.progress(Progress(stage, 0, 1, message))
 
     def offer(self, stage: str, found: Refined | CalibrationResult) -> None:
-        """Report what could be the answer, and the stage that found it."""
+        """Report a candidate estimate and the stage that found it."""
         theta = found.theta if isinstance(found, Refined) else found.estimate
         if self.progress is not None:
             self.progress(
@@ -131,11 +131,11 @@ class CalibrationRun:
 
 
 class Fits(abc.ABC):
-    """A way to go on where the local fit is not the answer: searches, candidate fits, and the choice."""
+    """Strategy where the local fit is not enough: searches, candidate fits, and the choice among them."""
 
     @abc.abstractmethod
     def best(self, run: CalibrationRun) -> FitOutcome:
-        """Search, fit, choose, and say what is known."""
+        """Search, fit, choose, and estimate the uncertainty."""
 
 
 DIVERGED = (
@@ -145,13 +145,13 @@ DIVERGED = (
 
 
 class CalibrationPipeline(CalibrationMethod[Problem]):
-    """A calibration in stages, ordered by what they cost.
+    """A calibration in stages; cheap stages come first.
 
     Args:
         search: The search.
-        name: Name of the whole; the search's by default.
-        settings: What is checked, and whether the local fit comes first.
-        fits: How to go on where the local fit is not the answer; :class:`Refinement` by default.
+        name: Name of the method; the search's by default.
+        settings: Which checks to run, and whether the local fit comes first.
+        fits: What follows where the local fit is not enough; :class:`Refinement` by default.
     """
 
     def __init__(
@@ -176,8 +176,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
     ) -> CalibrationResult:
         """Calibrate. See :meth:`CalibrationMethod.run`.
 
-        A resumed run takes finished searches from the checkpoint; the rest is done again, to the same
-        numbers.
+        A resumed run reads finished searches from the checkpoint. It repeats the rest with the same result.
         """
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
@@ -194,16 +193,16 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         local = local_fit(problem, partial(run.offer, "local fit")) if self.settings.local_first else None
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
-        # What another minimum leaves can be as small as noise, but it has a pattern.
+        # Another minimum can leave a residual as small as noise, but with a pattern.
         if local is not None and conclusive(problem, local, MISMATCH.white_samples):
-            found = to_the_noise(run, without_search(problem, budget, local), local)
+            found = conclude_fit(run, without_search(problem, budget, local), local)
         else:
             if local is not None and progress is not None:
                 local = with_rows(local)
-                foretell(problem, local, progress)
+                report_unidentifiable(problem, local, progress)
             found = with_shared_error(self.fits, dataclasses.replace(run, local=local))
         searched, known = found.searched, found.known
-        # What the search says of its own interval does not hold for these.
+        # The search's own interval does not hold for the refined estimate.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
             "search": searched.method,
             "search_seconds": searched.seconds,
@@ -231,19 +230,17 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
 
 @dataclass(frozen=True)
 class Refinement(Fits):
-    """A search and its refinement; searched again from other draws while the residual is unexplained.
+    """A search and its refinement, repeated from other draws while the residual is unexplained.
 
-    The first search is brief: a few generations find the basin, and the refinement its bottom with fewer
-    simulations. The next ones go to their end, but for a free base: long windows of contacts say little.
-
-    Attributes:
-        restarts: When.
+    The first search is short: a few generations find the basin, and the refinement finds its minimum with
+    fewer simulations. Later searches use the whole budget, except for a floating base: there, long windows
+    with contacts carry little information.
     """
 
     restarts: RestartSettings = field(default_factory=RestartSettings)
 
     def best(self, run: CalibrationRun) -> FitOutcome:
-        """Search, refine, let cross-validation say whether the refinement helps. See :meth:`Fits.best`."""
+        """Search, refine, and let cross-validation decide about the refinement. See :meth:`Fits.best`."""
         settings, left, floating = self.restarts, run.budget.generations, run.problem.robot.base is not None
         best: tuple[CalibrationResult, Refined] | None = None
         attempt = 0
@@ -257,10 +254,9 @@ class Refinement(Fits):
             if best is None or self._better(refined, best[1]):
                 best = (searched, refined)
             elif attempt == 1:
-                # Cross-validation compares the refinement with a search that went to its end.
+                # Cross-validation compares the refinement with a search that used its whole budget.
                 best = (searched, best[1])
-            # Two searches that end at the same unexplained residual say that the model is wrong, not the
-            # search.
+            # Two searches with the same unexplained residual: the model is wrong, not the search.
             same = abs(refined.chi2 - previous) < settings.same * previous
             if best[1].chi2 < settings.explained or same or left < settings.fewest_generations:
                 break
@@ -268,13 +264,13 @@ class Refinement(Fits):
             raise RuntimeError("unreachable: at least one search is run")
         local, refined = run.local, best[1]
         if local is not None and local.chi2 < refined.chi2:
-            # Short windows are easier to explain.
+            # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
                 best = (best[0], local)
-        return to_the_noise(run, *best, self._choose(run, *best), attempt)
+        return conclude_fit(run, *best, self._choose(run, *best), attempt)
 
     def _better(self, a: Refined, b: Refined) -> bool:
-        """Say whether ``a`` explains more: a longer window only counts where both are explained."""
+        """Return whether ``a`` is the better fit; window length counts only where both are explained."""
         if (
             all(fit.chi2 < self.restarts.explained for fit in (a, b))
             and a.shooting.length != b.shooting.length
@@ -283,36 +279,31 @@ class Refinement(Fits):
         return a.chi2 < b.chi2
 
     def _choose(self, run: CalibrationRun, searched: CalibrationResult, refined: Refined) -> Choice | None:
-        """Return what cross-validation says of the refinement; None where it explains all but the noise."""
-        # A fold is a search and a refinement; with contacts these take a minute each.
+        """Return the choice of cross-validation; None where the fit explains all but the noise."""
+        # A fold is a search and a refinement. With contacts these take a minute each.
         floating = run.problem.robot.base is not None
         if not run.settings.cross_validation or floating or conclusive(run.problem, refined):
             return None
-        run.say("cross-validation", "does the refinement help on what it has not seen?")
+        run.say("cross-validation", "does the refinement predict unseen data better?")
         robust = run.settings.robust and kurtosis(refined.normal.residual) > ROBUST.heavy_tails
-        # Drawn after all searches, so that a resumed run draws the same.
+        # Drawn after all searches, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
-        # A fold needs no more generations than the whole did.
+        # A fold needs no more generations than the search on all data.
         generations = max(len(searched.trace), self.restarts.fewest_generations)
         less = dataclasses.replace(run.budget, generations=generations)
         return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
 
 
-def to_the_noise(
+def conclude_fit(
     run: CalibrationRun,
     searched: CalibrationResult,
     refined: Refined,
     choice: Choice | None = None,
     restarts: int = 0,
 ) -> FitOutcome:
-    """Scan the latency, say what is known, check it.
+    """Scan the latency, estimate the uncertainty, and check the result.
 
-    Args:
-        run: The calibration.
-        searched: What the search found, or what stands for it.
-        refined: Where the refinement ended.
-        choice: What cross-validation said.
-        restarts: Searches after the first.
+    ``searched`` is the search's result or its substitute, ``choice`` that of cross-validation, if it ran.
     """
     problem = run.problem
     scan = None
@@ -359,13 +350,9 @@ def to_the_noise(
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
-    """Return what a way of fitting ends with, and whether commands and measurements share an error.
+    """Return a strategy's result, with an alarm if commands and measurements share an error.
 
-    It is said before the search, and again where the search's end predicts no better.
-
-    Args:
-        fits: The way.
-        run: The calibration, with its local fit.
+    The alarm is reported before the search. It stays in the result if the search predicts no better.
     """
     problem, local = run.problem, run.local
     suspect = None
@@ -381,15 +368,12 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     return dataclasses.replace(found, known=known, facts={**found.facts, "shared_error": suspect.to_json()})
 
 
-def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> None:
-    """Say before the search what the recordings cannot tell, by their Fisher information at the local fit.
+def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:
+    """Report before the search which parameters the recordings do not show (Fisher information at ``local``).
 
-    Args:
-        problem: Recordings and simulator.
-        local: The local fit, with linearised residuals.
-        progress: Who is told.
+    The local fit has linearised residuals.
     """
-    # What the model does not explain says nothing of what the motion shows: noise alone counts.
+    # Model error does not reduce the information in the motion: only noise counts.
     noise_only = dataclasses.replace(local, chi2=1.0)
     known = uncertainty_at(problem, noise_only, fixed_latency=problem.fixed_latency_s is not None)
     blind = [n for n, v in zip(problem.space.names, known.verdicts, strict=True) if v == "not identifiable"]
@@ -401,21 +385,17 @@ def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> No
 
 
 def conclusive(problem: Problem, fit: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
-    """Return whether a fit needs no other judge: what it leaves has the size of the sensors' noise.
+    """Return whether noise explains the residual of a fit, so that no other check is needed.
 
-    A residual that was chosen explains itself: only what no fit has seen can judge then.
-
-    Args:
-        problem: Recordings and simulator.
-        fit: The fit.
-        longest: Autocorrelation time up to which its residual passes for noise [samples].
+    A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the
+    longest autocorrelation time of a residual that counts as noise [samples].
     """
     chosen = problem.known_std is not None and problem.robot.base is None
     return not chosen and not unexplained(fit, longest)
 
 
 def without_search(problem: Problem, budget: Budget, local: Refined) -> CalibrationResult:
-    """Return what stands for a search's result where none was needed."""
+    """Return the local fit in place of a search's result."""
     space = problem.space
     return CalibrationResult(
         method="local fit",

@@ -18,7 +18,7 @@ from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.types import FloatArray
 
 VELOCITIES, ACTIONS = 8, 14
-"""How many velocities and former actions the policy observes."""
+"""Numbers of velocities and past actions that the policy observes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,9 +37,9 @@ class BalanceTask:
         position_weight: Cost of the squared cart position [1/m²].
         action_weight: Cost of the change of the action from tick to tick.
         fall_cost: Cost of falling or leaving the range, in ticks of the worst possible angle.
-        host_delay_s: Lowest and highest delay that the host adds to the robot's own latency: the newest of
-            200 state samples a second is 0 to 5 ms old when the policy looks, and wire and computation take
-            up to 2 ms.
+        host_delay_s: Lowest and highest delay of the host, added to the robot's own latency [s]. The newest
+            of 200 state samples per second is 0 to 5 ms old when the policy reads it; wire and computation
+            take up to 2 ms.
     """
 
     ticks: int = 250
@@ -73,10 +73,10 @@ def balance_spec(
 ) -> PolicySpec:
     """Return the layout of observation and action.
 
-    Positions now, velocities over 160 ms, actions over 280 ms. The velocities, differences of noisy reports,
-    need averaging. The set-point in the device is not reported, moves at a limited speed and drags a sticky
-    cart along: only the former actions tell where it is. With three of each, a robot with a slow set-point
-    and strong friction was not learned at all; with these it was in 10 000 steps.
+    Positions now, velocities over 160 ms, actions over 280 ms. Velocities are differences of noisy reports
+    and need averaging. The device's set-point is not reported, moves at a limited speed and pulls a cart with
+    friction: only past actions show where it is. With three of each, a robot with a slow set-point and strong
+    friction was not learned at all; with these it was in 10 000 steps.
     """
     cart, pole = description.joint_names[CART], description.joint_names[POLE]
     terms = [ObservationTerm("position", cart, 5.0), ObservationTerm("sin_position", pole, 10.0)]
@@ -115,13 +115,13 @@ class CartPoleEnv(ServoVectorEnv):
 
     and -fall_cost in the tick in which the pole has fallen or the cart has left its range, which ends the
     episode. It lies in (-1, 0], so near upright it is minus the weighted sum: among policies that stay up,
-    the return falls with the mean |angle|, which is what the paper's Table 2 judges. Zero for perfection
-    instead of one spares the critics the long way up to the value of staying up for ever; ending costs more
-    than any way of staying up could within the discount's horizon, which is the alive bonus by another name.
+    the return falls with the mean |angle|, by which the paper's Table 2 judges. The best reward is zero
+    instead of one, so critics need not first learn the value of staying up for ever. Ending costs more than
+    any way of staying up within the discount's horizon, which has the effect of an alive bonus.
 
     Args:
         description: The robot.
-        distribution: What each member's parameters and latency are drawn from.
+        distribution: Distribution of each member's parameters and latency.
         count: Members N.
         task: The settings.
         sensor: The sensor model; the description's by default.
@@ -159,7 +159,7 @@ class CartPoleEnv(ServoVectorEnv):
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
     ) -> FloatArray:
-        """Return the reward of one tick; the class says how it is made."""
+        """Return the reward of one tick; see the class."""
         task = self.task
         cost = task.angle_weight * np.abs(position[:, POLE]) + task.speed_weight * np.abs(velocity[:, CART])
         cost += task.position_weight * np.square(position[:, CART])
@@ -167,7 +167,7 @@ class CartPoleEnv(ServoVectorEnv):
         return np.exp(-cost) - 1.0
 
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
-        """Return who fell or left the range."""
+        """Return which members fell or left the range."""
         task = self.task
         fell = np.abs(position[:, POLE]) > task.end_angle_rad
         return np.asarray(fell | (np.abs(position[:, CART]) > task.end_position_m))

@@ -1,4 +1,4 @@
-"""Checkpoints of trainings: tensors in a safetensors file, which runs no code when it is read."""
+"""Checkpoints of trainings: tensors in a safetensors file, which runs no code when read."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ FORMAT: Final = "deal_hw.checkpoint/1"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Checkpoint:
-    """What a trainer keeps.
+    """The saved state of a training.
 
     Attributes:
-        tensors: Weights and the optimiser's memory, by ``<part>.<name>``.
-        notes: Plain JSON values: the trainer's name, how far it was.
-        path: Where it was read from, for messages.
+        tensors: Weights and the optimiser's state, by ``<part>.<name>``.
+        notes: Plain JSON values, such as the trainer's name and the steps done.
+        path: The file, for messages.
     """
 
     tensors: Mapping[str, torch.Tensor]
@@ -34,10 +34,10 @@ class Checkpoint:
     path: Path = Path()
 
     def check(self, **wanted: Any) -> None:
-        """Check notes that must be these.
+        """Check the values of notes.
 
         Raises:
-            CheckpointError: One is not; the message names it.
+            CheckpointError: One differs; the message names it.
         """
         for name, value in wanted.items():
             if self.notes.get(name) != value:
@@ -50,7 +50,7 @@ class Checkpoint:
         """Return the tensors of a part, which must have the names and shapes of ``like``.
 
         Raises:
-            CheckpointError: They have not, or a number is not finite.
+            CheckpointError: They do not, or a number is not finite.
         """
         found = {
             name.removeprefix(part + "."): value
@@ -65,12 +65,14 @@ class Checkpoint:
                 "checkpoint of the same task and settings"
             )
         if not all(bool(torch.isfinite(value).all()) for value in found.values()):
-            raise CheckpointError(f"{self.path}: the {part} holds a number that is not finite; give another")
+            raise CheckpointError(
+                f"{self.path}: the {part} holds a number that is not finite; give another checkpoint"
+            )
         return found
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint, layout: PolicySpec) -> None:
-    """Write a checkpoint; a file that is there is replaced when the new one is whole."""
+    """Write a checkpoint; an existing file is replaced only by a complete one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     notes = {**checkpoint.notes, "format": FORMAT, "layout": layout.to_json()}
     draft = path.with_name(f".{path.name}.draft")
@@ -83,10 +85,10 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, layout: PolicySpec) -> 
 
 
 def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
-    """Read a checkpoint of a policy of this layout.
+    """Read a checkpoint of a policy with this layout.
 
     Raises:
-        CheckpointError: There is no such file, it is no checkpoint, or it is of another layout.
+        CheckpointError: The file is missing, is no checkpoint, or has another layout.
     """
     try:
         with safe_open(path, framework="pt") as file:

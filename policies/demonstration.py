@@ -1,8 +1,8 @@
 """pi_0 in the loop of a target or of a population: policies as plain functions of the state.
 
-Needs numpy only. The callables fit :data:`deal_hw.sim.recordings.target.Behaviour` and the calibrator's
-population policies without knowing either: states are those of :class:`deal_hw.sim.engine.batch.ServoBatch`,
-joints after a floating base.
+It needs numpy only. The callables fit :data:`deal_hw.sim.recordings.target.Behaviour` and the calibrator's
+population policies without importing either. States are those of
+:class:`deal_hw.sim.engine.batch.ServoBatch`: a floating base, if any, then the joints.
 """
 
 from __future__ import annotations
@@ -53,8 +53,7 @@ def limited_action(
 ) -> FloatArray:
     """Return actions, (..., A), in [-1, 1] that move the target no faster than the safety limits allow.
 
-    Limited in the action and not after it, so that the policy, which observes its last action, knows what was
-    sent.
+    The action itself is limited, so that the policy, which observes its last action, knows what was sent.
     """
     step = np.array(description.limits.target_step) / scale
     return np.clip(np.clip(action, -1.0, 1.0), before - step, before + step)
@@ -64,13 +63,13 @@ def limited_action(
 class PopulationDemonstration:
     """A policy that drives N robots in closed loop, each from its own state.
 
-    The fields identify it in checkpoints; what it remembers of a rollout is forgotten by :meth:`restart`.
+    The fields identify it in checkpoints; :meth:`restart` clears the memory of a rollout.
 
     Attributes:
         policy: The policy.
         description: The robot.
-        wanted: Wanted velocity of the base: x, y [m/s] and yaw rate [rad/s]; for policies that observe it,
-            and clipped to what they were trained for, as in deploying.
+        wanted: Commanded velocity of the base: x, y [m/s] and yaw rate [rad/s], for policies that observe it;
+            clipped to the range of their training, as in deploying.
         spec_digest: Digest of the policy's spec, training record included.
 
     Raises:
@@ -94,20 +93,20 @@ class PopulationDemonstration:
 
     @property
     def history(self) -> int:
-        """Control periods that the policy looks back."""
+        """Length of the policy's memory [control periods]."""
         return self._policy.spec.history
 
     def restart(
         self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
     ) -> None:
-        """Begin anew with N robots that share one past: states (h, C) each, commands (h, A), oldest first.
+        """Start N robots from one common past: states (h, C) each, commands (h, A), oldest first.
 
         Args:
             count: N.
-            position: What the policy saw before.
-            velocity: Likewise.
-            command: What it answered.
-            number: Its commands so far, those from before this past too.
+            position: Past positions.
+            velocity: Past velocities.
+            command: The policy's commands in these states.
+            number: Number of its commands so far, including those before this past.
         """
         spec = self._policy.spec
         self._builder = ObservationBuilder(spec, (count,))
@@ -124,7 +123,7 @@ class PopulationDemonstration:
     def __call__(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the commands of a control period, (N, A), from states, (N, C) each.
 
-        Members whose state is not finite (diverged ones) are sent their rest command.
+        Members with a state that is not finite (diverged ones) get their rest command.
         """
         finite = np.isfinite(np.concatenate([position, velocity], axis=1)).all(axis=1, keepdims=True)
         known = np.nan_to_num(position), np.nan_to_num(velocity)
@@ -158,7 +157,7 @@ class Demonstration:
         self._actuated = len(description.actuated)
 
     def __call__(self, position: FloatArray, velocity: FloatArray, time_s: float) -> FloatArray:
-        """Return the command of the next control period; time 0 begins anew."""
+        """Return the command of the next control period; time 0 restarts."""
         if round(time_s * self._rate_hz) == 0:
             nothing = np.empty((0, len(position)))
             self._population.restart(1, nothing, nothing, np.empty((0, self._actuated)), 0)

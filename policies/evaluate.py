@@ -1,7 +1,7 @@
-"""How well a policy balances: the paper's Table 2, and a batched evaluation of many members at once.
+"""Evaluation of balancing policies: the paper's Table 2, batched over many robots.
 
-The task is frozen: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). Judged
-are the reported states, because on a robot there are no others.
+The task is fixed: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). It is
+judged by the reported states, because a real robot has no others.
 """
 
 from __future__ import annotations

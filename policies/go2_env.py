@@ -32,7 +32,7 @@ from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray, JointCommand
 
 ACTION_SCALE_RAD: Final = {"hip": 0.3, "thigh": 0.6, "calf": 0.6}
-"""Targets reach this far from the standing pose: as far as a trot needs, and within the ranges."""
+"""Largest distance of targets from the standing pose: enough for a trot, and within the ranges."""
 TROT: Final = (0.0, 0.5, 0.5, 0.0)
 """Phase of each leg's step, FL, FR, RL, RR [turns]: diagonal legs step together."""
 
@@ -44,19 +44,19 @@ class WalkTask:
     Attributes:
         ticks: Control periods in an episode.
         physics_step_s: Physics step [s].
-        clock_hz: Steps of each leg a second.
+        clock_hz: Steps of each leg per second.
         swing_share: Share of a step in which the foot is in the air.
         swing_m: Height of the foot in the middle of a step.
         command_range: Lowest and highest commanded velocity: ahead, left [m/s], turn [rad/s], (3, 2).
-        command_ticks: A command is drawn anew after so many control periods, on average.
-        standing: Share of the commands that are to stand.
-        zeroed: Share of each command's parts that are zero.
+        command_ticks: Mean number of control periods between two commands.
+        standing: Share of commands to stand.
+        zeroed: Share of zero components of a command.
         tracking_weight: Reward of following the commanded velocity ahead and to the left.
         tracking_width: Squared error of the velocity at which that reward falls to 1/e [m²/s²].
         turn_weight: Reward of following the commanded yaw rate.
         turn_width: Squared error of the yaw rate at which that reward falls to 1/e [rad²/s²].
-        gait_weight: Reward of feet that are as high as the clock wants them; none left for those that are
-            off by ``swing_m``, mean over the feet.
+        gait_weight: Reward of feet at the height that the clock wants, mean over the feet; zero at an error
+            of ``swing_m``.
         alive_reward: Reward of a tick without a fall.
         tilt_weight: Cost of the squared horizontal part of gravity's direction.
         height_weight: Cost of the squared deviation from ``height_m`` [1/m²].
@@ -65,25 +65,25 @@ class WalkTask:
         roll_weight: Cost of the squared roll and pitch rates [s²/rad²].
         slip_weight: Cost of the squared horizontal speed of feet that should stand [s²/m²].
         hip_weight: Cost of the squared deviation of the hips from the default pose [1/rad²].
-        pose_weight: Cost of that of all joints while the command is to stand [1/rad²].
+        pose_weight: The same of all joints while the command is to stand [1/rad²].
         action_weight: Cost of the squared change of the action.
-        clip_weight: Cost of the squared change that the safety filter makes to a target [1/rad²].
-        speed_weight: Cost of the squared share of the speed at which the safety module trips that is above
-            ``calm_share``, summed over the joints.
-        calm_share: See there.
+        clip_weight: Cost of the squared change of a target by the safety filter [1/rad²].
+        speed_weight: Cost of the squared excess of the joint speed, as share of the safety module's trip
+            speed, over ``calm_share``, summed over the joints.
+        calm_share: See ``speed_weight``.
         fall_cost: Cost of falling.
-        lowest_m: A lower base has fallen.
-        largest_tilt: A cosine of the tilt below this has fallen; the safety module trips at 0.8 rad.
+        lowest_m: Height of the base below which it has fallen.
+        largest_tilt: Cosine of the tilt below which it has fallen; the safety module trips at 0.8 rad.
         start_noise_rad: Largest deviation of joints at the start.
         start_speed: Largest speed of the base at the start, each axis [m/s].
-        host_delay_s: Lowest and highest delay that the host adds to the latency [s].
+        host_delay_s: Lowest and highest delay of the host, added to the latency [s].
         orientation_noise_rad: Noise of the reported orientation, each axis.
         gyro_noise_rad_s: Noise of the reported angular velocity.
         velocity_noise_rad_s: Noise of the reported joint velocities.
-        encoder_bias_rad: Joint encoders are off by up to this.
+        encoder_bias_rad: Largest bias of joint encoders.
         friction: Lowest and highest friction of the floor.
         payload_kg: Lowest and highest mass added to the trunk.
-        push_ticks: A push comes after so many control periods, on average.
+        push_ticks: Mean number of control periods between two pushes.
         push_m_s: Largest change of the base's horizontal velocity by a push, each axis.
     """
 
@@ -180,10 +180,10 @@ def walk_spec(
 
 
 class Go2Env(LocomotionEnv):
-    """Follow a velocity that changes now and then, trotting to the beat of a clock, behind the safety filter.
+    """Follow a velocity that changes now and then, trotting to a clock, behind the safety filter.
 
-    Targets pass the filter that deploying uses, from what the robot reports, before they are sent. The reward
-    of a tick, from the true state after it, with velocities in the base's frame, is::
+    Targets pass the filter of deploying, with the reported state, before they are sent. The reward of a tick,
+    from the true state after it, with velocities in the base's frame, is::
 
         tracking_weight exp(-|v_xy - command_xy|² / tracking_width)
         + turn_weight exp(-(wz - command_z)² / turn_width)
@@ -192,20 +192,20 @@ class Go2Env(LocomotionEnv):
         - bounce_weight vz² - roll_weight (wx² + wy²)
         - slip_weight sum over feet that should stand of their squared horizontal speed
         - hip_weight |q_hips - default|² - pose_weight |q - default|² where the command is to stand
-        - action_weight |a - a_before|² - clip_weight |target sent - target asked for|²
+        - action_weight |a - a_before|² - clip_weight |target sent - target requested|²
         - speed_weight sum over joints of max(0, |joint speed| / trip speed - calm_share)²
 
     and -fall_cost in the tick in which the base tilts or sinks too far, which ends the episode.
 
     Args:
-        description: The robot as its driver has it: with feet, and with limits for legs.
-        distribution: What each member's parameters and latency are drawn from.
+        description: The robot's description of its driver: with feet, and with limits for legs.
+        distribution: Distribution of each member's parameters and latency.
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
 
     Raises:
-        ConfigurationError: The description names no four feet.
+        ConfigurationError: The description does not name four feet.
     """
 
     def __init__(
@@ -262,11 +262,11 @@ class Go2Env(LocomotionEnv):
 
     @property
     def command(self) -> FloatArray:
-        """The wanted velocity of each member's base: x, y [m/s] and yaw rate [rad/s], (N, 3)."""
+        """The commanded velocity of each member's base: x, y [m/s] and yaw rate [rad/s], (N, 3)."""
         return self._builder.command
 
     def surroundings(self) -> Sequence[Parameter]:
-        """Return floor, payload and encoders."""
+        """Return the parameters of floor, payload and encoders."""
         task = self.task
         trunk = str(self.description.floating_base)
         mass = float(load_model(self.description).model.body(trunk).mass[0])
@@ -283,25 +283,25 @@ class Go2Env(LocomotionEnv):
         return self.command[:, 0]
 
     def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
-        """Draw the commands and the clocks' phases of the members that start anew."""
+        """Draw the commands and the clocks' phases of the restarted members."""
         self._draw_commands(where, rng)
         self._builder.clock[where] = rng.random(int(where.sum()))
         self._sent[where] = self._default
-        # The feet of a state that was set are only known a step later; until then none slips.
+        # After a state is set, its feet are known one step later; until then none slips.
         self._feet_before[where] = np.nan
 
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
-        """Draw settled robots; their bases move a little."""
+        """Draw settled robots with a small motion of their bases."""
         position, velocity = super().start_state(rng, count)
         velocity[:, :2] = rng.uniform(-1.0, 1.0, (count, 2)) * self.task.start_speed
         return position, velocity
 
     def limited(self, action: FloatArray, before: FloatArray) -> FloatArray:
-        """Return the actions as they are: the policy sees what it asked for, here as when deployed."""
+        """Return the actions unchanged: the policy observes its own request, as when deployed."""
         return action
 
     def target(self, action: FloatArray) -> FloatArray:
-        """Return the targets after the safety filter; gains that it lowers are set."""
+        """Return the targets after the safety filter; lowered gains are set."""
         wanted = dataclasses.replace(self._template, position_target=super().target(action))
         joints = self.loop.batch.robot.joints
         measured, velocity = (
@@ -314,7 +314,7 @@ class Go2Env(LocomotionEnv):
         return self._sent
 
     def sensed(self) -> tuple[FloatArray, FloatArray]:
-        """Return what is reported, with the noise of the inertial sensor and of joint velocities."""
+        """Return the reported state, with the noise of the inertial sensor and of joint velocities."""
         task, rng = self.task, self.np_random
         position, velocity = self.loop.reported_position.copy(), self.loop.reported_velocity.copy()
         position[:, 3:6] += rng.standard_normal((self.num_envs, 3)) * task.orientation_noise_rad
@@ -323,7 +323,7 @@ class Go2Env(LocomotionEnv):
         return position, velocity
 
     def privileged(self) -> FloatArray:
-        """Return the true velocity and height of the bases, how high feet are, and what was drawn, (N, P)."""
+        """Return the true velocity and height of the bases, and the heights of the feet, (N, P)."""
         seen = base(self.loop.position, self.loop.velocity)
         feet = 10.0 * (self._feet_now()[..., 2] - self._radius)
         return np.hstack([seen[:, LINEAR], 4.0 * seen[:, [HEIGHT]], feet])
@@ -331,7 +331,7 @@ class Go2Env(LocomotionEnv):
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
     ) -> FloatArray:
-        """Return the reward of one tick; the class says how it is made."""
+        """Return the reward of one tick; see the class."""
         task, seen = self.task, base(position, velocity)
         linear, angular, command = seen[:, LINEAR], seen[:, ANGULAR], self.command
         error = np.square(linear[:, :2] - command[:, :2]).sum(axis=1)
@@ -370,7 +370,7 @@ class Go2Env(LocomotionEnv):
         return np.asarray(reward)
 
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
-        """Return who fell."""
+        """Return which robots fell."""
         seen = base(position, velocity)
         tilted = -seen[:, GRAVITY][:, 2] < self.task.largest_tilt
         return np.asarray(tilted | (seen[:, HEIGHT] < self.task.lowest_m))
@@ -378,7 +378,7 @@ class Go2Env(LocomotionEnv):
     def step(
         self, actions: FloatArray
     ) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Push some members and draw new commands for some; the rest is as for every environment."""
+        """Push some members and draw new commands for some; the rest is as in every environment."""
         rng, task = self.np_random, self.task
         pushed = np.flatnonzero(rng.random(self.num_envs) < 1.0 / task.push_ticks)
         if pushed.size:
@@ -391,7 +391,7 @@ class Go2Env(LocomotionEnv):
         return result
 
     def measures(self) -> dict[str, float]:
-        """Return the mean errors of the velocity, and how often robots fall."""
+        """Return the mean errors of the velocity, and falls per minute."""
         ticks = self._sums.pop("ticks", 0.0)
         sums, self._sums = self._sums, {}
         if not ticks:
@@ -420,13 +420,13 @@ class Go2Env(LocomotionEnv):
         return np.asarray(self._places[:, self._feet])
 
     def _wanted_heights(self) -> FloatArray:
-        """Return how high the feet should be now, (N, 4) [m]: half a sine in the first part of a step."""
+        """Return the wanted heights of the feet, (N, 4) [m]: half a sine in the first part of a step."""
         share = ((self._builder.clock[:, None] + TROT) % 1.0) / self.task.swing_share
         return np.where(share < 1.0, self.task.swing_m * np.sin(np.pi * share), 0.0)
 
 
 def _drawn(kind: str, element: str, unit: str, ends: tuple[float, float]) -> Parameter:
-    """Return a parameter that is uniform between the ends; known where they are one."""
+    """Return a parameter that is uniform between the ends; known if they are equal."""
     low, high = ends
     room = 0.0 if low < high else 1.0
     return Parameter(

@@ -1,4 +1,4 @@
-"""The Allegro hand's task: turn the cube that lies on the palm."""
+"""The Allegro hand's task: turn a cube on the palm."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.types import FloatArray
 
 YAW_RATE = 5
-"""Of a floating base's velocities: turning about the world's vertical, as long as it does not tilt."""
+"""Index among a floating base's velocities: rotation about the world's vertical while it does not tilt."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,11 +27,11 @@ class TurnTask:
     Attributes:
         ticks: Control periods in an episode.
         turn_weight: Reward of turning [s/rad].
-        fastest_rad_s: Faster turning is worth no more: a cube that is thrown turns fastest.
-        holding_reward: Reward of a tick in which the cube is on the hand.
+        fastest_rad_s: Rate above which turning earns no more: a thrown cube turns fastest.
+        holding_reward: Reward of a tick with the cube on the hand.
         control_weight: Cost of the sum of squared actions.
-        action_rad: What an action of 1 adds to the holding pose.
-        least_height_m: A lower cube has fallen off.
+        action_rad: Joint offset from the holding pose at action 1.
+        least_height_m: Height below which the cube has fallen off.
         start_noise_rad: Largest deviation of joints at the start.
     """
 
@@ -54,7 +54,7 @@ def turn_spec(
     training: Mapping[str, Any] | None = None,
     task: TurnTask | None = None,
 ) -> PolicySpec:
-    """Return the layout of observation and action: joints, last action, and the cube but for its place."""
+    """Return the layout of observation and action: joints, last action, and the cube without its place."""
     terms = [ObservationTerm("height", "z", 10.0), *vector_terms("gravity", 1.0)]
     terms += [*vector_terms("heading", 1.0), *vector_terms("angular_velocity", 0.2)]
     terms += joint_terms(description, 0.1)
@@ -63,18 +63,18 @@ def turn_spec(
 
 
 class HandEnv(LocomotionEnv):
-    """Turn the cube to the left on the hand; an episode ends where it falls off.
+    """Turn the cube to the left on the hand; an episode ends when it falls off.
 
     The reward of a tick, from the true state after it, is::
 
         turn_weight min(yaw rate, fastest) + holding_reward - control_weight |a|²
 
-    The paper's task is to reach an orientation. To turn is its simpler part, and moves fingers and cube
-    alike.
+    The paper's task is to reach an orientation. Turning is a simpler part of it, with the same motion of
+    fingers and cube.
 
     Args:
         description: The hand; the cube is its floating base.
-        distribution: What each member's parameters and latency are drawn from.
+        distribution: Distribution of each member's parameters and latency.
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
@@ -103,11 +103,11 @@ class HandEnv(LocomotionEnv):
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
     ) -> FloatArray:
-        """Return the reward of one tick; the class says how it is made."""
+        """Return the reward of one tick; see the class."""
         task = self.task
         turning = task.turn_weight * np.minimum(velocity[:, YAW_RATE], task.fastest_rad_s)
         return np.asarray(turning + task.holding_reward - task.control_weight * np.square(action).sum(axis=1))
 
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
-        """Return whose cube has fallen off."""
+        """Return which cubes have fallen off."""
         return np.asarray(position[:, 2] < self.task.least_height_m)

@@ -1,4 +1,4 @@
-"""What the tasks of robots with a floating base share: starts, termination by tilt, specs, scoring."""
+"""Common part of tasks of robots with a floating base: starts, termination by tilt, specs, scoring."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.types import FloatArray
 
 POOL = 64
-"""Settled robots that episodes start from."""
+"""Number of settled robots from which episodes start."""
 
 GRAVITY, HEADING, ANGULAR, LINEAR, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
 """Columns of :func:`deal_hw.policy.base_features`."""
@@ -27,25 +27,25 @@ GRAVITY, HEADING, ANGULAR, LINEAR, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 9
 class LocomotionEnv(ServoVectorEnv):
     """Robots on a floor that start from rest in their default pose.
 
-    A start is drawn from a pool of robots of the same distribution that stood (or lay) for ``settle_s``, as a
-    target does before it is recorded; those that ended while settling are left out.
+    A start is drawn from a pool of robots of the same distribution that stood (or lay) for ``settle_s``, like
+    a target before its recording. Robots that fell while settling are left out.
 
     Attributes:
-        settle_s: How long robots of the pool settle [s].
+        settle_s: Settling time of the pool [s].
 
     Args:
         description: The robot; its base floats.
-        distribution: What each member's parameters and latency are drawn from.
-        layout: What is observed and what an action means.
+        distribution: Distribution of each member's parameters and latency.
+        layout: Layout of observation and action.
         count: Members N.
         ticks: Control periods in an episode.
         start_noise: Largest deviation of a joint from its settled position [rad].
-        host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s].
+        host_delay_s: Lowest and highest delay of the host, added to the distribution's latency [s].
         threads: Threads of the physics; None for all CPUs.
         step_s: Physics step [s]; the device period by default.
 
     Raises:
-        ConfigurationError: The robot's base is fixed, or none of the settled robots may start.
+        ConfigurationError: The robot's base is fixed, or no robot of the pool stays up.
     """
 
     settle_s: ClassVar[float] = 1.0
@@ -81,11 +81,11 @@ class LocomotionEnv(ServoVectorEnv):
         self._pool = self._settled(threads)
 
     def start_setpoint(self) -> FloatArray:
-        """Return the command that holds the default pose; motors are off."""
+        """Return the command that holds the default pose; zero for motors."""
         return self._default
 
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
-        """Draw settled robots and move their joints a little; at rest."""
+        """Draw settled robots at rest, with small changes of their joints."""
         position = self._pool[rng.integers(len(self._pool), size=count)]
         joints = self.loop.batch.robot.joints
         position[:, joints] += rng.uniform(-1.0, 1.0, position[:, joints].shape) * self._start_noise
@@ -96,11 +96,11 @@ class LocomotionEnv(ServoVectorEnv):
         return limited_action(self.description, self._scale, action, before)
 
     def forward_speed(self) -> FloatArray:
-        """Return how fast each member goes ahead, (N,) [m/s]: along its base's x axis, by default."""
+        """Return each member's forward speed, (N,) [m/s]; by default along its base's x axis."""
         return np.asarray(base(self.loop.position, self.loop.velocity)[:, LINEAR][:, 0])
 
     def wanted_speed(self) -> FloatArray | None:
-        """Return how fast each member should go, (N,) [m/s]; None where faster is better."""
+        """Return each member's commanded speed, (N,) [m/s]; None where faster is better."""
         return None
 
     def _settled(self, threads: int | None) -> FloatArray:
@@ -126,7 +126,7 @@ class LocomotionEnv(ServoVectorEnv):
 
 
 def base(position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return what there is to know of the bases of states, (N, C) each: (N, 13)."""
+    """Return the features of the bases of states, (N, C) each: (N, 13)."""
     return base_features(position[:, :6], velocity[:, :6])
 
 
@@ -150,7 +150,7 @@ def locomotion_spec(
     training: Mapping[str, Any] | None,
     **more: Any,
 ) -> PolicySpec:
-    """Return a spec with the description's gains and limits, the latter within what may be sent.
+    """Return a spec with the description's gains and with its limits inside the safety limits.
 
     ``more`` are further fields of the spec.
     """
@@ -175,17 +175,17 @@ def locomotion_spec(
 
 
 def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
-    """Return what a policy does in one episode of each member of an environment.
+    """Evaluate a policy in one episode of each member of an environment.
 
     Args:
         policy: The policy.
         env: The environment; each member is another draw of its distribution.
-        seed: Decides the draws.
+        seed: Seeds the draws.
 
     Returns:
-        Plain JSON values: returns (undiscounted), the share that fell, the share of the time they were up;
-        of those that did not fall, the mean forward speed [m/s] and how far each one's mean speed is from
-        the mean of the wanted one, on average; and what the task measures.
+        Plain JSON values: undiscounted returns, share of fallen robots, share of time up, and the task's
+        measures. For robots that did not fall: mean forward speed [m/s], and the mean distance of each
+        robot's mean speed from its mean commanded one.
     """
     observation, _ = env.reset(seed=seed)
     count = env.num_envs

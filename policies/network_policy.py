@@ -1,4 +1,4 @@
-"""A policy that is a torch network, and what trainers of such policies share."""
+"""A policy that is a torch network, and common functions of its trainers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class NetworkPolicy:
         return self._spec
 
     def reset(self) -> None:
-        """Nothing to forget: the observation carries the past."""
+        """Do nothing: the observation carries the past."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,)."""
@@ -46,9 +46,9 @@ class NetworkPolicy:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch compute on one thread meanwhile.
+    """Limit torch to one thread inside the context.
 
-    For networks of this size a second thread costs more than it computes; and one thread sums in one order.
+    For networks of this size a second thread costs more than it gains. And one thread sums in a fixed order.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -59,13 +59,17 @@ def one_thread() -> Iterator[None]:
 
 
 def is_finite(*networks: torch.nn.Module) -> bool:
-    """Return whether all weights are numbers."""
+    """Return whether all weights are finite."""
     return all(bool(torch.isfinite(p).all()) for network in networks for p in network.parameters())
 
 
 def diverged(steps: int, checkpoint: Path | None) -> TrainingDivergedError:
-    """Return the error of a training whose weights are no numbers any more."""
-    kept = "no checkpoint was kept" if checkpoint is None else f"the checkpoint {checkpoint} is of before"
+    """Return the error of a training with weights that are not finite."""
+    kept = (
+        "no checkpoint was written"
+        if checkpoint is None
+        else f"the checkpoint {checkpoint} was written before"
+    )
     return TrainingDivergedError(
         f"the training diverged after {steps} steps: a network holds a number that is not finite; {kept}. "
         "Lower the learning rate and start from there"
@@ -76,10 +80,10 @@ def trained_spec(env: ServoVectorEnv, algorithm: str, config: Any, seed: int, **
     """Return the spec of a policy with the record of its training.
 
     Args:
-        env: What it was trained in.
+        env: The environment of the training.
         algorithm: The trainer's name.
         config: The trainer's settings, a dataclass.
-        seed: What all randomness came from.
+        seed: Seed of all randomness.
         **versions: Versions of packages by name.
     """
     settings = {

@@ -18,7 +18,7 @@ from deal_hw.policy import PolicySpec
 
 OPSET = 18
 IR_VERSION = 9
-"""Old enough for every onnxruntime that the base install accepts."""
+"""Low enough for every onnxruntime that the base install accepts."""
 _ACTIVATIONS: Mapping[type[torch.nn.Module], str] = {
     torch.nn.ELU: "Elu",
     torch.nn.ReLU: "Relu",
@@ -33,17 +33,17 @@ def export_network(
 ) -> OnnxPolicy:
     """Write a network, compare the file with it, and return the file's policy.
 
-    The files are written under other names and then renamed: an interrupted export leaves nothing that could
-    be deployed.
+    Files are written under other names and then renamed, so that an interrupted export leaves nothing that
+    could be deployed.
 
     Args:
         network: Observations (B, O) in, actions (B, A) out: a Sequential of linear layers and activations.
-        spec: What it observes and what its action means.
+        spec: Its spec.
         path: The .onnx file; the record goes beside it with the suffix .json.
         record: Plain JSON values about the training.
 
     Raises:
-        PolicyError: A layer is of an unknown type, or the file does not compute what the network computes.
+        PolicyError: A layer has an unknown type, or the file computes other actions than the network.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.draft")
@@ -70,8 +70,8 @@ def write_policy(model: onnx.ModelProto, spec: PolicySpec, path: Path) -> None:
 
 
 def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
-    # Built by hand: torch's exporter takes seconds, needs onnxscript, and writes the paths of this machine
-    # into every node. A policy network is a chain of a few known layers.
+    # Built by hand: torch's exporter takes seconds, needs onnxscript, and writes local paths into every node.
+    # A policy network is a chain of a few known layers.
     nodes: list[onnx.NodeProto] = []
     weights: list[onnx.TensorProto] = []
     width, value = observation, "observation"
@@ -122,7 +122,7 @@ def _chain(network: torch.nn.Module) -> list[torch.nn.Module]:
 
 
 def _check_equal(network: torch.nn.Module, policy: OnnxPolicy) -> None:
-    # Fixed draws: an export must not use up anybody's randomness.
+    # Fixed draws: an export must not use the caller's random generators.
     scales = np.array([0.1, 1.0, 10.0], dtype=np.float32)[:, None, None]
     draws = np.random.default_rng(0).standard_normal((3, 32, len(policy.spec.observation))).astype(np.float32)
     observations = (scales * draws).reshape(-1, draws.shape[-1])
@@ -132,5 +132,5 @@ def _check_equal(network: torch.nn.Module, policy: OnnxPolicy) -> None:
     if not worst <= TOLERANCE:
         raise PolicyError(
             f"the exported policy differs from the network by {worst:g}, allowed are {TOLERANCE:g}; "
-            "the network holds an operation that ONNX computes otherwise"
+            "replace the operation that ONNX computes differently"
         )

@@ -16,29 +16,29 @@ from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray
 
 SPEC_KEY = "deal_hw.policy_spec"
-"""Key of the ONNX file's metadata under which the spec stands, as JSON."""
+"""Key of the spec, as JSON, in the ONNX file's metadata."""
 MAX_FILE_BYTES: Final = 100_000_000
 """Largest policy file: some 25 million weights, a hundred times what a policy at 50 Hz has."""
 _NO_FOLDER: Final = os.devnull + "/weights-outside-of-the-file"
 
 
 class OnnxPolicy:
-    """A policy read from an ONNX file that carries its spec.
+    """A policy from an ONNX file that contains its spec.
 
-    One thread and no spinning: the control process shares its cores with nobody's surprise, and for a network
-    of this size a second thread costs more than it computes.
+    It uses one thread without spinning: a second thread costs more than it gains for networks of this size,
+    and would disturb the control process.
 
     Args:
-        path: The file. It is read once, and the network is made from what was read.
-        digest: What :attr:`digest` must be; "" for any file.
+        path: The file. It is read once, and the network is made from these bytes.
+        digest: Required :attr:`digest`; "" for any file.
 
     Attributes:
         path: The file.
         digest: SHA-256 of its bytes, in hexadecimal.
 
     Raises:
-        PolicyError: There is no such file, it is too large or not ONNX, it is not the one of the digest, it
-            carries no spec, or network and spec disagree.
+        PolicyError: The file is missing, too large or not ONNX, has another digest or no spec, or network and
+            spec disagree.
     """
 
     def __init__(self, path: Path | str, digest: str = "") -> None:
@@ -48,7 +48,7 @@ class OnnxPolicy:
         if digest not in ("", self.digest):
             raise PolicyError(
                 f"{self.path} was changed after it was checked: its SHA-256 begins {self.digest[:16]}, "
-                f"that of the file that was checked {digest[:16]}; start again"
+                f"the checked file's {digest[:16]}; start again"
             )
         self._session = _open(self.path, content)
         try:
@@ -59,7 +59,7 @@ class OnnxPolicy:
                 f"{self.path} is damaged: a name inside is no UTF-8 text; copy or export the file again"
             ) from err
         self._row = np.zeros((1, len(self._spec.observation)), dtype=np.float32)
-        # The first run allocates; it must not happen inside the first control cycle.
+        # The first run allocates memory; it must not happen in the first control cycle.
         self.act_batch(self._row)
 
     @property
@@ -73,7 +73,7 @@ class OnnxPolicy:
         return bool(self._session.get_inputs()[0].shape[0] != 1)
 
     def reset(self) -> None:
-        """Nothing to forget: the observation carries the past."""
+        """Do nothing: the observation carries the past."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,).
@@ -116,7 +116,7 @@ def read_policy_file(path: Path) -> bytes:
     """Return the bytes of a policy file.
 
     Raises:
-        PolicyError: There is no such file, it is no file, or it is larger than :data:`MAX_FILE_BYTES`.
+        PolicyError: The file is missing, not regular, or larger than :data:`MAX_FILE_BYTES`.
     """
     try:
         with open(path, "rb", opener=_open_at_once) as file:
@@ -141,7 +141,7 @@ def read_policy_file(path: Path) -> bytes:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    # Opening a FIFO would otherwise wait for somebody who writes to it.
+    # Opening a FIFO would otherwise wait for a writer.
     return os.open(path, flags | os.O_NONBLOCK)
 
 
@@ -151,13 +151,13 @@ def _open(path: Path, content: bytes) -> onnxruntime.InferenceSession:
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # A network may name other files that hold its weights. They stand outside of the digest, so none is read:
-    # onnxruntime is told to look for them where no file can be.
+    # A network may name other files with its weights. They are not part of the digest, so none is read:
+    # onnxruntime looks for them where no file can be.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NO_FOLDER)
-    # Fatal only: what is wrong is said once, in the error below.
+    # Fatal errors only: the error below reports the others once.
     options.log_severity_level = 4
     try:
-        # Its fallback prints, and tries the same again on the same processor.
+        # Its fallback prints, and repeats the same on the same processor.
         return onnxruntime.InferenceSession(
             content, options, providers=["CPUExecutionProvider"], enable_fallback=0
         )

@@ -1,8 +1,8 @@
-"""A Gymnasium environment of a user, made ready for our trainers: calibrated physics, a policy's layout.
+"""A user's Gymnasium environment, prepared for our trainers: calibrated physics, a policy's layout.
 
-The policy's file must say what it observes and what its actions mean. Either the environment says it, by an
-attribute ``policy_spec``; or it observes the robot's joint positions (relative to the default pose) and then
-their velocities, and its action is the actuators' control: both are tried out before anything is trained.
+The policy's file must describe its observations and actions. Either the environment has an attribute
+``policy_spec``. Or it observes the robot's joint positions (relative to the default pose), then their
+velocities, and its action is the actuators' control: this is tested before the training.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
 TOLERANCE = 1e-5
-"""Largest difference between what an environment observes and what the policy's file will say."""
+"""Largest difference between the environment's observation and the one described in the policy's file."""
 TRIED = 3
-"""Steps that are tried."""
+"""Number of test steps."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class OwnTask:
-    """What is trained for, for the training record."""
+    """Name of the task, for the training record."""
 
     env: str
 
 
 class OwnVectorEnv(SyncVectorEnv):
-    """N members of a user's environment, each with parameters drawn anew at every reset.
+    """N members of a user's environment; every reset draws their parameters.
 
     Args:
         env: Its name, module:ENV_ID.
         description: The robot.
-        distribution: What parameters and latency are drawn from. Latency delays actions by whole steps.
+        distribution: Distribution of parameters and latency. Latency delays actions by whole steps.
         count: Members N.
 
     Attributes:
-        layout: What is observed and what an action means.
-        task: What is trained for.
+        layout: Layout of observation and action.
+        task: Name of the task.
 
     Raises:
         ConfigurationError: The environment cannot be used; the message says what to change.
-        UnknownNameError: Its model lacks a joint of the robot, or an element that the distribution names.
+        UnknownNameError: Its model lacks a joint of the robot, or an element of the distribution.
     """
 
     def __init__(
@@ -66,16 +66,16 @@ class OwnVectorEnv(SyncVectorEnv):
         )
 
     def measures(self) -> dict[str, float]:
-        """Nothing beside the return."""
+        """Return nothing beside the return."""
         return {}
 
     def privileged(self) -> FloatArray:
-        """Nothing that the policy does not see, (N, 0)."""
+        """Return no further information for the critic, (N, 0)."""
         return np.zeros((self.num_envs, 0))
 
 
 class _Member(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """One environment: actions in [-1, 1] that act late, and physics drawn at each reset."""
+    """One environment with delayed actions in [-1, 1], and physics drawn at each reset."""
 
     def __init__(
         self, env: Any, layout: PolicySpec, description: RobotDescription, distribution: ParameterDistribution
@@ -121,7 +121,7 @@ def _made(env: str) -> Any:
 
 
 def _layout(env: str, description: RobotDescription, distribution: ParameterDistribution) -> PolicySpec:
-    """Return what a policy of the environment observes and does, after trying it out."""
+    """Return the layout of observation and action, after a test."""
     made = _made(env)
     try:
         spaces = made.observation_space, made.action_space
@@ -148,7 +148,7 @@ def _layout(env: str, description: RobotDescription, distribution: ParameterDist
 def _tried(
     env: str, made: Any, description: RobotDescription, distribution: ParameterDistribution
 ) -> PolicySpec:
-    """Return the layout of joint positions, then velocities; refuse an environment that is otherwise."""
+    """Return the layout of joint positions, then velocities; refuse an environment with another one."""
     model, data = (getattr(made.unwrapped, name, None) for name in ("model", "data"))
     if model is None or data is None or not hasattr(model, "jnt_qposadr"):
         raise ConfigurationError(
@@ -177,15 +177,15 @@ def _tried(
         wanted = np.concatenate([data.qpos[at] - description.default_position, data.qvel[moving]])
         if seen.shape != wanted.shape or np.abs(seen - wanted).max() > TOLERANCE:
             raise ConfigurationError(
-                f"--env {env} observes something else than the {len(joints)} joint positions (relative to "
-                "default_position) and then their velocities, so nobody could tell the policy's file what to "
-                "observe on the robot; observe these, or give the environment an attribute policy_spec (a "
+                f"--env {env} does not observe the {len(joints)} joint positions (relative to "
+                "default_position) and then their velocities, so the policy's file could not describe its "
+                "observation; observe these, or give the environment an attribute policy_spec (a "
                 "deal_hw.policy.PolicySpec)"
             )
         if not np.allclose(data.ctrl, given, atol=TOLERANCE):
             raise ConfigurationError(
-                f"--env {env} does something else with actions than to write them into the actuators' ctrl; "
-                "do that, or give it an attribute policy_spec"
+                f"--env {env} does not write its actions unchanged into the actuators' ctrl; do that, or "
+                "give it an attribute policy_spec"
             )
         rate_hz = 1.0 / (float(data.time) - before)
         if not np.isclose(rate_hz, description.control_rate_hz, rtol=1e-3):
@@ -231,12 +231,12 @@ def _plain_layout(description: RobotDescription, distribution: ParameterDistribu
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Control:
-    """What an environment is given for actions in [-1, 1], (A,) each.
+    """Map from actions in [-1, 1] to an environment's actions, (A,) each.
 
     Attributes:
-        middle: For an action of 0.
-        half: For how much more one of 1 stands.
-        order: Place of each actuated joint among the environment's actions.
+        middle: Value at action 0.
+        half: Change of the value at action 1.
+        order: Index of each actuated joint among the environment's actions.
     """
 
     middle: FloatArray
@@ -253,7 +253,7 @@ class _Control:
 def _control(env: Any, layout: PolicySpec, description: RobotDescription) -> _Control:
     A = len(layout.actuated)
     if getattr(env.unwrapped, "policy_spec", None) is not None:
-        # Such an environment takes actions as the policy gives them.
+        # Such an environment takes the policy's actions unchanged.
         return _Control(np.zeros(A), np.ones(A), np.arange(A))
     middle = np.zeros(A)
     if description.actuation == "position":

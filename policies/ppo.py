@@ -31,17 +31,17 @@ class PpoConfig:
         steps: Environment steps of all members together; rounded up to whole rollouts.
         hidden: Units of the hidden layers of actor and critic.
         rollout: Control periods of each member between updates.
-        epochs: How often an update goes through a rollout.
-        batches: Parts that it goes through it in.
-        learning_rate: Adam's, at the start; from there it follows ``divergence``.
-        divergence: Kullback-Leibler divergence of an update that the learning rate is tuned for [nat].
-        clip: Share by which an update may change the probability of an action.
-        gamma: Discount a tick.
+        epochs: Passes of an update through a rollout.
+        batches: Parts of a rollout in each pass.
+        learning_rate: Adam's first learning rate; later it follows ``divergence``.
+        divergence: Kullback-Leibler divergence of an update for which the learning rate is tuned [nat].
+        clip: Largest relative change of an action's probability in an update.
+        gamma: Discount per tick.
         trace: Lambda of the generalised advantage estimate.
         entropy: Weight of the entropy of the actions.
-        exploration: Standard deviation of the actions at the start.
-        reward_scale: Rewards are multiplied by this before the critic sees them.
-        checkpoint_updates: A checkpoint is written every so many updates, and at the end.
+        exploration: Standard deviation of the first actions.
+        reward_scale: Factor on the rewards for the critic.
+        checkpoint_updates: Updates between two checkpoints; one more is written at the end.
     """
 
     steps: int = 12_000_000
@@ -97,17 +97,17 @@ class PpoTrainer:
         progress: TrainingProgress | None = None,
         files: TrainingFiles | None = None,
     ) -> NetworkPolicy:
-        """Return the policy after ``config.steps`` environment steps, or as it is when it is told to stop.
+        """Return the policy after ``config.steps`` environment steps, or when ``files.stop`` says so.
 
         Args:
             env: The environment; it is seeded from ``rng``.
             config: The settings.
-            rng: Where all randomness comes from. The global generator of torch is seeded from it.
+            rng: Source of all randomness. It seeds the global generator of torch.
             progress: Called after each update.
-            files: Checkpoint, TensorBoard files, and the word to stop.
+            files: Checkpoint, TensorBoard files, and the stop function.
 
         Returns:
-            The mean action, without exploration, cut off at -1 and 1.
+            The mean action, without exploration, clipped to [-1, 1].
 
         Raises:
             TrainingDivergedError: The networks hold numbers that are not finite.
@@ -121,7 +121,7 @@ class PpoTrainer:
             found = files.source(env.layout, read_checkpoint)
             if found is not None:
                 learner.load(found, whole=files.resume)
-                # Another seed than at the start: the same episodes again would teach the same again.
+                # Another seed than at the start, to get other episodes.
                 seed = int(np.random.default_rng([seed, learner.steps]).integers(2**31))
                 torch.manual_seed(seed)
             learner.begin(seed)
@@ -164,7 +164,7 @@ class _Learner:
         hidden = list(config.hidden)
         self._actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
         self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu")
-        # Small first actions: the default pose, and not a random one, is where learning starts.
+        # Small first actions: learning starts at the default pose, not at a random one.
         with torch.no_grad():
             list(self._actor.mlp)[-1].weight.mul_(0.1)
         storage = RolloutStorage("rl", env.num_envs, config.rollout, example, [A])
@@ -217,7 +217,7 @@ class _Learner:
 
     @property
     def is_finite(self) -> bool:
-        """Whether all weights are numbers."""
+        """Whether all weights are finite."""
         return is_finite(self._actor, self._critic)
 
     def network(self) -> torch.nn.Module:
@@ -225,7 +225,7 @@ class _Learner:
         return torch.nn.Sequential(*self._actor.mlp, torch.nn.Hardtanh())
 
     def checkpoint(self) -> Checkpoint:
-        """Return all that is needed to go on."""
+        """Return the state needed to continue."""
         tensors = {
             f"{part}.{name}": value
             for part, model in (("actor", self._actor), ("critic", self._critic))
@@ -243,7 +243,7 @@ class _Learner:
         return Checkpoint(tensors=tensors, notes=notes)
 
     def load(self, found: Checkpoint, *, whole: bool) -> None:
-        """Take over networks and, with ``whole``, where the training was."""
+        """Load the networks and, with ``whole``, the state of the training."""
         found.check(trainer=PpoTrainer.name, hidden=list(self._config.hidden))
         for part, model in (("actor", self._actor), ("critic", self._critic)):
             model.load_state_dict(found.part(part, model.state_dict()))

@@ -17,12 +17,12 @@ IDS: Mapping[str, str] = {
 
 
 def register(single: str, vector: str) -> None:
-    """Register all tasks, single and vector; those that are there already stay.
+    """Register all tasks, single and vector; existing ones stay.
 
     Args:
-        single: Function that makes a single environment, "module:name"; called with ``robot`` and what the
-            user gives to ``gymnasium.make``.
-        vector: The same for ``gymnasium.make_vec``, called with ``num_envs``, too.
+        single: Factory of a single environment, "module:name"; called with ``robot`` and the user's arguments
+            of ``gymnasium.make``.
+        vector: The same for ``gymnasium.make_vec``; called with ``num_envs``, too.
     """
     for name, robot in IDS.items():
         if name not in registration.registry:

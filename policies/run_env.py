@@ -35,8 +35,8 @@ class RunTask:
         forward_weight: Reward of speed along the world's x axis [s/m].
         healthy_reward: Reward of a tick in which the robot is healthy.
         control_weight: Cost of the sum of squared actions.
-        top_height_m: A higher torso ends the episode, as in gymnasium.
-        least_height_m: So does a lower one.
+        top_height_m: Torso height above which the episode ends, as in gymnasium.
+        least_height_m: Torso height below which it ends.
         start_noise_rad: Largest deviation of joints at the start.
     """
 
@@ -57,9 +57,9 @@ def run_spec(
     trained_under: str = "",
     training: Mapping[str, Any] | None = None,
 ) -> PolicySpec:
-    """Return the layout of observation and action: the full state but the place, and the last action.
+    """Return the layout of observation and action: the full state without the place, and the last action.
 
-    Directions are in the torso's frame, unlike gymnasium's quaternion, of which q and -q are one orientation.
+    Directions are in the torso's frame. Gymnasium's quaternion has two values, q and -q, for one orientation.
     """
     terms = [ObservationTerm("height", "z", 2.0), *vector_terms("gravity", 1.0)]
     terms += [*vector_terms("heading", 1.0), *vector_terms("linear_velocity", 0.5)]
@@ -76,14 +76,14 @@ class RunEnv(LocomotionEnv):
         forward_weight vx + healthy_reward - control_weight |a|²
 
     and 0 in the tick in which the robot stops being healthy, which ends the episode. A robot is healthy while
-    its torso is not upside down and its height within the task's. For the ant two things differ from
-    gymnasium's. It asks for a height of 0.2 m at least, below which the soft floors of this distribution let
-    a resting ant sink. And two weights are smaller here: of control (0.5), as the gear is 15 instead of 150,
-    and of health (1), a constant that the critics of a short training would spend their time on.
+    its torso is not upside down and its height is within the task's. For the ant, two things differ from
+    gymnasium. First, there is no least height of 0.2 m: the soft floors of this distribution let a resting
+    ant sink lower. Second, two weights are smaller here: that of control (0.5), as the gear is 15 instead of
+    150, and that of health (1), a constant that would occupy the critics of a short training.
 
     Args:
         description: The robot.
-        distribution: What each member's parameters and latency are drawn from.
+        distribution: Distribution of each member's parameters and latency.
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
@@ -115,7 +115,7 @@ class RunEnv(LocomotionEnv):
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
     ) -> FloatArray:
-        """Return the reward of one tick; the class says how it is made."""
+        """Return the reward of one tick; see the class."""
         task = self.task
         forward = task.forward_weight * velocity[:, 0]
         return np.asarray(forward + task.healthy_reward - task.control_weight * np.square(action).sum(axis=1))
@@ -125,7 +125,7 @@ class RunEnv(LocomotionEnv):
         return self.loop.velocity[:, 0]
 
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
-        """Return who lies on the back, fell or flew off."""
+        """Return which robots lie on the back, fell or flew off."""
         seen = base(position, velocity)
         height, task = seen[:, HEIGHT], self.task
         over = (height > task.top_height_m) | (height < task.least_height_m)
@@ -133,9 +133,9 @@ class RunEnv(LocomotionEnv):
 
 
 class HumanoidEnv(RunEnv):
-    """The same for the humanoid, which falls where the ant lies: it starts standing, not settled.
+    """The same for the humanoid, which starts standing, not settled: settling would let it fall.
 
-    To stay up is worth as much as a metre a second ahead, and its 21 motors cost less.
+    Staying up is worth as much as a speed of one metre per second, and its 21 motors cost less.
     """
 
     settle_s = 0.0

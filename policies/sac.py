@@ -34,18 +34,18 @@ class SacConfig:
     Attributes:
         steps: Environment steps of all members together.
         hidden: Units of the hidden layers of actor and critics.
-        gradient_steps: Updates for each step of the whole batch of members.
+        gradient_steps: Updates per step of the whole batch of members.
         batch: Transitions in an update.
-        learning_rate: Adam's, for actor, critics and temperature, at the start.
-        final_learning_rate: At the end; it falls linearly.
-        gamma: Discount a tick.
-        tau: Share of the critics that their targets take over at each update.
-        entropy: Temperature at the start; it is tuned from there.
-        target_entropy: Entropy of the policy that the temperature is tuned for [nat].
+        learning_rate: Adam's first learning rate, for actor, critics and temperature.
+        final_learning_rate: The last one; it falls linearly.
+        gamma: Discount per tick.
+        tau: Rate at which the target critics follow at each update.
+        entropy: First temperature; it is tuned from there.
+        target_entropy: Entropy of the policy for which the temperature is tuned [nat].
         warmup: Environment steps with random actions before the first update.
         buffer: Transitions kept.
-        averaged: Share of the steps, at the end, over which the actor's weights are averaged. The last actor
-            is off by its last few updates, which differ from seed to seed; their mean less so.
+        averaged: Last share of the steps over which the actor's weights are averaged. The last few updates
+            differ from seed to seed; the mean differs less.
     """
 
     steps: int = 48_000
@@ -101,18 +101,17 @@ class SacTrainer:
         progress: TrainingProgress | None = None,
         files: TrainingFiles | None = None,
     ) -> NetworkPolicy:
-        """Return the policy after ``config.steps`` environment steps, or as it is when it is told to stop.
+        """Return the policy after ``config.steps`` environment steps, or when ``files.stop`` says so.
 
         Args:
             env: The environment; it is seeded from ``rng``.
             config: The settings.
-            rng: Where all randomness comes from. The global generators of random, numpy and torch are seeded
-                from it, as stable-baselines3 draws from them.
+            rng: Source of all randomness. It seeds the global generators of random, numpy and torch, which
+                stable-baselines3 uses.
             progress: Called about a hundred times.
-            files: Checkpoint, TensorBoard files, and the word to stop. A checkpoint holds the networks and
-                not the transitions: a training that goes on gathers new ones. The model of stable-baselines3
-                lies beside it and has the optimisers' memory, which a resumed training takes up. It can be a
-                start, too.
+            files: Checkpoint, TensorBoard files, and the stop function. A checkpoint holds the networks, not
+                the transitions: a resumed training collects new ones. The model of stable-baselines3 beside
+                it holds the optimisers' state, which a resumed training loads. It can be a start, too.
 
         Returns:
             The mean action, without exploration.
@@ -182,10 +181,10 @@ def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
 
 
 class _Adapter(VecEnv):
-    """Shows a Gymnasium vector environment (SAME_STEP autoreset) to stable-baselines3, which is older."""
+    """Adapts a Gymnasium vector environment (SAME_STEP autoreset) to stable-baselines3's older interface."""
 
     def __init__(self, env: ServoVectorEnv, seed: int) -> None:
-        # First, because VecEnv's constructor asks it for its render mode.
+        # First, because VecEnv's constructor reads its render mode.
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._seed = seed
@@ -218,10 +217,10 @@ class _Adapter(VecEnv):
         return observation, reward, over, infos
 
     def close(self) -> None:
-        """The environment is the caller's: it stays open."""
+        """Leave the environment open: it is the caller's."""
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        # stable-baselines3 passes the seed on that the trainer has already given to reset().
+        # stable-baselines3 passes on the seed that the trainer has already given to reset().
         return [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
@@ -244,7 +243,7 @@ def _actor(model: Any) -> Any:
 
 
 class _MeanActor(BaseCallback):
-    """Averages the actor's weights from some step on."""
+    """Averages the actor's weights from a given step on."""
 
     def __init__(self, start: float) -> None:
         super().__init__()
@@ -263,7 +262,7 @@ class _MeanActor(BaseCallback):
         return True
 
     def apply(self, model: SAC) -> Any:
-        """Give the actor its mean weights, where there are any yet, and return it."""
+        """Set the actor's weights to their mean, if there is one, and return it."""
         actor = _actor(model)
         with torch.no_grad():
             for parameter, total in zip(actor.parameters(), self._sum, strict=bool(self._sum)):
@@ -272,7 +271,7 @@ class _MeanActor(BaseCallback):
 
 
 class _Report(BaseCallback):
-    """Reports, writes checkpoints and asks whether to stop, about a hundred times in all."""
+    """Reports, writes checkpoints and asks whether to stop, about a hundred times in total."""
 
     def __init__(
         self,
@@ -307,7 +306,7 @@ class _Report(BaseCallback):
         return not self._files.stop()
 
     def keep(self) -> None:
-        """Write the checkpoint, where one is wanted."""
+        """Write the checkpoint, if requested."""
         if self._files.checkpoint is None:
             return
         model: Any = self.model

@@ -1,6 +1,7 @@
-"""The model of stable-baselines3 beside a checkpoint, for training on with that library or with ours.
+"""The model of stable-baselines3 beside a checkpoint, to continue training with that library or with ours.
 
-stable-baselines3 keeps settings as pickles in it, which could run anything; ours reads its tensors alone.
+stable-baselines3 stores settings in it as pickles, which could run any code; our reader takes only the
+tensors.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ _UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, UnpicklingError, zip
 
 
 def model_path(checkpoint: Path) -> Path:
-    """Return where the model lies: ``policy_sb3.zip`` beside ``policy.safetensors``."""
+    """Return the model's path: ``policy_sb3.zip`` beside ``policy.safetensors``."""
     return checkpoint.with_name(f"{checkpoint.stem}_sb3.zip")
 
 
 def write_model(path: Path, model: SAC) -> None:
-    """Write a model; a file that is there is replaced when the new one is whole."""
+    """Write a model; an existing file is replaced only by a complete one."""
     draft = path.with_name(f".{path.stem}.draft.zip")
     try:
         model.save(draft)
@@ -41,7 +42,7 @@ def write_model(path: Path, model: SAC) -> None:
 
 
 def read_start(path: Path, layout: PolicySpec) -> Checkpoint:
-    """Read what a training starts from: a checkpoint of ours, or a model of stable-baselines3 (.zip).
+    """Read the start of a training: our checkpoint, or a model of stable-baselines3 (.zip).
 
     Raises:
         CheckpointError: It is neither, or of another task.
@@ -57,7 +58,7 @@ def read_start(path: Path, layout: PolicySpec) -> Checkpoint:
 
 
 def restore_optimisers(path: Path, model: SAC) -> bool:
-    """Give a model the optimisers' memory of the one at ``path`` if its networks are the same; say whether.
+    """Copy the optimisers' state from ``path`` to a model if the networks are equal; return whether.
 
     Raises:
         CheckpointError: The file cannot be read.
@@ -75,7 +76,7 @@ def restore_optimisers(path: Path, model: SAC) -> bool:
 
 def _tensors(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
-        # Without its data, which are pickles; tensors are read by torch's own restricted reader.
+        # Without its data, which are pickles; torch's own restricted reader reads the tensors.
         _, parameters, variables = load_from_zip_file(path, load_data=False, device="cpu")
         found, others = dict(parameters), dict(variables or {})
         if not {"policy", *OPTIMISERS} <= set(found) or "log_ent_coef" not in others:

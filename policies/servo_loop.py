@@ -1,7 +1,7 @@
-"""N simulated robots as a host sees them at the control rate: late targets, slow set-points, noisy reports.
+"""N simulated robots as a host sees them at the control rate: delay, speed-limited set-points, sensor noise.
 
-The environments of training and the evaluation stand on this one class. It does, batched, what the emulated
-device does frame by frame; the loop below is :class:`~deal_hw.sim.engine.closed_loop.ClosedLoop`.
+Training environments and evaluation share this class. It does, batched, what the emulated device does frame
+by frame; the loop below it is :class:`~deal_hw.sim.engine.closed_loop.ClosedLoop`.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ class ServoLoop:
 
     Args:
         description: The robot.
-        space: The parameters that members differ in.
+        space: The parameters in which members differ.
         count: Members N.
-        sensor: What stands between the true and the reported state; the description's by default.
+        sensor: Sensor model of the reported state; the description's by default.
         threads: Threads of the physics; None for all CPUs.
         step_s: Physics step [s]; the device period by default.
 
     Attributes:
-        reported_position: What the host is told, (N, C): the joints, after a floating base where there is
-            one. The sensor model is the joints'; the base is reported as it is.
+        reported_position: Reported positions, (N, C): a floating base, if any, then the joints. The sensor
+            model applies to the joints; the base is reported without error.
         reported_velocity: (N, C).
     """
 
@@ -85,16 +85,16 @@ class ServoLoop:
         rng: np.random.Generator,
         setpoint: FloatArray | None = None,
     ) -> None:
-        """Start M of the members anew: armed, set-point and targets at their own position; motors at zero.
+        """Restart M of the members: armed, set-point and targets at their own position; motors at zero.
 
         Args:
             where: The M members, a mask (N,).
             theta: Their parameters, (M, K).
-            latency_s: Their total latencies, (M,) [s]; rounded to device periods. Command delays come on top.
+            latency_s: Their total latencies, (M,) [s]; rounded to device periods. Command delays are added.
             position: Their positions, (M, C).
             velocity: Their velocities, (M, C).
             rng: For the noise of the first report.
-            setpoint: Set-point and targets to start with, (M, A), where they are not the position.
+            setpoint: First set-point and targets, (M, A); the position by default.
         """
         members = np.flatnonzero(where)
         self._theta[members] = theta
@@ -108,8 +108,7 @@ class ServoLoop:
         self._loop.restart(start, latency_s, members)
         period_s = 1.0 / self.description.control_rate_hz
         for age in range(self._window + 1):
-            # The host watched the robot before the episode, too: reports of the past differ by noise and
-            # motion.
+            # The host watched the robot before the episode, too: past reports differ by noise and motion.
             self._reports[age, members] = self._report(position - age * period_s * velocity, rng)
         self._publish(members, velocity)
 
@@ -121,7 +120,7 @@ class ServoLoop:
             rng: For the noise.
 
         Returns:
-            Members whose physics diverged, (N,); their reports are the default pose until they are restarted.
+            Members whose physics diverged, (N,); they report the default pose until they are restarted.
         """
         rate = None
         if self.description.actuation == "position":

@@ -13,9 +13,9 @@ from deal_hw.types import FloatArray
 
 
 class SingleEnv(gymnasium.Env[Observation, FloatArray]):
-    """One member of a vector environment, for libraries that know single environments only.
+    """One member of a vector environment, for libraries that need single environments.
 
-    Its physics are drawn anew at each ``reset``, as those of a member are.
+    Each ``reset`` draws new physics.
 
     Args:
         env: A vector environment of one member.
@@ -39,6 +39,6 @@ class SingleEnv(gymnasium.Env[Observation, FloatArray]):
     def step(self, action: FloatArray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply an action, (A,), for one control period; at the end the last observation is returned."""
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
-        # The batch starts its member anew in the same step.
+        # The batch restarts its member in the same step.
         seen = info["final_obs"] if info else observation
         return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}

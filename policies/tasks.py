@@ -36,15 +36,15 @@ _LEGGED_SAC: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingTask:
-    """What a robot is trained for, and how; the defaults are what its shipped policy was trained with.
+    """A robot's training; the defaults are those of its shipped policy.
 
     Attributes:
-        environment: The environment, "module:class"; it is called as ``environment(description,
-            distribution, members)``.
-        trainer: The usual trainer's name.
+        environment: The environment, "module:class"; called as ``environment(description, distribution,
+            members)``.
+        trainer: The default trainer's name.
         members: Robots simulated at once, by trainer.
-        settings: The trainers' settings that are not their defaults, by trainer.
-        udr_ratio: Uniform domain randomisation reaches this factor to either side of each nominal value.
+        settings: The trainers' settings that differ from their defaults, by trainer.
+        udr_ratio: Factor of uniform domain randomisation on either side of each nominal value.
         udr_latency_s: Lowest and highest total latency of it [s].
     """
 
@@ -64,7 +64,7 @@ class TrainingTask:
         """Return a trainer and its settings for this task.
 
         Args:
-            trainer: Its name; the usual one by default.
+            trainer: Its name; the robot's default by default.
             steps: Environment steps; None for the default.
 
         Raises:
@@ -124,7 +124,7 @@ OWN_TASK: Final = TrainingTask(
     udr_ratio=1.0,
     udr_latency_s=(0.0, 0.0),
 )
-"""A Gymnasium environment that the user names; nothing is known of what suits it."""
+"""The user's own Gymnasium environment; good settings for it are not known."""
 
 
 def training_task(robot: str) -> TrainingTask:

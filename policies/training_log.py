@@ -13,11 +13,7 @@ from deal_hw.training import TrainingStatus
 
 
 class TrainingLog:
-    """Writes scalars against environment steps; nothing where there is no folder.
-
-    Args:
-        folder: For the files; None: none are written.
-    """
+    """Writes scalars over environment steps to a folder; None writes nothing."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
@@ -37,7 +33,7 @@ class TrainingLog:
             self._writer.close()
 
     def write(self, status: TrainingStatus, losses: Mapping[str, float]) -> None:
-        """Write what is known after an update."""
+        """Write the values after an update."""
         if self._writer is None:
             return
         rows = {"train/mean_return": status.mean_return}

@@ -1,9 +1,9 @@
-"""Tries a policy before it may move a robot: its network runs in a process of its own, which can be killed.
+"""Tests a policy before it may move a robot: its network runs in a separate process, which can be killed.
 
-A policy file comes from anywhere. Its network may loop for ever, crash the process that loads it, ask for all
-memory, or answer with NaN where nobody looked. So the process that will watch over the robot never opens it:
-it learns the spec from another process, has it tried there on observations of this robot, and notes the
-file's digest, by which the control process knows later that it opens the same bytes.
+A policy file may come from anywhere. Its network may loop for ever, crash the process that loads it, use all
+memory, or answer with NaN. So the process that supervises the robot never opens the file. It gets the spec
+from another process, tests the network there on observations of this robot, and stores the file's digest. By
+the digest the control process later knows that it opens the same bytes.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from deal_hw.types import FloatArray
 
 _MAX_REPLY_BYTES: Final = 100_000_000
 _REPEATS: Final = 3
-"""How often a late action is timed."""
+"""Repetitions of the timing of a late action."""
 _DYING_S: Final = 1.0
 _ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialSettings:
-    """How far a policy is tried.
+    """Limits and size of a trial.
 
     Attributes:
-        processor_s: Processor time for loading and all observations together, whole seconds [s]; a tenth of
-            one is usual. A busy computer does not use it up.
-        time_limit_s: Time for start, loading and all observations together [s]; half a second is usual.
-        memory_bytes: Memory that loading and running may take beyond what onnxruntime has in use itself.
+        processor_s: Processor time for loading and all observations together, whole seconds [s]; 0.1 s is
+            usual. A busy computer does not use it up.
+        time_limit_s: Time for start, loading and all observations together [s]; 0.5 s is usual.
+        memory_bytes: Memory for loading and running, beyond what onnxruntime itself uses.
         nominal: Observations of the robot at rest in its default pose.
-        random: Observations at random, within the ranges of the description.
-        seed: Fixes these.
+        random: Random observations, within the ranges of the description.
+        seed: Seeds these.
     """
 
     processor_s: int = 10
@@ -63,12 +63,12 @@ class TrialSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialReport:
-    """What a trial found.
+    """Result of a trial.
 
     Attributes:
         spec: The policy's spec.
         digest: SHA-256 of the file's bytes, in hexadecimal.
-        observations: On how many observations it was tried.
+        observations: Number of observations.
         median_s: Median processor time of an action, by kind of state [s].
     """
 
@@ -79,7 +79,7 @@ class TrialReport:
 
 
 class TrialPolicy:
-    """A policy whose network runs in a process of its own; a context manager.
+    """A policy whose network runs in a separate process; a context manager.
 
     Args:
         path: The file.
@@ -89,7 +89,7 @@ class TrialPolicy:
     Attributes:
         path: The file.
         seconds: Processor time of the network's last answer [s].
-        observations: What it was asked, one at a time, so far, each (O,).
+        observations: Single observations so far, each (O,).
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class TrialPolicy:
         self._said = tempfile.TemporaryFile()
         with theirs:
             fd, settings = theirs.fileno(), self._settings
-            # A session of its own: Ctrl-C in the terminal reaches this process alone, which then kills it.
+            # A session of its own: Ctrl-C in the terminal reaches only this process, which then kills it.
             self._child = subprocess.Popen(
                 [
                     sys.executable,
@@ -170,7 +170,7 @@ class TrialPolicy:
         return bool(self._facts["batches"])
 
     def reset(self) -> None:
-        """Nothing to forget: the observation carries the past."""
+        """Do nothing: the observation carries the past."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,).
@@ -183,7 +183,7 @@ class TrialPolicy:
             raise PolicyError(
                 f"{self.path}: field observation[{i}] ({term.quantity} of {term.joint!r}, scale "
                 f"{term.scale:g}) is {observation[i]} in a state that this robot can reach; allowed: finite "
-                "numbers; mend its scale"
+                "numbers; correct its scale"
             )
         self.observations.append(observation)
         action: FloatArray = self.act_batch(observation[None])[0]
@@ -206,7 +206,7 @@ class TrialPolicy:
         return actions
 
     def _ask(self, observations: list[Any] | None = None) -> dict[str, Any]:
-        """Return the answer to observations; the first, which is not asked for, says what the file holds."""
+        """Return the answer to observations; None reads the first message, which describes the file."""
         try:
             if observations is not None:
                 self._connection.send_bytes(json.dumps(observations).encode())
@@ -225,7 +225,7 @@ class TrialPolicy:
         return reply
 
     def _obituary(self) -> str:
-        """Say how the process died."""
+        """Return how the process died, in words."""
         try:
             code = self._child.wait(_DYING_S)
         except subprocess.TimeoutExpired:
@@ -246,7 +246,7 @@ class TrialPolicy:
 def check_policy(
     path: Path, description: RobotDescription, settings: TrialSettings = TrialSettings()
 ) -> TrialReport:
-    """Check a policy file whole: what :class:`TrialPolicy` and :func:`try_policy` do, one after the other.
+    """Check a policy file completely, with :class:`TrialPolicy` and :func:`try_policy`.
 
     Raises:
         PolicyError: It must not run on this robot; the message says why in one line.
@@ -258,10 +258,10 @@ def check_policy(
 def try_policy(
     policy: TrialPolicy, description: RobotDescription, settings: TrialSettings = TrialSettings()
 ) -> TrialReport:
-    """Run a policy on nominal, extreme and random states of a robot, through the code that runs it later.
+    """Run a policy on nominal, extreme and random states of a robot, with the code that runs it later.
 
     Raises:
-        PolicyMismatchError: It was made for another robot, or observes what this one cannot sense.
+        PolicyMismatchError: It was made for another robot, or observes what this one cannot measure.
         PolicyError: It fails, its answer is not finite, or it takes longer than the robot allows.
     """
     source = GivenVelocity()
@@ -290,10 +290,10 @@ def try_policy(
 
 
 def _try(policy: TrialPolicy, behaviour: PolicyBehaviour, probe: Probe, allowed_s: float) -> float:
-    """Return how long a policy takes from a state to a command [s]."""
+    """Return a policy's time from a state to a command [s]."""
     times = [_time_command(policy, behaviour, probe)]
     while times[0] > allowed_s and len(times) < _REPEATS:
-        # Once may be an accident: pages and caches that were cold.
+        # One late action may be an accident: cold pages and caches.
         times.append(_time_command(policy, behaviour, probe))
     if median(times) > allowed_s:
         raise PolicyError(
@@ -307,10 +307,10 @@ def _try(policy: TrialPolicy, behaviour: PolicyBehaviour, probe: Probe, allowed_
 def _time_command(policy: TrialPolicy, behaviour: PolicyBehaviour, probe: Probe) -> float:
     """Return the processor time of a command, here and in the network's process [s].
 
-    What other programs take meanwhile does not count: the control process has priority over them.
+    The time of other programs does not count: the control process has priority over them.
     """
     begun = time.thread_time()
-    # What is too large for the network's numbers is found by act(), and named.
+    # act() finds and names values that are too large for the network's numbers.
     with np.errstate(all="ignore"):
         behaviour.command(probe.state, 0.0)
     return time.thread_time() - begun + policy.seconds

@@ -1,9 +1,9 @@
-"""Runs a policy's network for :mod:`deal_hw.policies.trial`: a process that may hang, crash or be killed.
+"""Runs a policy's network for :mod:`deal_hw.policies.trial`, in a process that may hang, crash or be killed.
 
-Started as ``python -m deal_hw.policies.trial_process FD PARENT MEMORY_BYTES SECONDS FILE``: one end of a
-socket as inherited descriptor, the parent's process id, limits, and the policy. Messages are JSON. The first
-says what the file holds; then each list of observations is answered with actions and the processor time that
-they took [s]. What is wrong is answered as ``{"error": ...}``.
+It is started as ``python -m deal_hw.policies.trial_process FD PARENT MEMORY_BYTES SECONDS FILE``: one end of
+a socket as inherited descriptor, the parent's process id, limits, and the policy. Messages are JSON. The
+first describes the file. Then each list of observations is answered with actions and the processor time [s].
+Errors are answered as ``{"error": ...}``.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _send(connection: Connection, message: dict[str, Any]) -> None:
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Bound what the network may use, beyond what Python and onnxruntime use already."""
+    """Limit memory and processor time of the network, beyond what Python and onnxruntime use already."""
     in_use = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     for kind, limit in (
         (resource.RLIMIT_AS, in_use + memory),

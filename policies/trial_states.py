@@ -1,4 +1,4 @@
-"""The states of a robot on which a policy is tried: nominal, extreme and random, within its description."""
+"""Test states of a robot for a policy: nominal, extreme and random, within its description."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from deal_hw.types import BodyState, FloatArray, RobotState, Status
 Kind = Literal["nominal", "extreme", "random"]
 
 _REACH: Final = {"rad": math.pi, "m": 1.0}
-"""How far from the default pose a joint is taken that may turn or slide for ever [rad or m]."""
+"""Largest distance from the default pose of a joint without position limits [rad or m]."""
 _SPEED: Final = {"rad": 50.0, "m": 5.0}
-"""Speed of a joint whose speed does not trip [rad/s or m/s]."""
+"""Speed of a joint without speed limit [rad/s or m/s]."""
 _TILT_RAD: Final = math.pi
 _TUMBLE_RAD_S: Final = 6.0
 _REST: Final = np.zeros(3)
@@ -26,14 +26,14 @@ _REST: Final = np.zeros(3)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Probe:
-    """One state on which a policy is tried.
+    """One test state.
 
     Attributes:
-        kind: What kind of state it is.
-        name: What is special about it, for messages.
+        kind: Kind of the state.
+        name: Its description, for messages.
         state: The state.
-        velocity: The wanted velocity of the base: ahead, left [m/s], turn [rad/s], (3,).
-        fresh: Whether the past is forgotten first, so that delayed terms show this state, too.
+        velocity: The commanded velocity of the base: ahead, left [m/s], turn [rad/s], (3,).
+        fresh: Whether the past is cleared first, so that delayed terms show this state, too.
     """
 
     kind: Kind
@@ -44,21 +44,20 @@ class Probe:
 
 
 class GivenVelocity:
-    """A wanted velocity that is set from outside, (3,)."""
+    """A commanded velocity that is set from outside, (3,)."""
 
     def __init__(self) -> None:
         self.wanted: FloatArray = _REST
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return it."""
+        """Return the commanded velocity."""
         return self.wanted
 
 
 class ProbeStates:
-    """Makes the states of one robot.
+    """Makes the test states of one robot, inside its trip limits.
 
-    Ranges are those within which the robot does not trip: joint positions and speeds, and the base's tilt and
-    turn rate where it has one.
+    Limits are those of joint positions and speeds, and of the base's tilt and turn rate, if it has one.
 
     Args:
         description: The robot.
@@ -82,7 +81,7 @@ class ProbeStates:
             self._tumble = limits.legs.tumble
 
     def nominal(self, count: int) -> Iterator[Probe]:
-        """Yield the default pose at rest, several times: an action's time varies."""
+        """Yield the default pose at rest, several times, because the time of an action varies."""
         for _ in range(count):
             yield self._probe("nominal", "default pose")
 
@@ -109,7 +108,7 @@ class ProbeStates:
                     yield self._probe("extreme", f"turning about {axis}", gyro=self._tumble * unit)
 
     def random(self, count: int, rng: np.random.Generator) -> Iterator[Probe]:
-        """Yield states at random, one the past of the next."""
+        """Yield random states; each is the past of the next."""
         for i in range(count):
             axis = rng.standard_normal(3)
             yield self._probe(

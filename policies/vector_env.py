@@ -1,4 +1,4 @@
-"""A vectorised Gymnasium environment of servo-driven robots, each with physics of its own."""
+"""A vectorised Gymnasium environment of servo-driven robots with individual physics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from deal_hw.types import FloatArray
 
 
 def check_task(ticks: int, **positive: float) -> None:
-    """Check the settings that tasks have in common.
+    """Check the common settings of tasks.
 
     Args:
         ticks: Control periods in an episode.
@@ -37,26 +37,25 @@ def check_task(ticks: int, **positive: float) -> None:
 
 
 class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
-    """N robots that follow a policy's commands; a task says how they start and what is rewarded.
+    """N robots that follow a policy's commands; a task defines starts and rewards.
 
-    Members that end are started anew in the same step (Gymnasium's SAME_STEP): what they saw last is in
-    ``info["final_obs"]``. Observations come from the class that the robot uses, so the two cannot drift
-    apart.
+    Members that end are restarted in the same step (Gymnasium's SAME_STEP); their last observation is in
+    ``info["final_obs"]``. Observations come from the class that the robot uses, so the two always agree.
 
     Args:
         description: The robot.
-        distribution: What each member's parameters and latency are drawn from at each start of an episode.
-        layout: What is observed and what an action means.
+        distribution: Distribution of each member's parameters and latency, drawn at the start of an episode.
+        layout: Layout of observation and action.
         count: Members N.
-        ticks: Control periods after which an episode is cut off.
-        host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s]: the age
-            of the newest state sample when the policy looks, and the way over the wire.
+        ticks: Control periods after which an episode is truncated.
+        host_delay_s: Lowest and highest delay of the host, added to the distribution's latency [s]: the age
+            of the newest state sample when the policy reads it, and the time on the wire.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
         step_s: Physics step [s]; the device period by default.
 
     Attributes:
-        layout: What is observed and what an action means.
+        layout: Layout of observation and action.
         failure_reward: The reward of the tick in which a member fails.
     """
 
@@ -85,7 +84,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, count)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, count)
-        # What is calibrated rules: the task draws only what the distribution says nothing about.
+        # Calibrated parameters come first: the task draws only those that the distribution does not have.
         given = {(p.kind, name) for p in distribution.space.parameters for name in p.elements}
         self._extra = ParameterSpace(
             p for p in self.surroundings() if not given & {(p.kind, name) for name in p.elements}
@@ -103,7 +102,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self._scale = np.array(layout.action_scale)
         self._default = np.array(layout.default_position)[list(description.actuated_index)]
         if description.actuation == "motor":
-            # An action is an effort itself: a motor has no pose that it is relative to.
+            # An action is an effort: a motor has no reference pose.
             self._default = np.zeros_like(self._default)
 
     @abc.abstractmethod
@@ -111,34 +110,34 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         """Draw positions and velocities at the start of M episodes, (M, C) each."""
 
     def start_setpoint(self) -> FloatArray | None:
-        """Return the set-point and targets episodes start with, (A,); None: each member's position."""
+        """Return the first set-point and targets of episodes, (A,); None for each member's position."""
         return None
 
     def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
-        """Draw what else a task draws for the members, (N,), that start anew; nothing by default."""
+        """Draw further values of a task for the restarted members, (N,); nothing by default."""
 
     def surroundings(self) -> Sequence[Parameter]:
-        """Return parameters that the task draws itself, uniformly, for each episode; none by default."""
+        """Return parameters that the task draws uniformly for each episode; none by default."""
         return ()
 
     def measures(self) -> dict[str, float]:
-        """Return what the task says about the steps since the last call, by name with its unit."""
+        """Return the task's values of the steps since the last call, by name with its unit."""
         return {}
 
     def privileged(self) -> FloatArray:
-        """Return what a critic may know beyond the observation, (N, P); nothing by default."""
+        """Return the critic's information beyond the observation, (N, P); nothing by default."""
         return np.zeros((self.num_envs, 0))
 
     def target(self, action: FloatArray) -> FloatArray:
-        """Return the targets that the robots are sent for actions, (N, A) each."""
+        """Return the targets of actions, (N, A) each."""
         return self._default + self._scale * action
 
     def sensed(self) -> tuple[FloatArray, FloatArray]:
-        """Return the positions and velocities that observations are built from, (N, C) each."""
+        """Return the positions and velocities of observations, (N, C) each."""
         return self.loop.reported_position, self.loop.reported_velocity
 
     def limited(self, action: FloatArray, before: FloatArray) -> FloatArray:
-        """Return the actions, (N, A), that are really taken after those before; all by default."""
+        """Return the actions, (N, A), limited after those before; unchanged by default."""
         return action
 
     @abc.abstractmethod
@@ -161,7 +160,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start all members anew; a whole-number seed fixes everything that follows."""
+        """Restart all members; a whole-number seed fixes everything that follows."""
         super().reset(seed=seed if isinstance(seed, int) else None, options=options)
         self._last_action = np.zeros((self.num_envs, len(self.layout.actuated)))
         self._restart(np.ones(self.num_envs, dtype=bool))
@@ -191,7 +190,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         over = terminated | truncated
         if not over.any():
             return self._observe(), reward, terminated, truncated, {}
-        # The members that go on must see this tick once only: what the others saw last is built on a copy.
+        # Members that go on must observe this tick only once, so the final observation is built on a copy.
         final = copy.deepcopy(self._builder).build(*self.sensed())
         self._restart(over)
         return self._observe(), reward, terminated, truncated, {"final_obs": final, "_final_obs": over}

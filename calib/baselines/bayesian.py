@@ -1,20 +1,20 @@
 """`bo`: Bayesian optimisation (BoTorch): a Gaussian process of the fitness, and batches that may improve it.
 
-The first generation is a scrambled Sobol sequence. Each further one fits a Gaussian process (BoTorch's own:
-one length scale a coordinate, whose prior grows with their number) to what was scored and takes the batch of
-the largest log expected improvement (qLogEI, Ament et al. 2023) inside a trust region around the best point,
-which grows after successes and shrinks after failures (TuRBO, Eriksson et al. 2019). Over the whole range of
+The first generation is a scrambled Sobol sequence. Each further one fits a Gaussian process to the scores
+(BoTorch's own: one length scale per coordinate, whose prior grows with their number). It takes the batch of
+the largest log expected improvement (qLogEI, Ament et al. 2023) in a trust region around the best point. The
+region grows after successes and shrinks after failures (TuRBO, Eriksson et al. 2019). Over the whole range of
 ten coordinates the batch is little better than a random one (measured: worse than the range's midpoint).
 
-Scores have an arbitrary scale and long tails, so the process models their normal quantiles, which keep
-nothing but the order.
+Scores have an arbitrary scale and long tails, so the process models their normal quantiles, which keep only
+the order.
 
-Cost: a Gaussian process of n points takes n^3 operations, so it sees `most_points` at most, the better half
+Cost: a Gaussian process of n points takes n^3 operations. So it sees at most `most_points`, the better half
 by rank and the others by age, and a batch is small: `bo` simulates far fewer members than its budget allows.
 
-Memory: points that the process can never see again are forgotten. BoTorch's models hold themselves in cycles,
-and its matrices are of another size each generation and leave holes between what stays; so after each one
-garbage is collected and malloc (glibc) is asked to hand free pages back.
+Memory: points that the process can never see again are dropped. BoTorch's models refer to themselves in
+cycles, and matrices of a new size each generation fragment the heap. So after each generation garbage is
+collected, and malloc (glibc) returns free pages.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
@@ -47,23 +47,23 @@ class BoSettings:
     """Settings of `bo`.
 
     Attributes:
-        fitness: Name of the fitness. The paper's row has the critic's return, but a critic changes every
-            generation and a Gaussian process models one fixed function, so the default is the trajectory
-            error. With a fitness that changes, each generation scores a part of the earlier members again
-            beside the new ones (the budget's population in all), and the process sees only these.
+        fitness: Name of the fitness. The paper uses the critic's return, but a critic changes every
+            generation and a Gaussian process models one fixed function. So the default is the trajectory
+            error. With a changing fitness each generation scores a part of the earlier members again beside
+            the new ones (the budget's population in total), and the process sees only these.
         batch: New members of a generation after the first, q.
         trust_region: Whether batches are taken near the best point; off is the textbook's search of the whole
             range.
         most_points: Most points of the Gaussian process.
-        elite: Members that make the population of the result, best first.
+        elite: Size of the result's population, best first.
         fit_iterations: Most iterations of the process's fit.
         acquisition_iterations: Most iterations of the acquisition's optimiser.
-        acquisition_starts: From how many starts it is optimised.
-        acquisition_draws: Draws that these starts are chosen from.
-        process_draws: Draws of the process of which the improvement is the mean.
-        scoring: How the fitness scores.
-        linear: Whether the range is linear, as in the paper; off takes equal steps of each parameter's scale.
-        latency: Whether the latency is one more coordinate where it is not given.
+        acquisition_starts: Number of its starts.
+        acquisition_draws: Draws from which the starts are chosen.
+        process_draws: Draws of the process for the mean improvement.
+        scoring: Settings of the fitness.
+        linear: Whether the range is linear, as in the paper; off is uniform in each parameter's own scale.
+        latency: Whether a latency that is not given is one more coordinate.
     """
 
     fitness: str = "trajectory"
@@ -89,49 +89,41 @@ class BoSettings:
             raise ConfigurationError(f"most_points must be at least 4, got {self.most_points}")
 
 
-class TrustRegion(Kept):
-    """The side of the box in which the next batch is taken, in widths of the range (TuRBO, algorithm 1).
+class TrustRegion(Stateful):
+    """The side of the box for the next batch, in widths of the range (TuRBO, algorithm 1).
 
-    Args:
-        failures: Generations without a better point after which the box is halved.
+    It is halved after ``failures`` generations without a better point.
     """
 
-    KEPT = ("length", "_good", "_bad")
+    STATE = ("length", "_good", "_bad")
     LONGEST, FIRST, SHORTEST = 1.6, 0.8, 0.5**7
     SUCCESSES = 3
-    """Better points in a row after which the box is doubled."""
+    """Consecutive better points after which the box is doubled."""
 
     def __init__(self, failures: int) -> None:
         self._failures = failures
         self.length, self._good, self._bad = self.FIRST, 0, 0
 
     def tell(self, *, better: bool) -> None:
-        """Say whether the batch held a better point than all before."""
+        """Update with whether the batch held a better point than all before."""
         self._good, self._bad = (self._good + 1, 0) if better else (0, self._bad + 1)
         if self._good >= self.SUCCESSES:
             self.length, self._good = min(2 * self.length, self.LONGEST), 0
         elif self._bad >= self._failures:
             self.length, self._bad = self.length / 2, 0
         if self.length < self.SHORTEST:
-            # TuRBO forgets all points here; the process is global, so that only the box starts again.
+            # TuRBO forgets all points here; the process is global, so only the box starts again.
             self.length = self.FIRST
 
 
-class GaussianProcessSearch(Kept):
+class GaussianProcessSearch(Stateful):
     """Points in the unit cube, proposed from a Gaussian process of the scores of earlier ones.
 
-    Knows no simulator: it is asked for points and told their fitness. All draws are those of one seed and the
-    generation's number, so that points and scores are the whole state.
-
-    Args:
-        count: Coordinates C.
-        population: Points of the first generation, and of all of them where the fitness changes.
-        settings: Sizes.
-        seed: Decides all draws.
-        stationary: Whether a point's fitness stays what it was; if not, earlier points are scored again.
+    All draws come from one seed and the generation's number, so points and scores are the whole state. Unless
+    the fitness is ``stationary``, each generation has the whole population and scores earlier points again.
     """
 
-    KEPT = ("_points", "_fitness", "_generation", "_seed", "scored", "fallbacks", "region")
+    STATE = ("_points", "_fitness", "_generation", "_seed", "scored", "fallbacks", "region")
 
     def __init__(
         self, count: int, population: int, settings: BoSettings, seed: int, *, stationary: bool
@@ -150,7 +142,7 @@ class GaussianProcessSearch(Kept):
 
     @property
     def points(self) -> FloatArray:
-        """Points with scores that compare, (n, C); the best and the newest of them."""
+        """Points with comparable scores, (n, C): the best and the newest."""
         return self._points
 
     @property
@@ -176,18 +168,12 @@ class GaussianProcessSearch(Kept):
         return self._asked
 
     def tell(self, fitness: FloatArray) -> None:
-        """Add the scores of the points that were asked for.
-
-        Args:
-            fitness: Higher is better, (n,); points that are not finite count as the worst.
-        """
+        """Add the scores, (n,), of the requested points; higher is better, and not finite is the worst."""
         asked = self.ask()
         if fitness.shape != (len(asked),):
-            raise ValueError(
-                f"fitness has shape {fitness.shape}, the points that were asked for {asked.shape}"
-            )
+            raise ValueError(f"fitness has shape {fitness.shape}, the requested points have {asked.shape}")
         if self._generation:
-            # Where the fitness changes, the points that were scored again are the ones to be better than.
+            # If the fitness changes, new points compete with those that were scored again.
             earlier = self._fitness if self._stationary else fitness[: -self._batch]
             new = _ranked(fitness[-self._batch :]).max()
             self.region.tell(better=bool(new > _ranked(earlier).max()))
@@ -201,18 +187,18 @@ class GaussianProcessSearch(Kept):
         self._generation += 1
 
     def _forget(self) -> None:
-        # A point only falls in rank and only ages, so that what is not kept now never would be again.
+        # A point only falls in rank and only ages: once dropped it would never be kept again.
         kept = self._kept(max(self._settings.most_points, 2 * self._settings.elite))
         self._points, self._fitness = self._points[kept], self._fitness[kept]
 
     def _sobol(self, count: int) -> FloatArray:
         seed = np.random.default_rng([self._seed, self._generation])
-        # A power of two of points is balanced; a part of it is the next best thing, not an error.
+        # A power of two of points is balanced; a part of it is nearly so.
         power = max(int(np.ceil(np.log2(count))), 0)
         return np.asarray(Sobol(self._count, rng=seed).random_base2(power)[:count])
 
     def _kept(self, count: int) -> IntArray:
-        """Return the indices of so many points: the better half by rank, the others by age, newest first."""
+        """Return the indices of ``count`` points: the better half by rank, then the newest of the others."""
         best = self.order[: (count + 1) // 2]
         rest = np.setdiff1d(np.arange(len(self._points)), best)
         return np.sort(np.concatenate([best, rest[::-1][: count - len(best)]]))
@@ -245,13 +231,8 @@ def _largest_improvement(
 ) -> FloatArray | None:
     """Return the batch of the largest qLogEI, (batch, C), or None where the process could not be fitted.
 
-    Args:
-        points: (n, C) in the unit cube.
-        value: What the process models, (n,).
-        batch: Points to return.
-        side: Mean side of the box around the best point in which to look; None for the unit cube.
-        seed: Decides all draws.
-        settings: Iterations and draws.
+    Points, (n, C), are in the unit cube, with the modelled values (n,). ``side`` is the mean side of the box
+    around the best point; None for the unit cube.
     """
     _require_botorch()
     import torch
@@ -267,7 +248,7 @@ def _largest_improvement(
     from deal_hw.calib.search.critic import torch_threads
 
     x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
-    # BoTorch draws its starts from torch's global generator; the fork gives the caller's back.
+    # BoTorch draws its starts from torch's global generator; the fork restores it.
     with warnings.catch_warnings(), torch_threads(1), torch.random.fork_rng(devices=[]):
         warnings.simplefilter("ignore")
         torch.manual_seed(seed)
@@ -296,7 +277,7 @@ def _largest_improvement(
 
 
 def _box(points: FloatArray, value: FloatArray, model: Any, side: float | None) -> FloatArray:
-    """Return the bounds in which the batch is taken, (2, C): longer where the process varies less."""
+    """Return the bounds of the batch, (2, C): longer where the process varies less."""
     C = points.shape[1]
     if side is None:
         return np.stack([np.zeros(C), np.ones(C)])
@@ -313,7 +294,7 @@ class _Bo(ScoredStepper):
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
-        # Now rather than after the first generation has been simulated.
+        # Fail now rather than after the first generation has been simulated.
         _require_botorch()
         self._search = GaussianProcessSearch(
             self.coordinates.count,
@@ -359,7 +340,7 @@ class BayesianOptimisation(RangedSearch):
 
 
 def critic_return() -> BayesianOptimisation:
-    """Return the paper's row, `bo-critic`: Bayesian optimisation of the critic's return."""
+    """Return `bo-critic`, the paper's baseline: Bayesian optimisation of the critic's return."""
     return BayesianOptimisation(BoSettings(fitness="critic", linear=True, latency=False), name="bo-critic")
 
 
@@ -370,8 +351,8 @@ def _trimmer() -> Callable[[int], int]:
 
 
 def _give_back() -> None:
-    """Free what a Gaussian process leaves behind and hand free pages back to the system where malloc can."""
-    # Its model refers to itself: a megabyte and more a generation that waits for the collector's last round.
+    """Free what a Gaussian process leaves behind, and return free pages to the system where malloc can."""
+    # Its model refers to itself: over a megabyte per generation that waits for the collector's last round.
     gc.collect()
     _trimmer()(0)
 
@@ -379,7 +360,7 @@ def _give_back() -> None:
 def _require_botorch() -> None:
     try:
         with warnings.catch_warnings():
-            # It uses parts of torch that are on their way out.
+            # It uses deprecated parts of torch.
             warnings.simplefilter("ignore")
             import botorch  # noqa: F401
     except ImportError as err:  # pragma: no cover - the extra is installed where the tests run

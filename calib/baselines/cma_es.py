@@ -1,7 +1,7 @@
 """`cma`: covariance matrix adaptation (pycma) with restarts of growing population, on a pluggable fitness.
 
-The baseline of robot calibration in practice (PACE, NVIDIA's extension). Restarts double the population
-(IPOP, Auger and Hansen 2005) and begin at a uniform draw; the first one begins at the midpoint of the range.
+It is the usual baseline of robot calibration (PACE, NVIDIA's extension). Restarts double the population
+(IPOP, Auger and Hansen 2005) and begin at a uniform draw. The first run begins at the midpoint of the range.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
 
@@ -27,13 +27,13 @@ class CmaSettings:
 
     Attributes:
         fitness: Name of the fitness.
-        population: Members of the first run; None for pycma's own 4 + 3 ln C, at most the budget's. At equal
-            simulated members many small populations get far nearer than few large ones (measured, 10
-            coordinates, 1200 members: 28 and 13 against 78 and 30 in log_error_x100).
+        population: Members of the first run; None for pycma's own 4 + 3 ln C, at most the budget's. With
+            equally many simulated members, many small populations get far nearer than few large ones
+            (measured, 10 coordinates, 1200 members: 28 and 13 against 78 and 30 in log_error_x100).
         growth: Factor of the population from one restart to the next (IPOP: 2).
         sigma: First step size, in widths of the range.
-        least_step: A run is over when no coordinate moves more than this, in widths of the range.
-        scoring: How the fitness scores.
+        least_step: A run ends when no coordinate moves more than this, in widths of the range.
+        scoring: Settings of the fitness.
     """
 
     fitness: str = "trajectory"
@@ -54,17 +54,11 @@ class CmaSettings:
             )
 
 
-class RestartedCma(Kept):
-    """CMA-ES in the unit cube, restarted when a run is over; all randomness comes from one seed.
+class RestartedCma(Stateful):
+    """CMA-ES in the unit cube, restarted when a run has ended; all randomness comes from one seed.
 
-    Knows no simulator: it is asked for a population and told its cost. pycma's state cannot be stored but by
-    pickling, so what is stored is the costs it was told: asked and told again it is where it was.
-
-    Args:
-        count: Coordinates C.
-        population: Members of the first run.
-        settings: Step sizes and growth.
-        seed: Decides all draws.
+    pycma's state can only be stored by pickling. So the costs are stored, and replaying them restores the
+    state.
     """
 
     def __init__(self, count: int, population: int, settings: CmaSettings, seed: int) -> None:
@@ -78,14 +72,14 @@ class RestartedCma(Kept):
 
     def _begin(self) -> None:
         self.restarts += 1
-        # Each run has its own stream, so that where one ends does not shift the draws of the next.
+        # Each run has its own stream, so that the end of one does not shift the draws of the next.
         rng = np.random.default_rng([self._seed, self.restarts])
         start = np.full(self._count, 0.5) if self.restarts == 0 else rng.random(self._count)
         self.population = self._first * self._settings.growth**self.restarts
         options = {
             "bounds": [0.0, 1.0],
             "popsize": self.population,
-            # The seed "not a number" leaves numpy's global generator alone, which `randn` replaces.
+            # The seed "not a number" leaves numpy's global generator alone; `randn` replaces that.
             "seed": np.nan,
             "randn": lambda *shape: rng.standard_normal(shape),
             "tolx": self._settings.least_step,
@@ -112,17 +106,13 @@ class RestartedCma(Kept):
         return self._asked
 
     def tell(self, cost: FloatArray) -> bool:
-        """Update, and begin the next run where this one is over.
+        """Update with costs, (population,), lower is better; return whether a new run began.
 
-        Args:
-            cost: Lower is better, (population,); members that are not finite count as worse than the worst.
-
-        Returns:
-            Whether a new run was begun.
+        Members that are not finite count as worse than the worst.
         """
         asked = self.ask()
         if cost.shape != (len(asked),):
-            raise ValueError(f"cost has shape {cost.shape}, the population that was asked for {asked.shape}")
+            raise ValueError(f"cost has shape {cost.shape}, the requested population has {asked.shape}")
         self._costs.append(np.array(cost, dtype=float))
         self._strategy.tell(list(asked), _finite(cost).tolist())
         self._asked = None
@@ -132,26 +122,27 @@ class RestartedCma(Kept):
         return True
 
     def save(self) -> State:
-        """Return the costs that were told so far, and the mean they lead to."""
+        """Return the costs so far, and the mean to which they lead."""
         flat = np.concatenate(self._costs) if self._costs else np.empty(0)
         return {"seed": self._seed, "first": self._first, "costs": flat, "mean": self.mean}
 
     def load(self, state: State) -> None:
-        """Ask and tell what was told before.
+        """Replay the saved costs.
 
         Raises:
-            DatasetError: That leads elsewhere: another version of pycma or of the numerical libraries.
+            DatasetError: They lead to another mean, with another version of pycma or of the numerical
+                libraries.
         """
         self._seed, self._first = int(state["seed"]), int(state["first"])
         self._costs, self._asked, self.restarts = [], None, -1
         self._begin()
         costs, at = np.asarray(state["costs"], dtype=float), 0
         while at < len(costs):
-            # Told by its present size: `tell` may begin a run with a larger population.
+            # By its present size: `tell` may begin a run with a larger population.
             size = self.population
             self.tell(costs[at : at + size])
             at += size
-        # Off by more than rounding, the libraries are not those of the saved run.
+        # A difference above rounding means other libraries than those of the saved run.
         if not np.allclose(self.mean, state["mean"], rtol=0.0, atol=1e-9):
             raise DatasetError(
                 "the saved run of `cma` cannot be repeated here: its costs lead to another mean; resume it "
@@ -160,7 +151,7 @@ class RestartedCma(Kept):
 
 
 class _Cma(ScoredStepper):
-    KEPT = ("_search", "_fitness", "_scored", "_best")
+    STATE = ("_search", "_fitness", "_scored", "_best")
 
     settings: CmaSettings
 
@@ -175,12 +166,12 @@ class _Cma(ScoredStepper):
 
     @property
     def finished(self) -> bool:
-        """Whether the next population would be more than what is left of the budget."""
+        """Whether the next population would exceed the rest of the budget."""
         budget = self.log.budget
         return bool(self._scored + self._search.population > budget.population * budget.generations)
 
     def step(self) -> None:
-        """Ask, score and tell, until the share of one of the budget's generations is used up."""
+        """Ask, score and tell, until the share of one generation of the budget is used up."""
         share = (len(self.log.trace) + 1) * self.log.budget.population
         scored = diverged = 0.0
         while True:
@@ -209,7 +200,7 @@ class _Cma(ScoredStepper):
     def found(self) -> tuple[Members, Members]:
         """Return the best member of all runs, and the population of its run.
 
-        Where the fitness changes over the generations, the best of the last one.
+        With a changing fitness, the best of the last generation.
         """
         best = self._best
         return self.coordinates.members(best.unit[None]), self.coordinates.members(best.population)
@@ -227,11 +218,8 @@ class Cma(Search):
     settings: CmaSettings = field(default_factory=CmaSettings)
 
 
-class Best(Kept):
-    """The best member so far; before any was scored, the midpoint of the range.
-
-    Args:
-        count: Coordinates C.
+class Best(Stateful):
+    """The best member so far; before any score, the midpoint of the range.
 
     Attributes:
         unit: Its unit coordinates, (C,).
@@ -240,20 +228,16 @@ class Best(Kept):
         population: The last population of that run, (n, C).
     """
 
-    KEPT = ("unit", "fitness", "run", "population")
+    STATE = ("unit", "fitness", "run", "population")
 
     def __init__(self, count: int) -> None:
         self.unit, self.fitness, self.run = np.full(count, 0.5), -float("inf"), 0
         self.population = np.stack([np.zeros(count), np.ones(count)])
 
     def tell(self, unit: FloatArray, fitness: FloatArray, run: int, *, keep: bool) -> None:
-        """Look at a further population.
+        """Update with a population of a run, (n, C), and its fitness, (n,); -inf where a member diverged.
 
-        Args:
-            unit: The population, (n, C).
-            fitness: Its fitness, (n,); -inf where a member diverged.
-            run: The run it belongs to.
-            keep: Whether earlier fitness compares with this one.
+        ``keep`` says whether earlier fitness is comparable with this one.
         """
         top = int(np.argmax(fitness))
         if fitness[top] > self.fitness or (not keep and np.isfinite(fitness[top])):
@@ -263,7 +247,7 @@ class Best(Kept):
 
 
 def _finite(cost: FloatArray) -> FloatArray:
-    """Return costs in which members that are not finite are worse than all others, (N,)."""
+    """Return costs, (N,), with members that are not finite worse than all others."""
     usable = np.isfinite(cost)
     if not usable.any():
         return np.zeros(len(cost))
@@ -274,7 +258,7 @@ def _finite(cost: FloatArray) -> FloatArray:
 def _pycma() -> Any:
     try:
         with warnings.catch_warnings():
-            # It warns of plotting packages that are not there.
+            # It warns about missing plotting packages.
             warnings.simplefilter("ignore")
             import cma
     except ImportError as err:  # pragma: no cover - the extra is installed where the tests run

@@ -1,11 +1,11 @@
 """`easi`: evolution strategy against a critic (EASI, Dong et al., NeurIPS 2024), the paper's first baseline.
 
-Each generation rolls every member out, trains the critic on these rollouts, scores them by the trained critic
-and refits a diagonal Gaussian to the better half, from which the next generation is drawn. There is neither a
-step-size control nor a covariance: the spread of the elites is the step.
+Each generation rolls every member out, trains the critic on these rollouts and scores them by it. Then it
+fits a diagonal Gaussian to the better half and draws the next generation from it. There is neither step-size
+control nor a covariance: the spread of the elites is the step.
 
-Written from the method's description and from the constants of its published program (population, survival
-rate, weights, critic); where we deviate it is said at the place.
+Written from the method's description and the constants of its published program (population, survival rate,
+weights, critic). Deviations are noted in place.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -30,13 +30,13 @@ class EasiSettings:
 
     Attributes:
         fitness: Name of the fitness; EASI's is the critic.
-        survive_rate: Share of members that are elites; at most a half, beyond which weights are negative.
+        survive_rate: Share of elites; at most a half, beyond which weights are negative.
         linear: Whether the range is linear, as published; then one of ratio xi^2 has its midpoint at half its
-            upper end. Off takes equal steps of each parameter's own scale (log for positive ones).
-        latency: Whether the latency, which EASI does not know, is one more coordinate where it is not given.
+            upper end. Off is uniform in each parameter's own scale (log for positive ones).
+        latency: Whether a latency that is not given is one more coordinate; EASI has none.
         critic: The published critic (two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation).
-        batch_per_member: Transitions in one of the critic's batches for each member of the population (16).
-        scoring: How the fitness scores, but for the critic.
+        batch_per_member: Transitions in a batch of the critic per member of the population (16).
+        scoring: Settings of the fitness, except the critic.
     """
 
     fitness: str = "critic"
@@ -53,28 +53,18 @@ class EasiSettings:
 
 
 def elite_weights(population: int, elites: int) -> FloatArray:
-    """Return the weights of the elites, best first, (elites,); they sum to 1.
-
-    Args:
-        population: Members N.
-        elites: How many of them survive, at most N / 2.
-    """
+    """Return the weights of the elites of N members, best first, (elites,), at most N / 2; they sum to 1."""
     raw = np.log(0.5 * (population + 1)) - np.log(np.arange(1, elites + 1))
     return np.asarray(raw / raw.sum())
 
 
-class EliteGaussian(Kept):
-    """A diagonal Gaussian in the unit cube that is refitted to the best members of its own sample.
+class EliteGaussian(Stateful):
+    """A diagonal Gaussian in the unit cube that is fitted to the best members of its own sample.
 
-    Knows no simulator: it is asked for a population and told its fitness.
-
-    Args:
-        population: The first members, (N, C), drawn uniformly.
-        survive_rate: Share of members that are elites.
-        rng: Draws all later members.
+    The first members, (N, C), are drawn uniformly.
     """
 
-    KEPT = ("_population", "mean", "std")
+    STATE = ("_population", "mean", "std")
 
     def __init__(self, population: FloatArray, survive_rate: float, rng: np.random.Generator) -> None:
         if len(population) < 2:
@@ -90,13 +80,10 @@ class EliteGaussian(Kept):
         return self._population.copy()
 
     def tell(self, fitness: FloatArray) -> None:
-        """Refit to the elites and draw the next population.
+        """Fit the elites and draw the next population; fitness (N,), not finite for no elite.
 
-        The published program calls the first half of the random start its first elite, without a look at
+        The published program takes the first half of the random start as its first elite, without a look at
         fitness; here the first generation is scored like the others.
-
-        Args:
-            fitness: Higher is better, (N,); members that are not finite are never elites.
         """
         usable = np.flatnonzero(np.isfinite(fitness))
         if usable.size:

@@ -1,8 +1,8 @@
 """`ekf`: parameters as additional states of an extended Kalman filter that runs along the recording.
 
-The filter of the paper's Table 6: the state is (positions, velocities, parameters in their own scale and the
-latency), the model is one sample of simulation, its Jacobian that of forward differences in one batch. It is
-extended, not unscented or ensemble: what bends between the mean and its uncertainty is lost.
+It is the filter of the paper's Table 6. The state is (positions, velocities, parameters in their own scale,
+latency). The model is one sample of simulation, and its Jacobian comes from forward differences in one batch.
+The filter is extended, not unscented or ensemble: nonlinearity within the uncertainty is ignored.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from deal_hw.types import FloatArray
 class ExtendedKalman:
     """An extended Kalman filter with numeric Jacobians; it knows no simulator.
 
-    The first n of its D states move; the others, the parameters, stay. Ask for the points, let them move by
-    one step, tell what came out.
+    The first n of its D states move; the others, the parameters, stay. :meth:`ask` returns the points to
+    simulate for one step, and :meth:`tell` takes the results.
 
     Args:
         mean: First mean, (D,).
         covariance: First covariance, (D, D).
-        moving: How many states move, n.
+        moving: Number of moving states, n.
         step: Step of the forward differences, (D,).
         noise: Variance that is added before each step, (D,).
     """
@@ -43,21 +43,21 @@ class ExtendedKalman:
         self._moving, self._step, self._noise = moving, step, noise
 
     def ask(self) -> FloatArray:
-        """Return the mean and, for each state, the mean with that state moved: (1 + D, D)."""
+        """Return the mean and, for each state, the mean with that state changed: (1 + D, D)."""
         return np.concatenate([self.mean[None], self.mean + np.diag(self._step)])
 
     def tell(self, moved: FloatArray, observed: FloatArray, measured: FloatArray, std: FloatArray) -> float:
         """Predict and update.
 
         Args:
-            moved: Moving states after the step of each point that was asked, (1 + D, n).
-            observed: What each would measure then, (1 + D, M).
-            measured: What was measured, (M,).
-            std: Its standard deviation, (M,); infinite where nothing was measured.
+            moved: Moving states of each point after the step, (1 + D, n).
+            observed: Predicted measurements of each, (1 + D, M).
+            measured: The measurements, (M,).
+            std: Their standard deviation, (M,); infinite for missing ones.
 
         Returns:
-            The innovation's squared length in its own covariance over the channels: 1 on average for a filter
-            that is right.
+            The innovation's squared length in its own covariance over the channels: 1 on average for a
+            consistent filter.
         """
         n, D = self._moving, len(self.mean)
         known = np.isfinite(std)
@@ -79,7 +79,7 @@ class ExtendedKalman:
         return float(innovation @ np.linalg.solve(S, innovation)) / int(known.sum())
 
     def restart(self, mean: FloatArray, std: FloatArray) -> None:
-        """Put the moving states elsewhere, (n,) each, and forget what ties the parameters to them."""
+        """Reset the moving states, (n,) each, and their correlation with the parameters."""
         n = self._moving
         self.mean[:n] = mean
         self.covariance[:n], self.covariance[:, :n] = 0.0, 0.0
@@ -91,16 +91,15 @@ class EkfSettings:
     """Settings of `ekf`.
 
     Attributes:
-        passes: Runs along all recordings, at most the budget's generations. Each starts at the parameters
-            that the last one ended with and with the first one's covariance, so that no sample counts twice.
-        parameter_drift: Standard deviation by which a parameter may drift in one second, in parts of its
-            range.
-        velocity_noise: Standard deviation that the model's error adds to a velocity in one sample, in parts
-            of the start states' uncertainty.
-        first_noise_factor: Factor on the sensors' standard deviations in the first pass; it falls by equal
-            ratios to 1 in the last. While the parameters are far off, what bends outweighs the noise.
-        diverged: Innovations that are so many times their own variance say that the filter does not follow
-            the recording.
+        passes: Runs along all recordings, at most the budget's generations. Each starts at the last one's
+            parameters and with the first one's covariance, so that no sample counts twice.
+        parameter_drift: Standard deviation of a parameter's drift in one second, in parts of its range.
+        velocity_noise: Standard deviation of the model's error in a velocity per sample, in parts of the
+            start states' uncertainty.
+        first_noise_factor: Factor on the sensors' standard deviations in the first pass. It falls by equal
+            ratios to 1 in the last. Far from the truth, nonlinearity outweighs the noise.
+        diverged: Ratio of the innovations to their own variance above which the filter does not follow the
+            recording.
     """
 
     passes: int = 8
@@ -114,7 +113,7 @@ class _Passes(Stepper):
     """One run: a generation is one pass along all recordings."""
 
     settings: EkfSettings
-    KEPT = ("_value", "_covariance", "_lost", "_misfit")
+    STATE = ("_value", "_covariance", "_lost", "_misfit")
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
@@ -122,7 +121,7 @@ class _Passes(Stepper):
         self._low, self._high = value_bounds(log.problem)
         space = log.problem.space
         self._free_latency = log.problem.fixed_latency_s is None
-        # A range is a flat prior: its midpoint and its standard deviation, where nothing better is expected.
+        # A range is a flat prior: its midpoint and standard deviation, where a parameter has no own prior.
         expected, spread = space.prior
         known = np.isfinite(spread)
         self._drift = np.append(space.width, self._high[-1] - self._low[-1])
@@ -185,7 +184,7 @@ class _Passes(Stepper):
         return ExtendedKalman(np.append(np.zeros(n), self._value[:P]), covariance, n, steps, noise)
 
     def _along(self, filter_: ExtendedKalman, data: WindowData, factor: float) -> Iterator[float]:
-        """Run along one recording with the sensors' standard deviations times a factor."""
+        """Run along one recording with the sensors' standard deviations multiplied by a factor."""
         problem = self.problem
         C, P = problem.coordinates, len(self._prior_std)
         states = problem.starts[data.episode]
@@ -232,7 +231,7 @@ class _Passes(Stepper):
             alarms.append(
                 Alarm(
                     f"The filter's innovations are {self._misfit:.1f} times their own variance.",
-                    "The filter diverged: its covariance means nothing.",
+                    "The filter diverged: its covariance is not valid.",
                     "Use another method, or narrower ranges (--range NAME LOW HIGH).",
                 )
             )

@@ -1,10 +1,10 @@
 """`gauss-newton`: random draws, the best refined one by one, drawn again until the residual is explained.
 
 Many scattered starts beat one concentrated search here: a draw whose effort or speed limit is never reached
-sits on a plateau with a zero gradient, and only another draw leads away from it. The residual is that of
-`eki`, window innovations whitened for sensor noise and start-state error, so start states need no unknowns of
-their own; the solver is that of all fits (:func:`deal_hw.calib.fit.solver.minimise`). Every start is refined
-to its end: stopped at the first that seemed explained, one of six tuning seeds ended in a wrong minimum.
+is on a plateau with a zero gradient, and only another draw leads away from it. The residual is that of `eki`:
+window innovations whitened for sensor noise and start-state error, so start states are no unknowns. The
+solver is that of all fits (:func:`deal_hw.calib.fit.solver.minimise`). Every start is refined to its end:
+stopped at the first that seemed explained, one of six tuning seeds ended in a wrong minimum.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ class GaussNewtonSettings:
 
     Attributes:
         draws: Parameter vectors that are scored before each multi-start.
-        draw_share: Drawing takes at most one part in so many of a small budget's generations.
-        starts: The best of them that are refined.
-        survivors: Starts that go on to each further stage.
-        noisy_ticks: Window lengths of the stages in control periods, where positions carry noise.
-        clean_ticks: The same where they carry none.
-        rounds: How often a start is refined in one stage, whitened anew around where it is.
-        solver: How it is refined. The prior around the start is wide: what is not seen is drawn, not held.
-        converged: Relative gain of the residual below which a further round is not worth its simulations.
-        restart_chi2: A residual above this is not explained: draw again.
+        draw_share: Inverse of the largest part of a small budget's generations for draws.
+        starts: Number of the best draws that are refined.
+        survivors: Number of starts in each further stage.
+        noisy_ticks: Window lengths of the stages for noisy positions [control periods].
+        clean_ticks: The same for positions without noise.
+        rounds: Refinements of a start in one stage, each whitened around the present point.
+        solver: Solver of the refinement. The prior around the start is wide: insensitive parameters are
+            drawn, not held.
+        converged: Relative gain of the residual below which no further round follows.
+        restart_chi2: Chi2 above which new starts are drawn.
     """
 
     draws: int = 500
@@ -54,21 +55,21 @@ class GaussNewtonSettings:
 
 
 def members_of(problem: Problem, values: FloatArray) -> Members:
-    """Return parameters in their own scale with the latency, (N, K + 1), in physical units."""
+    """Return values in the parameters' own scale with the latency, (N, K + 1), in physical units."""
     return Members(problem.space.from_scale(values[:, :-1]), values[:, -1])
 
 
 class Innovations:
     """Window innovations, whitened around one simulator, of parameters in their own scale and the latency.
 
-    What is expected of parameters (their priors) stands behind them as one more residual each.
+    The parameters' priors follow as one more residual each.
 
     Args:
         problem: Data and simulator.
         ticks: Window length in control periods.
         centre: The simulator to linearise around, (K + 1,).
-        follow: Linearise around the start states that are most probable there, not around the smoothed ones;
-            right once the simulator is nearly right.
+        follow: Linearise around the most probable start states there, not around the smoothed ones; right
+            once the simulator is nearly right.
     """
 
     def __init__(self, problem: Problem, ticks: int, centre: FloatArray, *, follow: bool) -> None:
@@ -89,7 +90,7 @@ class Innovations:
         self._mean, self._std = problem.space.to_scale(mean)[self._expected], std[self._expected]
 
     def residuals(self, values: FloatArray) -> FloatArray:
-        """Return the whitened residuals of values, (N, K + 1), in one batch: (N, M)."""
+        """Return the whitened residuals, (N, M), of values, (N, K + 1), in one batch."""
         members = members_of(self.problem, values)
         found = whitened_residual(self.problem, members, members, self.windows, whitenings=self._whitenings)
         off = (values[:, self._expected] - self._mean) / self._std
@@ -100,28 +101,28 @@ class Innovations:
         return np.asarray(self.residuals(value[None])[0])
 
     def jacobian(self, value: FloatArray) -> FloatArray:
-        """Return forward differences, (M, K + 1); 0 for a latency that is given."""
+        """Return forward differences, (M, K + 1); 0 for a given latency."""
         points = np.repeat(value[None], 1 + len(self._steps), axis=0)
         points[1:, : len(self._steps)] += np.diag(self._steps)
         r = self.residuals(points)
         found = np.zeros((r.shape[1], len(value)))
-        # A column that diverges where its base does not says nothing about the way to go.
+        # A column that diverges beside a finite base gives no direction.
         slopes = (r[1:] - r[0]) / self._steps[:, None]
         found[:, : len(self._steps)] = np.nan_to_num(slopes, posinf=0.0, neginf=0.0).T
         return found
 
     def split(self, residual: FloatArray) -> tuple[FloatArray, ...]:
-        """Return one residual, (M,), by episodes: (W, H, channels) each; without what is expected."""
+        """Return one residual, (M,), by episodes, (W, H, channels) each, without the priors."""
         ends = np.cumsum([d.measured.size for d in self.windows])
         parts = np.split(residual[: ends[-1]], ends[:-1])
         return tuple(p.reshape(d.measured.shape) for p, d in zip(parts, self.windows, strict=True))
 
 
 class _MultiStart(Stepper):
-    """One run: draw, refine one start a generation, stage by stage, draw again."""
+    """One run: draw, refine one start per generation, stage by stage, draw again."""
 
     settings: GaussNewtonSettings
-    KEPT = ("_stage", "_number", "_restarts", "_explained", "_drawn", "_values", "_chi2", "_best")
+    STATE = ("_stage", "_number", "_restarts", "_explained", "_drawn", "_values", "_chi2", "_best")
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
@@ -164,8 +165,8 @@ class _MultiStart(Stepper):
         budget, settings = self.log.budget, self.settings
         members = self.coordinates.members(self.coordinates.sample(self.rng, budget.population))
         values = self._values_of(members)
-        # One metric for all draws, that of the range's midpoint, and absolute values: most draws are so far
-        # off that squares would rank them by their one worst window.
+        # One metric for all draws, that of the range's midpoint. Absolute values, because squares would rank
+        # most draws, which are far off, by their one worst window.
         innovations = Innovations(self.problem, self._ticks[0], self._midpoint, follow=False)
         score = np.mean(np.abs(innovations.residuals(values)), axis=1) ** 2
         pool = np.concatenate([self._values, values])
@@ -205,7 +206,7 @@ class _MultiStart(Stepper):
             self._end_stage()
 
     def _keep_best(self) -> None:
-        # Residuals over shorter windows, and scores of draws, do not compare with those of the last stage.
+        # Residuals over shorter windows and scores of draws are not comparable with those of the last stage.
         at = int(np.argmin(self._chi2))
         chi2 = float(self._chi2[at]) if self._stage == len(self._ticks) - 1 else math.inf
         if chi2 <= self._best[0]:

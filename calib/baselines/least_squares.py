@@ -2,12 +2,12 @@
 
 And `least-squares-multistart`, a stronger one for real recordings: windows, a latency, several starts.
 
-The plain textbook baseline, as the paper's Table 6 means it. Every control period starts from the state that
-the robot reported, the simulation predicts the next one, and `scipy.optimize.least_squares` (trust region,
-with the ranges as bounds) minimises the sum of squared differences, from the midpoint of the ranges on. Each
-recorded quantity is divided by how much it changes in one control period; that is all the weighing there is.
-No noise model, no latency but one that is given, no second start: errors in the recorded states go into the
-parameters, and a start on a plateau stays there. Parameters are in their own scale (log for positive ones).
+The first is the plain textbook baseline of the paper's Table 6. Every control period starts from the reported
+state, and the simulation predicts the next one. `scipy.optimize.least_squares` (trust region, with the ranges
+as bounds) minimises the sum of squared differences from the midpoint of the ranges. Each recorded quantity is
+divided by its change in one control period; there are no other weights. There is no noise model, no latency
+unless given, and no second start: errors in the recorded states go into the parameters, and a start on a
+plateau stays there. Parameters are in their own scale (log for positive ones).
 """
 
 from __future__ import annotations
@@ -40,9 +40,8 @@ class LeastSquaresSettings:
     """Settings of `least-squares`.
 
     Attributes:
-        tolerance: Relative change of cost and parameters at which the search rests.
-        diverged: Difference, in typical changes, that stands for a simulation that diverged: scipy takes no
-            infinities.
+        tolerance: Relative change of cost and parameters at which the search ends.
+        diverged: Residual of a diverged simulation [typical changes]: scipy takes no infinities.
     """
 
     tolerance: float = 1e-8
@@ -51,18 +50,18 @@ class LeastSquaresSettings:
 
 @dataclass(frozen=True, slots=True)
 class FittedStart:
-    """What a one-shot optimiser found.
+    """Result of a one-shot optimiser.
 
     Attributes:
         theta: Physical values, (K,).
         covariance: In each parameter's own scale, (K, K).
-        latency_s: Latency that was assumed [s].
+        latency_s: The assumed latency [s].
         iterations: Iterations of the optimiser.
         message: Why it stopped.
-        source: Where the intervals come from, in words.
-        steps: Physics steps that it simulated past the problem's own simulator.
+        source: Source of the intervals, in words.
+        steps: Physics steps outside the problem's own simulator.
         alarms: Reasons to distrust it.
-        interval: 90 % intervals where the optimiser has its own, (K, 2); None: from the covariance.
+        interval: The optimiser's own 90 % intervals, (K, 2); None: from the covariance.
     """
 
     theta: FloatArray
@@ -77,10 +76,10 @@ class FittedStart:
 
 
 class OneShot(Stepper):
-    """A run of an optimiser that cannot be stopped in the middle: one generation."""
+    """A run of an optimiser that cannot be interrupted: one generation."""
 
     EXPLAINED_TICKS = 10
-    """Window length of the residual that the result states, in control periods."""
+    """Window length of the stated residual, in control periods."""
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: OneShotSearch) -> None:
         super().__init__(log, rng, search)
@@ -102,7 +101,7 @@ class OneShot(Stepper):
         return Members(found.theta[None], np.array([self.coordinates.clip_latency(found.latency_s)]))
 
     def result(self) -> CalibrationResult:
-        """Return what the optimiser found."""
+        """Return the optimiser's result."""
         found = self._found
         if found is None:
             raise InsufficientDataError("the optimiser has not run yet; call step() first")
@@ -128,7 +127,7 @@ class OneShot(Stepper):
         )
 
     def save(self) -> State:
-        """Return what was found."""
+        """Return the result, if there is one."""
         return {"found": None if self._found is None else dataclasses.asdict(self._found)}
 
     def load(self, state: State) -> None:
@@ -143,8 +142,7 @@ class OneShot(Stepper):
 class OneShotSearch(Search, abc.ABC):
     """A search by an optimiser that is one call, so a run is one generation.
 
-    Interrupted in the middle of it, a run begins anew, to the same numbers. The budget's generations bound
-    the optimiser's iterations.
+    An interrupted run begins again, with the same result. The budget's generations limit the iterations.
     """
 
     stepper = OneShot
@@ -168,14 +166,9 @@ class LeastSquaresBaseline(OneShotSearch):
 
 
 def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return s^2 inv(J'J) with the range as a flat prior, which keeps what the data cannot see finite.
+    """Return s^2 inv(J'J), (K, K), from derivatives (R, K) in each parameter's own scale, and residuals (R,).
 
-    Where a parameter has a prior of its own that is added.
-
-    Args:
-        space: The parameters.
-        jacobian: Derivatives in each parameter's own scale, (R, K).
-        residual: (R,).
+    The range is a flat prior, which keeps insensitive parameters finite. A parameter's own prior is added.
     """
     variance = float(residual @ residual) / max(len(residual) - len(space), 1)
     information = jacobian.T @ jacobian / max(variance, np.finfo(float).tiny)
@@ -192,7 +185,7 @@ def _solve(
     solution = _minimise(error, 0.0, space.to_scale(space.center), ends)
     count = len(solution.fun)
     if np.isfinite(space.prior[1]).any():
-        # Without a noise model a prior's standard deviation is weighed against the residuals' own spread.
+        # Without a noise model, a prior's standard deviation is weighted by the residuals' own spread.
         spread = float(np.sqrt(solution.fun @ solution.fun / max(count - len(space), 1)))
         solution = _minimise(error, max(spread, np.finfo(float).tiny), solution.x, ends)
     theta = np.clip(space.from_scale(solution.x), space.low, space.high)
@@ -231,13 +224,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
 
 
 class OneStep:
-    """Differences between what was recorded and what is predicted one control period ahead of each record.
-
-    Args:
-        problem: Data and simulator.
-        latency_s: Latency that is assumed [s].
-        diverged: See :class:`LeastSquaresSettings`.
-    """
+    """Differences between each recorded state and its prediction from one control period before."""
 
     def __init__(self, problem: Problem, latency_s: float, diverged: float = 1e3) -> None:
         self._problem, self._latency_s, self._diverged = problem, latency_s, diverged
@@ -245,7 +232,7 @@ class OneStep:
         self._data = problem.windows(samples_per_tick(problem))
         self._recorded = [self._states(d) for d in self._data]
         first = problem.episodes[self._data[0].episode]
-        # With all positions measured, velocities were recorded too; otherwise only what was measured counts.
+        # If all positions were measured, velocities were recorded too; otherwise only measured ones count.
         counts = np.ones(2 * problem.coordinates, dtype=bool)
         if first.measured is not None:
             counts = first.measured.copy()
@@ -254,7 +241,7 @@ class OneStep:
         scale = np.sqrt(np.mean(change**2, axis=0))
         counts &= scale > 0
         if not counts.any():
-            raise InsufficientDataError("nothing that was recorded ever changes; move the robot")
+            raise InsufficientDataError("no recorded quantity ever changes; move the robot")
         self._counts, self._scale = counts, scale[counts]
 
     def _states(self, data: WindowData) -> FloatArray:
@@ -285,12 +272,12 @@ class MultiStartSettings:
     """Settings of `least-squares-multistart`.
 
     Attributes:
-        starts: The nominal values, and draws over all ranges.
-        survivors: Best starts that go on with all recordings.
+        starts: Number of starts: the nominal values, and draws over all ranges.
+        survivors: Number of the best starts that continue with all recordings.
         window_s: Length of the windows [s].
-        first_s: How much of the recordings, evenly spread, the starts are first fitted to [s].
-        part_s: The recordings are cut into parts of this length, of which these are taken [s].
-        first_iterations: Iterations of each start there.
+        first_s: Length of data of the first fits, evenly spread [s].
+        part_s: Length of the parts into which the recordings are cut for that [s].
+        first_iterations: Iterations of each first fit.
     """
 
     starts: int = 8
@@ -303,11 +290,11 @@ class MultiStartSettings:
 
 @dataclass(frozen=True)
 class MultiStartLeastSquares(OneShotSearch):
-    """Least squares on open-loop predictions from smoothed states, the best of several starts.
+    """Least squares on predictions from smoothed states, the best of several starts.
 
-    What a careful user writes: windows of some tenths of a second, Levenberg-Marquardt on the position error
-    (each channel over its own root mean square residual), the latency one more unknown, the ranges as bounds
-    and no other prior; the best of several starts counts.
+    It is what a careful user writes: Levenberg-Marquardt on the position error in windows of some tenths of a
+    second. Each channel is divided by its own root mean square residual, and the latency is one more unknown.
+    The ranges are bounds; there is no other prior.
     """
 
     name = "least-squares-multistart"
@@ -340,7 +327,7 @@ def _solve_starts(
     K = len(problem.space)
     residual = np.concatenate([r.ravel() for r in best.normal.residual])
     variance = float(residual @ residual) / max(len(residual) - K, 1)
-    # The range as a flat prior keeps what the data cannot see finite.
+    # The range as a flat prior keeps insensitive parameters finite.
     flat = np.diag(12.0 / problem.space.width**2)
     return FittedStart(
         theta=best.theta,

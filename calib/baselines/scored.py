@@ -1,4 +1,4 @@
-"""What the baselines that search by one score a member share: scoring, counting and the trace."""
+"""Common part of baselines that search by one score per member: scoring, counting and the trace."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})
-"""Fitnesses that learn: numbers of different generations do not compare."""
+"""Fitnesses that learn: their numbers are not comparable between generations."""
 
 
 class ScoredStepper(Stepper):
-    """A run whose members are told one number each.
+    """A run whose search sees one number per member.
 
-    The settings name the fitness and say how it scores; its window is also that of the residual that the
-    result states.
+    The settings name the fitness and its own settings; its window is also that of the stated residual.
     """
 
-    KEPT: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
+    STATE: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
     INTERVAL = "population spread, uncalibrated"
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
@@ -47,7 +46,7 @@ class ScoredStepper(Stepper):
         return len(self.log.trace) >= self.log.budget.generations
 
     def score(self, members: Members) -> tuple[FloatArray, dict[str, float]]:
-        """Score members and return their fitness, (N,), -inf where one diverged, and what the trace says."""
+        """Score members; return their fitness, (N,), -inf where one diverged, and values for the trace."""
         fitness = np.asarray(self._fitness.score(members), dtype=float)
         usable = np.isfinite(fitness)
         finite = fitness[usable]
@@ -66,7 +65,7 @@ class ScoredStepper(Stepper):
         lost = sum(row["diverged"] for row in self.log.trace)
         alarm = Alarm(
             f"{lost:.0f} of {scored:.0f} members diverged and had no score.",
-            "Simulations explode over much of the search range, and nothing was searched there.",
+            "Simulations diverge over much of the search range, and nothing was searched there.",
             "Narrow the ranges (--range NAME LOW HIGH), or shorten the physics step.",
         )
         return self.log.result(
@@ -78,5 +77,5 @@ class ScoredStepper(Stepper):
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return what else the provenance says."""
+        """Return further entries of the provenance."""
         return {}

@@ -1,7 +1,7 @@
-"""Baselines that bound what a method is worth: two that ignore the recording, and one that draws at random.
+"""Baselines that bound the value of a method: some ignore the recording, one draws at random.
 
-`midpoint` and `nominal` are the no-data baselines of every table: a method that does not beat
-them has read nothing.
+`midpoint` and `nominal` are the no-data baselines of every table: a method that does not beat them has
+learned nothing from the data.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class NoSettings:
 class _Draw(Stepper):
     """One generation: the population is a uniform draw, so that the interval is the range's."""
 
-    KEPT = ("_unit",)
+    STATE = ("_unit",)
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Ignorant) -> None:
         super().__init__(log, rng, search)
@@ -52,7 +52,7 @@ class _Draw(Stepper):
 
 
 class Ignorant(Search, abc.ABC):
-    """A method that looks at nothing and states the whole range as interval."""
+    """A method that reads no data; its interval is the whole range."""
 
     stepper = _Draw
     settings = NoSettings()
@@ -63,32 +63,32 @@ class Ignorant(Search, abc.ABC):
 
 
 class Midpoint(Ignorant):
-    """Return the midpoint of every range, in the range's own scale."""
+    """The midpoint of every range, in the range's own scale."""
 
     name = "midpoint"
 
     def estimate(self, space: ParameterSpace) -> FloatArray:
-        """Return the centre."""
+        """See :meth:`Ignorant.estimate`."""
         return space.center
 
 
 class LinearMidpoint(Ignorant):
-    """Return the midpoint of every range on a linear scale."""
+    """The midpoint of every range on a linear scale."""
 
     name = "midpoint-linear"
 
     def estimate(self, space: ParameterSpace) -> FloatArray:
-        """Return the centre."""
+        """See :meth:`Ignorant.estimate`."""
         return np.asarray((space.low + space.high) / 2)
 
 
 class Nominal(Ignorant):
-    """Return the values of the user's own model."""
+    """The values of the user's own model."""
 
     name = "nominal"
 
     def estimate(self, space: ParameterSpace) -> FloatArray:
-        """Return the nominal values."""
+        """See :meth:`Ignorant.estimate`."""
         return space.nominal
 
 
@@ -98,7 +98,7 @@ class RandomSettings:
 
     Attributes:
         ticks: Window length in control periods.
-        elite: Members that make the population of the result, best first; at least 2.
+        elite: Size of the result's population, best first; at least 2.
     """
 
     ticks: int = 10
@@ -106,16 +106,16 @@ class RandomSettings:
 
 
 class _Random(Stepper):
-    """A run of `random`: one draw of a population a generation, of which the best are kept."""
+    """A run of `random`: each generation draws one population and keeps the best."""
 
-    KEPT = ("_unit", "_score")
+    STATE = ("_unit", "_score")
 
     settings: RandomSettings
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         self._windows = cut(log.problem, self.settings.ticks)
-        # One metric for all draws, that of the range's midpoint: scores of different metrics do not compare.
+        # One metric for all draws, that of the range's midpoint: otherwise scores are not comparable.
         self._middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
         self._unit = np.empty((0, self.coordinates.count))
         self._score = np.empty(0)

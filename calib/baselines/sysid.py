@@ -1,8 +1,8 @@
 """`mujoco-sysid`: DeepMind's ``mujoco.sysid`` as an outside reference, on the same windows as every method.
 
-Its user knows windows, smoothed start states and ranges. The controls are late by the latency that the
-problem or the settings give, by nothing otherwise; or the latency is one more parameter of its least squares
-(:func:`with_delay`). The start is the nominal model, the intervals are its own.
+Its user knows windows, smoothed start states and ranges. The controls are delayed by the latency of the
+problem or the settings, by none without one. Or the latency is one more parameter of its least squares
+(:func:`with_delay`). It starts at the nominal model, and the intervals are its own.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class SysidSettings:
     Attributes:
         ticks: Window length in control periods.
         window_s: Window length in seconds instead [s].
-        latency_s: A latency that was found by other means, such as our scan [s]; None for the problem's where
-            one is given, and otherwise zero.
-        delay: Where no latency is given, search it within the problem's range as one more parameter.
+        latency_s: A latency found by other means, such as our scan [s]; None for the problem's if given, and
+            otherwise zero.
+        delay: If no latency is given, search it within the problem's range as one more parameter.
     """
 
     ticks: int = 10
@@ -66,11 +66,7 @@ class MujocoSysid(OneShotSearch):
 
 
 def with_delay(window_s: float) -> MujocoSysid:
-    """Return it as a user tunes it for recordings of late commands: longer windows, and a delay to be found.
-
-    Args:
-        window_s: Window length [s].
-    """
+    """Return `mujoco-sysid` tuned for delayed commands: windows of ``window_s`` and a searched latency."""
     return MujocoSysid(SysidSettings(window_s=window_s, delay=True))
 
 
@@ -102,7 +98,7 @@ def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: st
         iterations=log.budget.generations,
         threads=problem.threads,
     )
-    # From derivatives by the value to those by its logarithm, where that is the scale.
+    # From derivatives by the value to those by its logarithm on a log scale.
     chain = np.where(space.log_scale, found.theta, 1.0)
     interval = np.stack([found.theta - found.half_width, found.theta + found.half_width], axis=1)
     return FittedStart(

@@ -1,7 +1,7 @@
-"""One change of a recording that command and measurement share: order, sign and scale of joints, the clock.
+"""A change that command and measurement share: order, sign and scale of joints, and the clock.
 
-Such an error shows in no comparison of the two. Undone, it is a recording like any other, which a model
-predicts or does not.
+Comparing command and measurement does not show such an error. After the change is undone, a model can predict
+the recording.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from deal_hw.sim.recordings.episode import SampledEpisode
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChannelChange:
-    """A change of all channels of a fixed robot's joints: x of joint j becomes ``scale[j] * x[source[j]]``.
+    """A change of all joint channels of a fixed-base robot: x of joint j becomes ``scale[j] * x[source[j]]``.
 
     Attributes:
-        source: Which joint's channels each joint takes, a permutation, (J,).
-        scale: What they are multiplied by, (J,); efforts take the sign only.
-        clock: What times are multiplied by [-].
+        source: Source joint of each joint, a permutation, (J,).
+        scale: Factors, (J,); efforts take the sign only.
+        clock: Factor of all times [-].
     """
 
     source: tuple[int, ...]
@@ -34,7 +34,7 @@ class ChannelChange:
 
     @classmethod
     def none(cls, joints: int) -> ChannelChange:
-        """Return the change that changes nothing."""
+        """Return the identity."""
         return cls(source=tuple(range(joints)), scale=(1.0,) * joints)
 
     @property
@@ -45,7 +45,7 @@ class ChannelChange:
         return ChannelChange(source=tuple(map(int, back)), scale=scale, clock=1.0 / self.clock)
 
     def then(self, after: ChannelChange) -> ChannelChange:
-        """Return this change followed by another as one."""
+        """Return this change followed by ``after``, as one change."""
         return ChannelChange(
             source=tuple(self.source[k] for k in after.source),
             scale=tuple(s * self.scale[k] for s, k in zip(after.scale, after.source, strict=True)),
@@ -53,13 +53,9 @@ class ChannelChange:
         )
 
     def of(self, episode: SampledEpisode, actuated: Sequence[int], *, efforts: bool) -> SampledEpisode:
-        """Return a recording so changed; gains and limits stay where they are.
+        """Return the changed recording of a fixed-base robot; gains and limits stay.
 
-        Args:
-            episode: The recording of a robot on a fixed base.
-            actuated: Index of each actuated joint among the joints, (A,). Their channels change places among
-                each other only.
-            efforts: Commands are efforts, not positions.
+        Only the actuated joints, (A,), exchange commands. ``efforts``: commands are efforts, not positions.
         """
         joints, scale = list(self.source), np.array(self.scale)
         actuators = [list(actuated).index(self.source[joint]) for joint in actuated]
@@ -74,12 +70,7 @@ class ChannelChange:
         )
 
     def on(self, problem: Problem, episodes: Sequence[SampledEpisode]) -> Problem:
-        """Return the problem of recordings so changed, each sample as exact as it was beside its own size.
-
-        Args:
-            problem: The problem of a robot on a fixed base.
-            episodes: The recordings.
-        """
+        """Return the problem of changed recordings of a fixed-base robot, with the noise scaled alike."""
         facts, robot = problem.robot.description, problem.robot
         motor = facts.actuation == "motor"
         changed = [self.of(e, facts.actuated_index, efforts=motor) for e in episodes]

@@ -1,4 +1,4 @@
-"""Before any long work: is there enough in a recording to calibrate from, and what does it show?"""
+"""Checks before any long work: are the recordings sufficient, and which parameters do they show?"""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from deal_hw.types import FloatArray
 
 
 def check_delays(problem: Problem) -> None:
-    """Check that command delays can be told from the latency, which is searched beside the parameters.
+    """Check that command delays can be separated from the latency, which is searched as well.
 
     Raises:
         ConfigurationError: Every actuator's delay is searched, and the latency as well.
@@ -23,17 +23,17 @@ def check_delays(problem: Problem) -> None:
     moved = {element for p in delays for element in p.elements}
     if problem.fixed_latency_s is None and moved >= set(problem.robot.actuator_names):
         raise ConfigurationError(
-            f"{', '.join(p.name for p in delays)}: every command is delayed by the latency, too, which is "
-            "searched beside the parameters, so only their sum can be seen; leave the delay of one actuator "
-            "out or `known`, or give the latency (--latency)"
+            f"{', '.join(p.name for p in delays)}: the latency, which is searched as well, delays every "
+            "command too, so the recordings show only their sum; leave the delay of one actuator out, mark "
+            "one as `known`, or give the latency (--latency)"
         )
 
 
 def check_excitation(problem: Problem) -> None:
-    """Check that the recordings are long enough and move.
+    """Check that the recordings are long enough and that every joint moves.
 
     Raises:
-        InsufficientDataError: They do not; the message says what was found and what to record.
+        InsufficientDataError: They are not; the message says what was found and what to record.
     """
     seconds = sum(float(np.sum(e.usable)) * e.period_s for e in problem.episodes)
     advice = "record again with `deal-hw collect --motion rich` (4 s; --excitation-level 1 to 3 is stronger)"
@@ -46,8 +46,8 @@ def check_excitation(problem: Problem) -> None:
     spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
     if problem.known_std is None and not problem.noise_free:
-        # What a recording happens to show may be less than its sensor's noise, down to none at all: a joint
-        # that never left its friction is still no motion to calibrate from.
+        # A recording without motion can show less noise than its sensor has, even none. A joint that friction
+        # held is not enough to calibrate from.
         noises = np.maximum(noises, problem.robot.description.sensor.position_std)
     settings = problem.settings
     least = settings.least_motion if problem.known_std is None else settings.least_chosen_motion
@@ -70,18 +70,17 @@ def check_excitation(problem: Problem) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensitivitySettings:
-    """Settings of :func:`look` and :func:`jumps`.
+    """Settings of :func:`compute_sensitivity` and :func:`jumps`.
 
     Attributes:
         window_s: Length of the windows [s].
-        most_windows: So many are predicted.
-        nothing: Predictions that agree to this many standard deviations of the noise are the same [-].
-        faint: A range that changes nothing by more standard deviations than this is hardly visible [-].
-        nudge: A parameter is changed by so much, in its own scale, to see whether predictions jump,
-        push: and by so much to see how steep they really are.
-        jump: A nudge that changes predictions by so many times what the push says is a jump [-].
-        many: Share of windows that must jump [-]: where a contact begins or ends at another moment some do,
-            by no fault.
+        most_windows: Most windows to predict.
+        nothing: Predictions that differ by fewer standard deviations of the noise are equal [-].
+        faint: A range that changes predictions by fewer standard deviations is hardly visible [-].
+        nudge: Small parameter change that reveals jumps, in the parameter's own scale.
+        push: Larger change that measures the true slope.
+        jump: Ratio of the slopes under nudge and push above which a prediction jumps [-].
+        many: Least share of windows that jump [-]. A contact that begins at another moment makes a few jump.
     """
 
     window_s: float = 0.5
@@ -99,7 +98,7 @@ SETTINGS = SensitivitySettings()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensitivity:
-    """How much predictions change from one end of a parameter's range to the other.
+    """Change of predictions from one end of a parameter's range to the other.
 
     Attributes:
         names: The K parameters.
@@ -111,7 +110,7 @@ class Sensitivity:
 
     @property
     def unseen(self) -> tuple[str, ...]:
-        """Parameters that change nothing."""
+        """Parameters with no effect."""
         return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < SETTINGS.nothing)
 
     @property
@@ -135,20 +134,20 @@ def compute_sensitivity(problem: Problem) -> Sensitivity:
         theta[1 + 2 * k, k], theta[2 + 2 * k, k] = space.low[k], space.high[k]
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     effect = np.zeros(K)
-    for data in _some(longest_windows(problem, SETTINGS.window_s)):
+    for data in _spread_windows(longest_windows(problem, SETTINGS.window_s)):
         predicted = problem.predict(theta, latency, data).observed
         change = np.abs(predicted[1:] - predicted[:1]) / data.std
-        # A member that diverges at the end of its range is seen, to be sure.
+        # A member that diverges at the end of its range does have an effect.
         change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
         effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
     return Sensitivity(space.names, effect)
 
 
 def jumps(problem: Problem) -> dict[str, float]:
-    """Return the parameters whose smallest change makes predictions jump, and by how many of their units.
+    """Return the parameters whose smallest change makes predictions jump, and the size of the jump.
 
-    Fits follow derivatives, and those of a simulator whose solver stops early are noise: two frictions at one
-    joint are divided between them as it happens.
+    Fits follow derivatives. Those of a simulator whose solver stops early are noise: the fit then splits two
+    frictions at one joint arbitrarily.
 
     Raises:
         InsufficientDataError: The recordings hold no window.
@@ -156,7 +155,7 @@ def jumps(problem: Problem) -> dict[str, float]:
     space = problem.space
     K = len(space)
     value = space.to_scale(space.nominal)
-    # Towards the middle of the range, or a value at its end would be nudged to nothing.
+    # Towards the middle of the range: a value at its end would be clipped.
     inwards = np.where(value > (space.to_scale(space.low) + space.to_scale(space.high)) / 2, -1.0, 1.0)
     values = np.repeat(value[None], 1 + 2 * K, axis=0)
     values[1 : 1 + K] += SETTINGS.nudge * np.diag(inwards)
@@ -164,7 +163,7 @@ def jumps(problem: Problem) -> dict[str, float]:
     theta = space.from_scale(values)
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     changes = []
-    for data in _some(longest_windows(problem, SETTINGS.window_s)):
+    for data in _spread_windows(longest_windows(problem, SETTINGS.window_s)):
         predicted = problem.predict(theta, latency, data).observed
         change = np.where(np.isfinite(data.std), np.abs(predicted[1:] - predicted[:1]), 0.0)
         changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
@@ -178,21 +177,21 @@ def jumps(problem: Problem) -> dict[str, float]:
 
 
 def require_sensitive(found: Sensitivity) -> None:
-    """Refuse parameters that no rollout sees.
+    """Refuse parameters without effect on any rollout.
 
     Raises:
-        ConfigurationError: There are such; the message names them.
+        ConfigurationError: There are such parameters; the message names them.
     """
     if found.unseen:
         raise ConfigurationError(
-            f"no rollout of these recordings sees {', '.join(found.unseen)}: predictions are the same "
+            f"no rollout of these recordings depends on {', '.join(found.unseen)}: predictions are the same "
             "from one end of the range to the other. Remove them from the parameters (or give them with "
             "--known), or record a motion that shows them"
         )
 
 
-def _some(windows: list[WindowData]) -> list[WindowData]:
-    """Return about as many of the windows, evenly over all recordings."""
+def _spread_windows(windows: list[WindowData]) -> list[WindowData]:
+    """Return about ``most_windows`` of the windows, evenly over all recordings."""
     total = sum(len(data.windows) for data in windows)
     every = max(total // SETTINGS.most_windows, 1)
     kept, first = [], 0

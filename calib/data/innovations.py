@@ -1,9 +1,9 @@
 """Window innovations: recording minus prediction, whitened for sensor noise and for start-state error.
 
-A window restarts the simulation at a smoothed state. The error of that state enters the prediction, so each
-window's innovation has the covariance Sigma = sensor variance + J P0 J', with J the derivative of the
-prediction by the start state and P0 the uncertainty of that state. Multiplying by the inverse Cholesky factor
-of Sigma leaves unit variance where the model is right, and takes out what a wrong start state explains.
+Each window restarts the simulation at a smoothed state, whose error enters the prediction. So a window's
+innovation has the covariance Sigma = sensor variance + J P0 J'. J is the derivative of the prediction by the
+start state, and P0 the covariance of that state. Multiplying by the inverse Cholesky factor of Sigma gives
+unit variance where the model is right, and removes what a wrong start state explains.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ class Members:
 
 
 def is_noisy(problem: Problem) -> bool:
-    """Return whether what was measured carries sensor noise."""
+    """Return whether the measurements carry sensor noise."""
     std = problem.noise_std[problem.channels]
     return not problem.noise_free and bool(np.any(std >= problem.settings.noise_free_std))
 
 
 def samples_per_tick(problem: Problem) -> int:
-    """Return how many state samples one control period has."""
+    """Return the number of state samples in a control period."""
     description = problem.robot.description
     return max(round(description.state_rate_hz / description.control_rate_hz), 1)
 
 
 def cut(problem: Problem, ticks: int) -> list[WindowData]:
-    """Cut the recordings into windows of so many control periods.
+    """Cut the recordings into windows of ``ticks`` control periods.
 
-    Noisy recordings are used from half a smoothing width on: before that the smoother sees one side only, and
-    a start state that is off by more than it admits costs more than the window tells.
+    Noisy recordings are used from half a smoothing width on. Before that the smoother is one-sided, and its
+    start states are worse than their stated uncertainty.
     """
     per_tick = samples_per_tick(problem)
     if not is_noisy(problem):
@@ -61,14 +61,9 @@ def cut(problem: Problem, ticks: int) -> list[WindowData]:
 def early_setpoints(
     batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray, advance_s: float = 0.008
 ) -> FloatArray:
-    """Return set-points like :func:`setpoints`, but for latencies that may be slightly negative.
+    """Return set-points like :func:`setpoints`, also for latencies, (N,) [s], down to ``-advance_s``.
 
-    Args:
-        batch: The members.
-        episode: The episode.
-        latency_s: Total latency of each member, (N,) [s].
-        advance_s: Set-points are computed late by so much and moved back [s]: latencies down to minus this
-            are possible.
+    They are computed with the delay ``advance_s`` and shifted back.
     """
     ahead = round(advance_s / episode.step_s)
     late = setpoints(batch, episode, latency_s + ahead * episode.step_s)
@@ -82,7 +77,7 @@ def predict(
     position: FloatArray | None = None,
     velocity: FloatArray | None = None,
 ) -> MemberPrediction:
-    """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative."""
+    """Predict windows like :meth:`Problem.predict`, also for slightly negative latencies."""
     batch = problem.batch(len(members.theta))
     batch.set_parameters(members.theta)
     path = early_setpoints(batch, problem.episodes[data.episode], members.latency_s)
@@ -91,14 +86,14 @@ def predict(
 
 @dataclass(frozen=True, slots=True)
 class Whitening:
-    """What whitens the windows of one episode.
+    """Whitening transform of one episode's windows.
 
     Attributes:
-        reference: MemberPrediction of the simulator around which was linearised, (W, H, M).
+        reference: Prediction at the linearisation point, (W, H, M).
         factor: Inverse Cholesky factors of Sigma, (W, H M, H M).
-        root: J sqrt(P0): what one standard deviation of each start coordinate does, (W, H M, 2 C).
+        root: J sqrt(P0): effect of one standard deviation of each start coordinate, (W, H M, 2 C).
         std: Standard deviations of a start state, (2 C,).
-        offset: Start states relative to the smoothed ones around which was linearised, in units of ``std``,
+        offset: Start states at the linearisation point relative to the smoothed ones, in units of ``std``,
             (W, 2 C).
     """
 
@@ -114,28 +109,23 @@ class Whitening:
         return np.asarray(np.einsum("wij,nwj->nwi", self.factor, flat, optimize=True))
 
     def innovation(self, measured: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Whiten recording minus prediction, the latter moved to the smoothed start states, (N, W, H M).
+        """Whiten recording minus prediction, the latter shifted to the smoothed start states, (N, W, H M).
 
-        Args:
-            measured: (W, H, M).
-            predicted: From the start states that :meth:`starts` gives, (N, W, H, M).
+        The prediction, (N, W, H, M), is from the start states of :meth:`starts`.
         """
         moved = np.einsum("wis,ws->wi", self.root, self.offset).reshape(measured.shape)
         return self.apply(measured + moved - predicted)
 
     def starts(self, data: WindowData) -> tuple[FloatArray, FloatArray]:
-        """Return the start positions and velocities around which was linearised, (W, C) each."""
+        """Return the start positions and velocities at the linearisation point, (W, C) each."""
         C = data.start_position.shape[1]
         moved = self.offset * self.std
         return data.start_position + moved[:, :C], data.start_velocity + moved[:, C:]
 
     def next_offset(self, measured: FloatArray, limit: float = 3.0) -> FloatArray:
-        """Return the most probable start states under the linearisation's simulator: the next ``offset``.
+        """Return the most probable start states under the linearised simulator: the next ``offset``.
 
-        Args:
-            measured: (W, H, M).
-            limit: They move by so many standard deviations at most, or a wrong simulator would explain
-                itself.
+        Without the limit [standard deviations], start states would explain a wrong model.
         """
         whitened = self.innovation(measured, self.reference[None])[0]
         response = np.einsum("wij,wjs->wis", self.factor, self.root)
@@ -144,7 +134,7 @@ class Whitening:
 
 
 _MOST_SPREAD = 1e6
-"""What start states leave uncertain counts up to so many times the noise [-]; a factorisation bears 1e7."""
+"""Largest ratio of start-state effect to noise that counts [-]; the factorisation is stable up to 1e7."""
 
 
 def linearise(
@@ -156,14 +146,15 @@ def linearise(
         problem: Data and simulator.
         centre: One member, the mean of the population.
         data: The windows.
-        offset: Start states to linearise around, in standard deviations from the smoothed ones, (W, 2 C).
+        offset: Start states at the linearisation point, in standard deviations from the smoothed ones, (W, 2
+            C).
     """
     states = problem.starts[data.episode]
     W, C = data.start_position.shape
     std = np.concatenate([states.position_std, states.velocity_std])
     around = np.zeros((W, 2 * C)) if offset is None else offset
-    # Central differences at half the uncertainty: friction makes predictions kinked, and a secant of the size
-    # of the error itself says more about them than a derivative.
+    # Central differences at half the uncertainty. Friction makes kinks in predictions, and a secant as wide
+    # as the error itself describes them better than a derivative.
     count = 1 + 4 * C
     position = np.repeat(data.start_position[None] + around[:, :C] * std[:C], count, axis=0)
     velocity = np.repeat(data.start_velocity[None] + around[:, C:] * std[C:], count, axis=0)
@@ -173,13 +164,13 @@ def linearise(
         state[2 + 2 * s, :, c] -= 0.5 * std[s]
     members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
     predicted = predict(problem, members, data, position, velocity).observed
-    # A window in which the centre diverges says nothing of its start state: the recording stands in for it.
+    # Where the centre diverges, the window has no information on its start state: use the recording.
     reference = np.where(np.isfinite(predicted[0]), predicted[0], data.measured)
     predicted = np.where(np.isfinite(predicted), predicted, reference)
     flat = predicted.reshape(count, W, -1)
     root = np.moveaxis(flat[1::2] - flat[2::2], 0, -1)
     noise = data.std.reshape(W, -1)
-    # Where predictions nearly diverge the noise would vanish beside them in double precision.
+    # Where predictions nearly diverge, the noise would be lost to rounding beside them.
     most = np.abs(root).max(axis=(1, 2)) / noise.min(axis=1)
     root = root / np.maximum(most / _MOST_SPREAD, 1.0)[:, None, None]
     sigma = root @ np.swapaxes(root, 1, 2)
@@ -204,12 +195,12 @@ def whitened_residual(
         members: The N simulators.
         centre: The simulator to linearise around, such as the population's mean.
         windows: The windows.
-        offsets: Start states to linearise around, one array for each of ``windows``; replaced by the next
-            ones to use. None for the smoothed states.
-        whitenings: Made before around the same simulator and start states, one for each of ``windows``.
+        offsets: Start states at the linearisation point, one array per entry of ``windows``, updated in
+            place. None for the smoothed states.
+        whitenings: Precomputed for the same simulator and start states, one per entry of ``windows``.
 
     Returns:
-        (N, M); not finite in rows of members that diverged.
+        (N, M); not finite in rows of diverged members.
     """
     parts = []
     for i, data in enumerate(windows):
@@ -230,12 +221,9 @@ def whitened_residual(
 
 
 def explained(problem: Problem, centre: Members, ticks: int) -> float:
-    """Return the mean squared whitened residual of one simulator; 1 is a perfect model.
+    """Return the mean squared whitened residual of one simulator, ``centre``; 1 for a perfect model.
 
-    Args:
-        problem: Data and simulator.
-        centre: One member.
-        ticks: Window length in control periods.
+    Windows have ``ticks`` control periods.
     """
     windows = cut(problem, ticks)
     chi2 = float(np.mean(whitened_residual(problem, centre, centre, windows) ** 2))

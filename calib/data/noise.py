@@ -1,4 +1,4 @@
-"""How noisy a recording is, estimated from it alone, and the smoothed states at which windows start."""
+"""Noise of a recording, estimated from it alone, and the smoothed states at which windows start."""
 
 from __future__ import annotations
 
@@ -19,32 +19,29 @@ MAD_TO_STD = 1.4826022185056018
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataSettings:
-    """What is taken to be so of recordings.
+    """Assumptions about recordings.
 
     Attributes:
-        resolution: Positions travel as whole micrometres and microradians [m or rad].
-        noise_free_std: Positions with less noise than this are taken as they are [m or rad].
-        noise_free_residual: What residuals are measured by where nothing is noisy [m or rad]: far above
-            rounding, far below sensors.
-        noise_order: White noise is what differences of this order leave of smooth motion.
-        speed_bins: Bins of equal speed in which noise is estimated; fewer recordings than hold
-            ``fewest_in_bin`` samples in each say nothing of jitter.
-        fewest_in_bin: See ``speed_bins``.
-        certain: A timing jitter counts where it explains this many standard errors of the noise's growth
-            with speed.
-        slowest_jitter_s: Sampling periods above this are too long to tell a jitter of the samples' time: what
-            is left of the motion itself grows with speed like a jitter's noise does [s].
-        smoothing_s: Start states are smoothed over so long [s].
-        smoothing_order: Order of the polynomial.
-        fewest_smoothed: Least samples of a polynomial: fewer hardly smooth.
-        velocity_prior_std: Weak prior on start velocities by the unit of the coordinate [m/s and rad/s]:
-            keeps windows of few samples solvable.
-        unseen_std: Prior on a base's place on the floor where nobody measured it: no trajectory depends on
-            it [m].
-        least_motion: Joints must move by so many times the sensor's noise.
-        least_chosen_motion: The same where the residual was chosen: allowing for what the model lacks, it is
-            far above the sensor's noise.
-        fewest_changes: The target must change so often.
+        resolution: Step of positions on the wire [m or rad].
+        noise_free_std: Positions with less noise are taken as exact [m or rad].
+        noise_free_residual: Residual scale of noise-free recordings [m or rad]: far above rounding, far below
+            sensors.
+        noise_order: Order of the differences that remove smooth motion and leave white noise.
+        speed_bins: Number of bins of equal speed in which noise is estimated.
+        fewest_in_bin: Fewest samples per bin for an estimate of jitter.
+        certain: Least significance of a timing jitter [standard errors].
+        slowest_jitter_s: Longest sampling period at which jitter of the sample times can be separated from
+            the motion [s].
+        smoothing_s: Width over which start states are smoothed [s].
+        smoothing_order: Order of the smoothing polynomial.
+        fewest_smoothed: Fewest samples of a polynomial.
+        velocity_prior_std: Weak prior on start velocities by the coordinate's unit [m/s and rad/s]; keeps
+            windows of few samples solvable.
+        unseen_std: Prior on an unmeasured place of the base on the floor [m]; no trajectory depends on it.
+        least_motion: Least motion of a joint [multiples of the sensor's noise].
+        least_chosen_motion: The same where the residual scale was chosen. That scale includes model error and
+            is far above the sensor's noise.
+        fewest_changes: Fewest changes of the target.
     """
 
     resolution: float = 1e-6
@@ -66,7 +63,7 @@ class DataSettings:
 
     @property
     def floor(self) -> float:
-        """The least noise of positions: rounding on the wire [m or rad]."""
+        """Least noise of positions: rounding on the wire [m or rad]."""
         return float(self.resolution / np.sqrt(12.0))
 
 
@@ -75,37 +72,30 @@ SETTINGS = DataSettings()
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """White noise on positions, and samples whose time is uncertain.
+    """White noise on positions, and jitter of the sample times.
 
-    A sample that reports the state of a slightly other moment is off by speed times time, so a jittering
-    sensor looks noisier the faster the joint moves.
+    A sample taken at a slightly wrong time is off by speed times time. So a jittering sensor looks noisier
+    the faster the joint moves.
 
     Attributes:
         position_std: Noise of positions at rest, (J,) [m or rad].
-        timing_std_s: Standard deviation of the samples' time [s].
+        timing_std_s: Standard deviation of the sample times [s].
     """
 
     position_std: FloatArray
     timing_std_s: float
 
     def std(self, velocity: FloatArray) -> FloatArray:
-        """Return the standard deviation of positions reported at these velocities, (..., J)."""
+        """Return the standard deviation of positions at these velocities, (..., J)."""
         return np.sqrt(self.position_std**2 + (self.timing_std_s * velocity) ** 2)
 
 
 def white_noise_std(values: FloatArray, settings: DataSettings = SETTINGS) -> FloatArray:
-    """Estimate the standard deviation of white noise on top of smooth motion.
+    """Estimate the standard deviation of white noise on top of smooth motion, (J,), from samples (T, J).
 
-    The sixth difference of a smooth motion nearly vanishes while white noise of variance s^2 comes out with
-    variance 924 s^2 (the sum of the squared binomial coefficients); the median keeps impacts and stick-slip
-    out.
-
-    Args:
-        values: Uniformly sampled channels, (T, J).
-        settings: Which differences; the least that is returned.
-
-    Returns:
-        Standard deviations, (J,).
+    The sixth difference of a smooth motion nearly vanishes. That of white noise with variance s^2 has
+    variance 924 s^2 (the sum of the squared binomial coefficients). The median ignores impacts and
+    stick-slip.
     """
     order = settings.noise_order
     if len(values) <= 2 * order:
@@ -123,16 +113,11 @@ def noise_model(
     velocities: list[FloatArray],
     settings: DataSettings = SETTINGS,
 ) -> NoiseModel:
-    """Estimate noise and timing jitter of recordings.
+    """Estimate noise and timing jitter from positions and smoothed velocities of recordings, (T, J) each.
 
-    The noise is estimated in bins of equal speed, joint by joint, and its square fitted by a straight line in
-    the squared speed: the intercept is the noise at rest, the slope, which all joints share, the jitter's
-    variance.
-
-    Args:
-        positions: Reported positions of each recording, (T, J) each, uniformly sampled.
-        velocities: Smoothed velocities, likewise.
-        settings: How.
+    The noise is estimated in bins of equal speed, joint by joint. A straight line is fitted to its square
+    over the squared speed. The intercept is the noise at rest; the slope, shared by all joints, is the
+    jitter's variance.
     """
     order, bins, floor = settings.noise_order, settings.speed_bins, settings.floor
     whole = np.max([white_noise_std(x, settings) for x in positions], axis=0)
@@ -150,8 +135,8 @@ def noise_model(
         parts = np.array_split(np.argsort(speed2[:, j]), bins)
         x = np.array([speed2[part, j].mean() for part in parts])
         y = np.array([float(_spread(difference[part, j : j + 1], order)[0]) ** 2 for part in parts])
-        # A variance from n samples through a median is known to about 2.3 / sqrt(n); neighbours share
-        # differences.
+        # The median of n samples gives a variance to about 2.3 / sqrt(n), relative; neighbouring differences
+        # share samples.
         sigma = y * 2.3 * math.sqrt(3.0 / len(parts[0])) + floor**2
         slope, error = _slope(x, y, sigma)
         slopes.append(slope)
@@ -195,18 +180,12 @@ class StartStates:
 def smooth_states(
     episode: SampledEpisode, noise_std: FloatArray, rotation: slice, settings: DataSettings = SETTINGS
 ) -> StartStates:
-    """Estimate the state at every sample.
+    """Estimate the state at every sample; ``noise_std`` is that of (position, velocity), (2 C,).
 
-    Positions that are free of noise are left alone, and so are the reported velocities then: smoothing would
-    only round off the impacts. Measured angular velocities of a base are smoothed; its rotation vector
-    vanishes, because its reference is the smoothed orientation already. What was not measured stays
-    the estimate that the episode holds.
-
-    Args:
-        episode: The recording.
-        noise_std: Noise of (position, velocity), (2 C,).
-        rotation: Which coordinates are the base's rotation vector.
-        settings: How.
+    Noise-free positions and their reported velocities are kept: smoothing would only round off the impacts.
+    Measured angular velocities of a base are smoothed. Its rotation vector (coordinates ``rotation``) becomes
+    zero, because its reference is the smoothed orientation. Unmeasured coordinates keep the episode's
+    estimate.
 
     Raises:
         InsufficientDataError: The recording is shorter than the smoother.

@@ -1,8 +1,8 @@
-"""A calibration problem: recordings on the device's time grid, a batched simulator, and what is searched.
+"""A calibration problem: recordings on the device's time grid, a batched simulator, and the parameter space.
 
-Every method sees the data through this class, so that all of them use the same simulator, the same start
-states and the same count of simulated steps. States have C tangent coordinates and as many velocities; what
-was measured of them are the M channels that predictions are compared with.
+Every method reads the data through this class. So all use the same simulator, the same start states and the
+same count of simulated steps. A state has C tangent coordinates and C velocities. Of these, the M measured
+channels are compared with predictions.
 """
 
 from __future__ import annotations
@@ -44,13 +44,12 @@ class WindowData:
         episode: Index of the episode.
         windows: W windows of H samples.
         measured: Measured channels at the predicted samples, (W, H, M).
-        std: Standard deviation of the measured channels, (W, H, M); infinite where none was reported.
-        start_position: Smoothed positions at the starts, (W, C).
-        start_velocity: Smoothed velocities at the starts, (W, C).
-        prior_mean: What is known of the start states beside what the window predicts: the measurement at the
-            start, or an estimate, or a weak guess, (W, 2 C).
-        prior_std: Standard deviation of ``prior_mean``, (W, 2 C).
-        prior_counts: Which entries of ``prior_mean`` are as good as a measurement, (2 C,).
+        std: Standard deviation of the measured channels, (W, H, M); infinite for missing samples.
+        start_position: Smoothed start positions, (W, C).
+        start_velocity: Smoothed start velocities, (W, C).
+        prior_mean: Prior of the start states: a measurement, an estimate or a weak guess, (W, 2 C).
+        prior_std: Its standard deviation, (W, 2 C).
+        prior_counts: Entries of the prior that count as measurements, (2 C,).
     """
 
     episode: int
@@ -66,10 +65,10 @@ class WindowData:
 
 @dataclass(frozen=True, slots=True)
 class MemberPrediction:
-    """What N members predict of W windows of H samples; NaN where a member diverged.
+    """Predictions of W windows of H samples by N members; NaN where a member diverged.
 
     Attributes:
-        observed: The measured channels, (N, W, H, M).
+        observed: Measured channels, (N, W, H, M).
         position: Tangent coordinates, (N, W, H, C).
         velocity: (N, W, H, C).
     """
@@ -80,29 +79,29 @@ class MemberPrediction:
 
 
 class PopulationPolicy(Protocol):
-    """pi_0, the policy that moved the robot all through the recordings, for N simulators at once."""
+    """pi_0, the policy that produced all commands of the recordings, for N simulators at once."""
 
     @property
     def history(self) -> int:
-        """Control periods that it looks back."""
+        """Length of its memory [control periods]."""
         ...
 
     def restart(
         self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
     ) -> None:
-        """Begin anew with N simulators that share one past.
+        """Start N simulators from one common past.
 
         Args:
-            count: Their number N.
-            position: States that the policy saw before, oldest first, (h, C).
+            count: Number of simulators N.
+            position: Past states, oldest first, (h, C).
             velocity: Likewise.
-            command: What it answered, (h, A).
-            number: Its commands so far; at least h.
+            command: The policy's commands in these states, (h, A).
+            number: Number of its commands so far; at least h.
         """
         ...
 
     def __call__(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the commands of the next control period, (N, A), from states, (N, C) each."""
+        """Return the commands of the next control period, (N, A), from positions and velocities, (N, C)."""
         ...
 
 
@@ -112,20 +111,18 @@ class Problem:
 
     Attributes:
         robot: The nominal model.
-        space: What is searched.
-        episodes: The recordings to fit; short gaps are filled in and not fitted to. All measure the same
-            channels.
+        space: The searched parameters.
+        episodes: Recordings with equal measured channels. Short gaps are interpolated and not fitted.
         threads: Simulation threads; None for all CPUs.
-        latency_range_s: Total latencies that are searched [s]; widened to hold one that is given, so that no
-            bound moves it.
-        fixed_latency_s: A latency that is given; None to search it.
-        known_std: Standard deviation of every entry of (position, velocity), (2 C,), where it is known or
-            chosen; None to estimate it from the recordings.
-        settings: What is taken to be so of recordings.
-        policy: What moved the robot all through the recordings; None where that is not known, or no policy.
+        latency_range_s: Range of the total latency [s]; widened to include a given latency.
+        fixed_latency_s: A given latency [s]; None to search it.
+        known_std: Standard deviation of (position, velocity), (2 C,), where known or chosen; None to estimate
+            it from the recordings.
+        settings: Assumptions about recordings.
+        policy: The policy that produced all commands; None for an unknown one, or no policy.
         channels: Indices of the measured channels into (position, velocity), (M,).
-        noise_std: Noise of (position, velocity) over all speeds, (2 C,); only measured entries mean anything.
-        noise: Noise at rest and jitter of the samples' time.
+        noise_std: Noise of (position, velocity) over all speeds, (2 C,); valid for measured entries only.
+        noise: Noise at rest, and jitter of the sample times.
         starts: Smoothed states of each episode.
     """
 
@@ -188,7 +185,7 @@ class Problem:
         if self.known_std is not None or self.noise_free or slow:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
-        # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.
+        # Jitter of sample times shows in positions; a rotation about the smoothed orientation has none left.
         timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
         columns = self.channels[timed]
         positions = [e.position[:, columns] for e in self.episodes]
@@ -198,7 +195,7 @@ class Problem:
         return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
 
     def _with_given_noise(self, std: FloatArray, channels: IntArray) -> FloatArray:
-        """Return standard deviations, (M,), with the known ones of sensors in their place."""
+        """Return standard deviations, (M,), with known sensor noise where it is given."""
         joints = self.robot.description.joint_names
         first = self.coordinates - len(joints)
         given = {
@@ -215,12 +212,9 @@ class Problem:
         return self._batches.steps
 
     def part(self, chosen: Sequence[npt.NDArray[np.bool_]]) -> Problem:
-        """Return the problem with only these samples of each recording usable.
+        """Return the problem with only the samples under one mask per recording, (T,), usable.
 
-        Noise, smoothed states and simulators are shared, so nothing is estimated anew.
-
-        Args:
-            chosen: One mask a recording, (T,).
+        Noise, smoothed states and simulators are shared; nothing is estimated again.
         """
         other = copy.copy(self)
         other.episodes = [
@@ -230,29 +224,20 @@ class Problem:
         return other
 
     def on(self, episodes: Sequence[SampledEpisode], known_std: FloatArray | None) -> Problem:
-        """Return the problem of other recordings; noise is estimated anew, simulators are shared.
-
-        Args:
-            episodes: The recordings.
-            known_std: See :class:`Problem`.
-        """
+        """Return the problem of other recordings; noise is estimated again, simulators are shared."""
         other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
         other._batches = self._batches
         return other
 
     def with_more(self, parameters: Sequence[Parameter]) -> Problem:
-        """Return the problem with more parameters, after its own; recordings and noise are shared.
-
-        Args:
-            parameters: They.
-        """
+        """Return the problem with more parameters after its own; recordings and noise are shared."""
         other = copy.copy(self)
         space = other.space = ParameterSpace((*self.space.parameters, *parameters))
         other._batches = BatchPool(lambda count: ServoBatch(self.robot, space, count, self.threads))
         return other
 
     def with_robot(self, robot: RobotModel) -> Problem:
-        """Return the problem with another model of the same robot; all else is shared."""
+        """Return the problem with another model of the same robot; the rest is shared."""
         other = copy.copy(self)
         other.robot = robot
         other._batches = BatchPool(lambda count: ServoBatch(robot, self.space, count, self.threads))
@@ -260,12 +245,12 @@ class Problem:
 
     @property
     def first_latency_s(self) -> float:
-        """The latency that fits begin with: the given one, else the least that is searched [s]."""
+        """Latency at which fits begin: the given one, else the lowest in the range [s]."""
         return self.latency_range_s[0] if self.fixed_latency_s is None else self.fixed_latency_s
 
     @property
     def noise_free(self) -> bool:
-        """Whether all states are known without error, so that windows need not fit where they start."""
+        """Whether all states are known without error, so that start states need no fit."""
         return all(e.exact for e in self.episodes)
 
     @property
@@ -280,8 +265,15 @@ class Problem:
         every = (*names, *(f"{name}.velocity" for name in names))
         return tuple(every[c] for c in self.channels)
 
+    @property
+    def channel_units(self) -> tuple[str, ...]:
+        """Units of the measured channels, (M,)."""
+        units = self.robot.coordinate_units
+        every = (*units, *(f"{unit}/s" for unit in units))
+        return tuple(every[c] for c in self.channels)
+
     def batch(self, count: int) -> ServoBatch:
-        """Return the simulator of ``count`` members, kept while it is among the last used sizes."""
+        """Return the simulator of ``count`` members; the last used sizes are kept."""
         return self._batches.get(count)
 
     def measured(self, index: int) -> FloatArray:
@@ -290,7 +282,7 @@ class Problem:
         return np.concatenate([episode.position, episode.velocity], axis=1)[:, self.channels]
 
     def channel_speed(self, index: int) -> FloatArray:
-        """Return how fast each measured channel changes, (T, M); 0 for velocities."""
+        """Return the speed of each measured channel, (T, M); 0 for velocities."""
         moved = self.starts[index].velocity
         return np.concatenate([moved, np.zeros_like(moved)], axis=1)[:, self.channels]
 
@@ -338,11 +330,11 @@ class Problem:
     def _prior(
         self, index: int, std: FloatArray
     ) -> tuple[FloatArray, FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-        """Return what is known of each state without prediction: mean and std, (T, 2 C), and what counts."""
+        """Return the prior of each state: mean and std, (T, 2 C), and which entries count as measurements."""
         episode, C = self.episodes[index], self.coordinates
         T = len(episode.sample)
         weak = np.array([self.settings.velocity_prior_std[unit] for unit in self.robot.coordinate_units])
-        # The weak prior on velocities is centred on zero; it only guards the inverse.
+        # The weak prior on velocities has mean zero; it only keeps the inverse finite.
         mean = np.concatenate([episode.position, np.zeros((T, C))], axis=1)
         unseen = np.full((T, C), self.settings.unseen_std)
         spread = np.concatenate([unseen, np.repeat(weak[None], T, axis=0)], axis=1)
@@ -390,7 +382,7 @@ class Problem:
     ) -> MemberPrediction:
         """Predict windows with members whose parameters are set, along given set-points, (N, S, A).
 
-        Forces on the coordinates, (N, W, H * stride, C), are those of device periods.
+        ``force`` acts on the coordinates in each device period, (N, W, H * stride, C).
         """
         x, v = predict_windows(
             batch,
@@ -409,15 +401,15 @@ class Problem:
 
 
 def samples_in(problem: Problem, seconds: float) -> int:
-    """Return how many samples a time holds: at least 1 from known states, 4 where start states are fitted."""
+    """Return the number of samples in a time: at least 1 from known start states, 4 from fitted ones."""
     return max(round(seconds / problem.episodes[0].period_s), 1 if problem.noise_free else 4)
 
 
 def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
-    """Cut windows of so many seconds, shorter ones where no recording holds one.
+    """Cut windows of ``seconds``, or shorter ones where no recording holds one.
 
     Raises:
-        InsufficientDataError: Not even windows of four samples fit.
+        InsufficientDataError: Even windows of four samples do not fit.
     """
     length = max(round(seconds / problem.episodes[0].period_s), 4)
     while True:
@@ -430,7 +422,7 @@ def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
 
 
 def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
-    """Return some of the windows, chosen by a mask (W,) or by their rows."""
+    """Return the windows under a mask (W,), or at these rows."""
     names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
     windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
     return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})

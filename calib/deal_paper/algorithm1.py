@@ -1,9 +1,9 @@
-"""`deal-paper`: DEAL's Algorithm 1 as published, with every choice that the paper leaves open as a setting.
+"""`deal-paper`: DEAL's Algorithm 1 as published; every choice that the paper leaves open is a setting.
 
 Generation t: roll pi_0 out in every simulator (line 3), train the critic (eq. 5), score each member's own
 rollout, turn scores into probabilities and take one denoising step (eqs. 1, 2, 9, 10:
 :mod:`deal_hw.calib.deal_paper.diffusion_evolution`). The range is linear and no latency is searched. Page
-'The paper, line by line' of the documentation lists what is ours.
+'The paper, line by line' of the documentation lists our choices.
 """
 
 from __future__ import annotations
@@ -25,24 +25,23 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperSettings(FitnessSettings):
-    r"""Choices of `deal-paper`; the paper names those that are marked with a section.
+    r"""Choices of `deal-paper`; section numbers are the paper's.
 
     Attributes:
         critic: Size (section 3.1: two layers of 256) and training of the critic. Learning rate, clip, updates
             n and batch M are not in the paper.
         diffusion: The search's choices; its number of generations is the budget's.
-        normalise: Whether the search moves in the normalised range (section 3.2); off is the ablation
+        normalise: Whether the search moves in the normalised range (section 3.2). Off is the ablation
             DEAL\PN, which moves in SI units from the middle of each range.
-        box: What the range is normalised to, low and high. Centred, as with a flat fitness a box [0, 1]
-            drifts to its lower corner; as wide as gives a uniform start unit variance, as eq. 12 has it at
-            t = T. In [-1, 1] the unit noise of eq. 10 puts a third of all coordinates outside the range,
-            where they are simulated at its edge.
-        linear: Whether the range is linear ("within the search range", section 3.2); off takes equal steps of
-            each parameter's own scale.
-        latency: Whether the latency, of which the paper knows nothing, is one more coordinate where it is not
-            given.
-        fitness: Name of the fitness (`deal_hw.calib.deal_paper.fitness`). "critic" is the paper's; "flat"
-            scores every member 0, a search that cannot see the data. Eq. 9 reads the fitness as it is,
+        box: Low and high end of the normalised range. It is centred: with a flat fitness, a box [0, 1] drifts
+            to its lower corner. A uniform start has unit variance, as in eq. 12 at t = T. In [-1, 1] the unit
+            noise of eq. 10 puts a third of all coordinates outside the range, where they are simulated at its
+            edge.
+        linear: Whether the range is linear ("within the search range", section 3.2); off is uniform in each
+            parameter's own scale.
+        latency: Whether a latency that is not given is one more coordinate; the paper has none.
+        fitness: Name of the fitness (`deal_hw.calib.deal_paper.fitness`). "critic" is the paper's. "flat"
+            scores every member 0, so the search does not depend on the data. Eq. 9 reads the raw fitness,
             whatever its scale.
     """
 
@@ -55,7 +54,7 @@ class PaperSettings(FitnessSettings):
     fitness: str = "critic"
 
     def __post_init__(self) -> None:
-        # A dataclass with slots is another class than the one that `super()` sees.
+        # With slots, the decorated class differs from the one that `super()` sees.
         FitnessSettings.__post_init__(self)
         if not self.box[0] < self.box[1]:
             raise ConfigurationError(f"box {self.box}: give the lower end first")
@@ -82,14 +81,14 @@ class _Box:
         return np.asarray(self._low + self._width * unit)
 
     def members(self, x: FloatArray) -> Members:
-        """Map the box to physical values; what left it is simulated at its edge (the paper does not say)."""
+        """Map the box to physical values, clipped at its edge (the paper does not say)."""
         return self._coordinates.members(np.clip((x - self._low) / self._width, 0.0, 1.0))
 
 
 class _DealPaper(Stepper):
     """A run of Algorithm 1: one denoising step a generation."""
 
-    KEPT = ("_search", "_fitness")
+    STATE = ("_search", "_fitness")
 
     settings: PaperSettings
 
@@ -143,12 +142,7 @@ class _DealPaper(Stepper):
 
 @dataclass(frozen=True)
 class DealPaper(RangedSearch):
-    """DEAL as published; the budget's population is N, its generations are T.
-
-    Attributes:
-        settings: How to run.
-        name: Name in results.
-    """
+    """DEAL as published; the budget's population is N, its generations are T."""
 
     settings: PaperSettings = field(default_factory=PaperSettings)
     name: str = "deal-paper"
@@ -156,15 +150,15 @@ class DealPaper(RangedSearch):
 
 
 def paper() -> DealPaper:
-    """Return `deal-paper`: Algorithm 1, open choices made as well as we could."""
+    """Return `deal-paper`: Algorithm 1 with our best choice where the paper leaves one."""
     return DealPaper()
 
 
 def literal() -> DealPaper:
-    """Return Algorithm 1 with none of our choices where the paper's words can be taken as they stand.
+    """Return `deal-paper-literal`: Algorithm 1 with the paper's words taken literally.
 
-    Raw softmax (eq. 22), distance summed over K (eq. 1), the range normalised to [0, 1], inputs as they are,
-    a critic that is trained against all rollouts so far (line 3 stores them).
+    Raw softmax (eq. 22), distance summed over K (eq. 1), range normalised to [0, 1], raw inputs, and a critic
+    trained against all rollouts so far (line 3 stores them).
     """
     return DealPaper(
         PaperSettings(
@@ -178,7 +172,7 @@ def literal() -> DealPaper:
 
 
 def without_noise_adaptation() -> DealPaper:
-    r"""Return the paper's ablation DEAL\FN: no eq. 9."""
+    r"""Return the paper's ablation DEAL\FN: without eq. 9."""
     return DealPaper(PaperSettings(diffusion=DiffusionSettings(adapt_noise=False)), name="deal-paper-fn")
 
 
@@ -188,7 +182,7 @@ def without_normalisation() -> DealPaper:
 
 
 def flat() -> DealPaper:
-    """Return `deal-paper` with a constant fitness: whatever it finds, it did not find in the data."""
+    """Return `deal-paper` with a constant fitness: a baseline without data."""
     return DealPaper(PaperSettings(fitness="flat"), name="deal-paper-flat")
 
 

@@ -13,7 +13,7 @@ from deal_hw.types import FloatArray
 class CriticFitness(Fitness):
     """Rollouts, replay and critic: lines 3 to 9 of Algorithm 1."""
 
-    KEPT = ("_critic", "_replay")
+    STATE = ("_critic", "_replay")
 
     def _prepare(self, rng: np.random.Generator) -> None:
         settings = self._settings
@@ -31,7 +31,7 @@ class CriticFitness(Fitness):
             score = self._critic.score(rollouts.reshape(-1, width))
         keep = self._settings.replay_generations
         if keep is not None:
-            # What the next generation is not trained on is forgotten now, so that no checkpoint holds it.
+            # Old rollouts are dropped before the checkpoint is saved.
             del self._replay[: max(len(self._replay) - keep + 1, 0)]
         self.values = {"wasserstein": gap}
         # Line 9: the expectation over the member's own rollout.

@@ -1,12 +1,12 @@
 """Diffusion evolution (DEAL, section 3 and appendix A.1): a population denoised towards its fitter members.
 
-Knows no simulator: it is asked for a population and told the fitness of each member. Equation numbers are
-those of the DEAL paper, and the symbols are its symbols: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
+It knows no simulator: ``ask`` returns a population, ``tell`` takes the fitness of each member. Equation
+numbers and symbols are the DEAL paper's: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
 
-The coordinates are a box that is centred on zero. The paper says "normalised within the search range" and not
-which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any
-data (a flat fitness drifts to 0.37-0.45 of the range), in a centred box they pull towards the centre, where
-the search starts.
+The coordinates are a box around zero. The paper says "normalised within the search range", but not which box.
+In [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any data: a flat
+fitness drifts to 0.37-0.45 of the range. In a centred box they pull towards the centre, where the search
+starts.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import logsumexp, softmax
 
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -26,19 +26,18 @@ Schedule = Literal["cosine", "linear"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiffusionSettings:
-    r"""What the paper leaves open, and what it says.
+    r"""The paper's choices, and ours where it leaves one.
 
     Attributes:
         generations: Search steps T.
         schedule: How alpha_t falls from 1 to about 0; the paper names none.
-        alpha_last: alpha_T: eq. 12 wants about 0; a true 0 would weigh all neighbours alike.
+        alpha_last: alpha_T: eq. 12 wants about 0; a true 0 would weight all neighbours equally.
         eta: sigma_t in units of the full DDPM noise; 0 is deterministic DDIM. The paper names no schedule.
         divide_distance: Whether the kernel's squared distance is divided by K. The paper's N(.; ., 1 - alpha)
-            is a sum over coordinates, which at high K underflows: each member then has no neighbour but
-            itself.
+            is a sum over coordinates. At high K it underflows: each member then has only itself as neighbour.
         temperature: None is the paper's g, a softmax of the raw fitness (eq. 22). A number standardises the
-            fitness within the generation and divides it by this: a critic's scale is arbitrary, and the raw
-            softmax either selects nobody or one.
+            fitness within the generation and divides it by this. A critic's scale is arbitrary: the raw
+            softmax selects either everyone or one.
         adapt_noise: Whether eq. 9 scales the noise; off is the paper's ablation DEAL\FN.
         influence: lambda in eq. 9; the paper gives no value.
     """
@@ -64,13 +63,7 @@ class DiffusionSettings:
 
 
 def alpha_schedule(generations: int, schedule: Schedule, last: float = 1e-3) -> FloatArray:
-    """Return alpha_0 = 1, ..., alpha_T = about 0, (T + 1,).
-
-    Args:
-        generations: Search steps T.
-        schedule: "cosine" spends more steps at both ends; "linear" falls evenly.
-        last: alpha_T.
-    """
+    """Return alpha_0 = 1, ..., alpha_T = ``last``, (T + 1,); "cosine" has smaller steps at both ends."""
     part = np.arange(generations + 1) / generations
     fall = (1 + np.cos(np.pi * part)) / 2 if schedule == "cosine" else 1 - part
     return np.asarray(last + (1 - last) * fall)
@@ -78,15 +71,15 @@ def alpha_schedule(generations: int, schedule: Schedule, last: float = 1e-3) -> 
 
 @dataclass(frozen=True, slots=True)
 class DiffusionStep:
-    """What one step did.
+    """Result of one step.
 
     Attributes:
         effective_size: Effective sample size of the probabilities p, 1 / sum p^2: N is no selection at all.
-        effective_neighbours: The same for p times the kernel, mean over members: 1 is a member that sees only
-            itself.
+        effective_neighbours: The same for p times the kernel, mean over members: 1 is a member with only
+            itself as neighbour.
         delta: The factor of eq. 9 as computed.
-        sigma: The noise that was used, after the clamp.
-        clamped: Whether the noise that eq. 9 asked for was more than eq. 10 can hold.
+        sigma: The noise used, after the clamp.
+        clamped: Whether the noise of eq. 9 exceeded the limit of eq. 10.
     """
 
     effective_size: float
@@ -96,16 +89,13 @@ class DiffusionStep:
     clamped: bool
 
 
-class DiffusionEvolution(Kept):
+class DiffusionEvolution(Stateful):
     """A population (N, K) in a box around zero; a uniform start of unit variance fits eq. 12 best.
 
-    Args:
-        population: The start theta^T, (N, K); the paper draws it uniformly from the search range.
-        settings: Schedules and choices.
-        rng: Draws omega.
+    The paper draws the start theta^T uniformly from the search range.
     """
 
-    KEPT = ("_theta", "t")
+    STATE = ("_theta", "t")
 
     def __init__(self, population: FloatArray, settings: DiffusionSettings, rng: np.random.Generator) -> None:
         self._theta = np.array(population, dtype=float)
@@ -115,7 +105,7 @@ class DiffusionEvolution(Kept):
         self.t = settings.generations
 
     def ask(self) -> FloatArray:
-        """Return theta^t, (N, K); members may lie outside the box, the caller decides what that means."""
+        """Return theta^t, (N, K); members may lie outside the box."""
         return self._theta.copy()
 
     @property
@@ -139,7 +129,7 @@ class DiffusionEvolution(Kept):
         estimate = weights @ theta
         # Eq. 2 (line 14). alpha_t < 1 for every t >= 1.
         noise = (theta - np.sqrt(alpha) * estimate) / np.sqrt(1 - alpha)
-        # sigma_t: the DDPM posterior's standard deviation times eta, as in DDIM (paper's reference 25, its
+        # sigma_t: the DDPM posterior's standard deviation times eta, as in DDIM (the paper's reference 25,
         # eq. 16).
         sigma = (
             settings.eta * np.sqrt((1 - alpha_next) / (1 - alpha)) * np.sqrt(max(1 - alpha / alpha_next, 0.0))
@@ -147,8 +137,7 @@ class DiffusionEvolution(Kept):
         delta = 1.0
         if settings.adapt_noise:
             finite = fitness[np.isfinite(fitness)]
-            # Eq. 9 (line 10). exp is unbounded, so it is cut before it overflows; the clamp below decides
-            # anyway.
+            # Eq. 9 (line 10). Cut before exp overflows; the clamp below limits it anyway.
             delta = (
                 settings.influence * float(np.exp(np.clip(-finite.mean(), -50.0, 50.0)))
                 if finite.size
@@ -173,11 +162,9 @@ class DiffusionEvolution(Kept):
 
 
 def probabilities(fitness: FloatArray, temperature: float | None) -> FloatArray:
-    """Map fitness to probabilities, (N,) each (the paper's g, eq. 22).
+    """Map fitness to probabilities, (N,) each (the paper's g, eq. 22); see `DiffusionSettings.temperature`.
 
-    Args:
-        fitness: Higher is better; -inf gets probability 0, unless all are.
-        temperature: None for the softmax of the raw values, a number for standardised ones divided by it.
+    A fitness of -inf gets probability 0, unless all have it.
     """
     finite = np.isfinite(fitness)
     if not finite.any():
@@ -195,14 +182,8 @@ def probabilities(fitness: FloatArray, temperature: float | None) -> FloatArray:
 def neighbour_weights(theta: FloatArray, p: FloatArray, alpha: float, *, divide: bool) -> FloatArray:
     """Return p_i N(theta_j; sqrt(alpha) theta_i, 1 - alpha) / Z, (N, N), row j for member j.
 
-    Computed from logarithms: at high K the density itself underflows to zero for every neighbour.
-
-    Args:
-        theta: Population, (N, K).
-        p: Probabilities, (N,).
-        alpha: alpha_t.
-        divide: Whether the squared distance is divided by K; the constant in front of the density cancels in
-            Z.
+    Computed from logarithms: at high K the density itself underflows to zero for every neighbour. With
+    ``divide`` the squared distance is divided by K; the constant factor of the density cancels in Z.
     """
     centres = np.sqrt(alpha) * theta
     squared = np.sum(theta**2, axis=1)[:, None] - 2 * theta @ centres.T + np.sum(centres**2, axis=1)

@@ -1,7 +1,7 @@
-"""Fitness: one number a member, higher is better, for the searches that take no more than that.
+"""Fitness: one number per member, higher is better, for searches that need no more.
 
-A search asks a table for a fitness by name and does not know what it measures. Numbers of different
-generations compare for all but the critic, which goes on learning.
+A search takes a fitness by name from a table and does not know its meaning. Numbers of different generations
+are comparable for all but the critic, which keeps learning.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from deal_hw.calib.deal_paper.rollouts import (
     transitions,
 )
 from deal_hw.calib.search.base import Coordinates
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
 
@@ -53,18 +53,18 @@ class FitnessSettings:
         window_ticks: Window length of `trajectory` in control periods.
         ticks: Most transitions of a rollout (the DEAL paper's Table 4: 200); `critic`, `energy`, `mmd`.
         replay: Roll out with the recorded commands, not with the policy in closed loop (Algorithm 1, line 3).
-        difference: Score (s, a, s' - s) instead of the paper's (s, a, s'): the same information, but a first
-            layer can see the change at all, as s and s' differ by a hundredth of their range.
-        standardise: Scale transitions to mean 0 and variance 1 over the recording; the paper says nothing of
-            input scaling. Standardised inputs are cut to five standard deviations: a member whose pole spins
-            would own the critic's output, and with it the softmax.
+        difference: Score (s, a, s' - s) instead of the paper's (s, a, s'). The information is the same. But s
+            and s' differ by only a hundredth of their range, which a first layer hardly sees.
+        standardise: Scale transitions to mean 0 and variance 1 over the recording; the paper has no input
+            scaling. Standardised inputs are cut at five standard deviations: otherwise a member whose pole
+            spins dominates the critic's output, and with it the softmax.
         bandwidth: Width of `mmd`'s kernel in standardised units; None for the median distance between the
             recording's transitions.
         critic: Size and training of the critic; None for the paper's.
-        replay_generations: How many generations' rollouts D_S the critic is trained against, None for all.
-            Algorithm 1 stores rollouts and does not say whether it forgets; a critic that is still trained
-            against populations of long ago pushes the present one along with them (measured: no better than
-            the centre), so the default forgets.
+        replay_generations: Number of generations of rollouts D_S in the critic's training; None for all.
+            Algorithm 1 stores rollouts and does not say whether it forgets. A critic that is still trained
+            against old populations pushes the present one away with them (measured: no better than the
+            centre), so the default forgets.
         torch_threads: Threads of the critic's arithmetic.
     """
 
@@ -90,17 +90,8 @@ class FitnessSettings:
             raise ConfigurationError(f"the bandwidth must be above 0 or None, got {self.bandwidth:g}")
 
 
-class Fitness(Kept, abc.ABC):
-    """What a search is told of its members.
-
-    Args:
-        problem: Data, simulator and policy.
-        settings: How to score.
-        rng: Seeds the critic; the others learn nothing and keep nothing.
-
-    Attributes:
-        values: What the last call of `score` found besides, for the trace.
-    """
+class Fitness(Stateful, abc.ABC):
+    """A score of members; ``values`` are further values of the last call of `score`, for the trace."""
 
     def __init__(
         self,
@@ -114,11 +105,11 @@ class Fitness(Kept, abc.ABC):
 
     @abc.abstractmethod
     def _prepare(self, rng: np.random.Generator) -> None:
-        """Make what scoring needs."""
+        """Set up scoring."""
 
     @abc.abstractmethod
     def score(self, members: Members) -> FloatArray:
-        """Return one number a member, (N,): higher is better, -inf where the simulation diverged."""
+        """Return one number per member, (N,): higher is better, -inf where the simulation diverged."""
 
 
 def make_fitness(
@@ -127,17 +118,11 @@ def make_fitness(
     rng: np.random.Generator,
     settings: FitnessSettings | None = None,
 ) -> Fitness:
-    """Return a new fitness.
-
-    Args:
-        name: A name in `FITNESSES`.
-        problem: Data, simulator and policy.
-        rng: Seeds the critic; the others draw nothing from it.
-        settings: How to score.
+    """Return a new fitness; see :class:`Fitness`.
 
     Raises:
-        UnknownNameError: The name is not in the table.
-        InsufficientDataError: The recording is too short for it, or it needs the policy of the recording.
+        UnknownNameError: The name is not in `FITNESSES`.
+        InsufficientDataError: The recording is too short for it, or its policy is needed and not known.
     """
     if name not in FITNESSES:
         raise UnknownNameError("fitness", name, FITNESSES)
@@ -149,10 +134,10 @@ def make_fitness(
 
 
 class FlatFitness(Fitness):
-    """The same number for every member: a search that cannot see the data."""
+    """The same number for every member: a baseline without data."""
 
     def _prepare(self, rng: np.random.Generator) -> None:
-        # The critic's seed, which nobody reads: search and no-data baseline then see the same random numbers.
+        # Draws the critic's seed, so that search and no-data baseline use the same random numbers.
         rng.integers(2**62)
 
     def score(self, members: Members) -> FloatArray:
@@ -163,16 +148,15 @@ class FlatFitness(Fitness):
 class TrajectoryFitness(Fitness):
     """Prediction error in windows: minus the logarithm of the mean squared whitened window innovation.
 
-    The logarithm, because errors of far members span many decades: a softmax of the errors themselves would
-    see nothing among the good ones. The metric is that of the range's midpoint for all members and
-    generations, or scores would not compare.
+    Errors of distant members span many decades: a softmax of the errors themselves could not separate the
+    good ones. All members and generations use the metric of the range's midpoint, so scores are comparable.
     """
 
     def _prepare(self, rng: np.random.Generator) -> None:
         self._windows = cut(self._problem, self._settings.window_ticks)
         coordinates = Coordinates(self._problem)
         self._midpoint = coordinates.members(np.full((1, coordinates.count), 0.5))
-        # Made on first use and kept: a small population's call costs less than its metric.
+        # Made on first use: a small population's call costs less than its metric.
         self._whitenings: list[Whitening] | None = None
 
     def score(self, members: Members) -> FloatArray:
@@ -189,10 +173,6 @@ class TrajectoryFitness(Fitness):
 
 class RolloutView:
     """Transitions (s, a, s') of the recording and of rollouts.
-
-    Args:
-        problem: Data, simulator and policy.
-        settings: How to roll out, and what of it is seen.
 
     Raises:
         InsufficientDataError: A recording is too short, or its policy is not known.
@@ -261,12 +241,7 @@ class KernelFitness(EnergyFitness):
 def energy_distance(x: FloatArray, y: FloatArray) -> float:
     """Return the energy distance 2 E|x - y| - E|x - x'| - E|y - y'| of two samples (Szekely and Rizzo 2013).
 
-    Args:
-        x: (n, d).
-        y: (m, d).
-
-    Returns:
-        At least 0; expectations run over all pairs, a sample with itself included.
+    Samples are (n, d) and (m, d). Expectations run over all pairs, a sample with itself included.
     """
     between = float(cdist(x, y).mean())
     # pdist holds each pair once and not the zeros on the diagonal.
@@ -275,15 +250,9 @@ def energy_distance(x: FloatArray, y: FloatArray) -> float:
 
 
 def squared_mmd(x: FloatArray, y: FloatArray, bandwidth: float) -> float:
-    """Return the squared maximum mean discrepancy of two samples (Gretton et al. 2012, eq. 5).
+    """Return the squared maximum mean discrepancy of samples (n, d) and (m, d) (Gretton et al. 2012, eq. 5).
 
-    Args:
-        x: (n, d).
-        y: (m, d).
-        bandwidth: h of the kernel exp(-|x - y|^2 / (2 h^2)).
-
-    Returns:
-        At least 0; the biased estimate, over all pairs.
+    It is the biased estimate, over all pairs, with the kernel exp(-|x - y|^2 / (2 h^2)) of ``bandwidth`` h.
     """
 
     def mean(a: FloatArray, b: FloatArray) -> float:

@@ -25,8 +25,9 @@ class Ticks:
     Attributes:
         start: Grid index at which each tick starts, (T + 1,); the last one ends the last tick.
         sample: Index of the state sample at each of them, (T + 1,).
-        changes: Ticks at which what is sent (gains, limits) differs from the tick before; starts with 0.
-        lead: Device periods from the start of a tick, whose state the controller saw, until its command acts.
+        changes: Ticks whose gains or limits differ from the tick before; starts with 0.
+        lead: Device periods from the start of a tick, whose state the controller saw, to its command's
+            effect.
         number: Commands of the recording before the first tick's.
         past: Index of the state sample at the start of each of the last ticks before the first, (h,).
     """
@@ -48,7 +49,7 @@ class Ticks:
 
     @property
     def past_action(self) -> IntArray:
-        """Grid index at which the action of each of the ticks before is read, (h,)."""
+        """Grid index at which the action of each past tick is read, (h,)."""
         period = self.start[1] - self.start[0]
         return np.asarray(self.action[0] + period * np.arange(-len(self.past), 0))
 
@@ -56,15 +57,9 @@ class Ticks:
 def control_ticks(problem: Problem, index: int, most: int | None = None, history: int = 0) -> Ticks:
     """Divide an episode into control periods, from its first usable sample to the first gap.
 
-    A tick starts at the newest state that the controller can have seen, the last sample before its command
-    acts.
-
-    Args:
-        problem: Gives the episodes and the control rate.
-        index: Which episode.
-        most: Most ticks to return.
-        history: Control periods that the policy looks back. Where the recording begins after the policy did,
-            so many ticks are left out, so that its past is known.
+    A tick starts at the newest state that the controller can have seen: the last sample before its command
+    acts. At most ``most`` ticks are returned. If the recording begins after the policy did, ``history`` ticks
+    are left out, so that the policy's past is known.
 
     Raises:
         InsufficientDataError: There are fewer than two ticks.
@@ -73,7 +68,7 @@ def control_ticks(problem: Problem, index: int, most: int | None = None, history
     period = round(1.0 / (description.control_rate_hz * episode.step_s))
     row_of = {int(s): i for i, s in enumerate(episode.sample)}
     first = int(np.argmax(episode.usable))
-    # Commands come once a period, at the phase at which most of them change the target.
+    # Commands come once per period, at the phase at which most of them change the target.
     changed = np.flatnonzero(np.any(episode.target[1:] != episode.target[:-1], axis=1)) + 1
     phase = int(np.bincount(changed % period, minlength=period).argmax())
     lead = int((phase - episode.sample[first]) % episode.stride)
@@ -95,8 +90,8 @@ def control_ticks(problem: Problem, index: int, most: int | None = None, history
             break
     if len(start) < 3 + skip:
         raise InsufficientDataError(
-            f"episode {index} has {max(len(start) - 1, 0)} whole control periods; a rollout needs {2 + skip} "
-            "or more"
+            f"episode {index} has {max(len(start) - 1, 0)} whole control periods, a rollout needs at least "
+            f"{2 + skip}; record longer"
         )
     past, start, sample = sample[:skip], start[skip:], sample[skip:]
     sent = np.concatenate([episode.stiffness, episode.damping, episode.effort_limit], axis=1)
@@ -121,12 +116,8 @@ def rollout_population(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Roll all members out from the recording's initial state (Algorithm 1, line 3).
 
-    Args:
-        problem: Data, simulator and pi_0; its physics step may be longer than the device's period.
-        members: The N simulators.
-        index: Which episode.
-        ticks: Its control periods.
-        replay: Send the recorded targets, pi_0's actions on the robot, instead of asking pi_0.
+    With ``replay``, members get the recorded targets, pi_0's actions on the robot, instead of pi_0's new
+    ones. The physics step may be longer than the device's period.
 
     Returns:
         Positions and velocities at the ticks, (N, T + 1, J) each, and the action of each tick, (N, T, A).
@@ -153,15 +144,15 @@ def rollout_population(
 
 
 def policy_of(problem: Problem) -> PopulationPolicy:
-    """Return the policy that moved the robot all through the recordings.
+    """Return the policy that produced all commands of the recordings.
 
     Raises:
         InsufficientDataError: It is not known, or no policy did.
     """
     if problem.policy is None:
         raise InsufficientDataError(
-            "a rollout in closed loop needs the policy that moved the robot all through the recordings, and "
-            "it is not known; record with `deal-hw collect --motion balance`, or use a method that needs no "
+            "a rollout in closed loop needs the policy that produced all commands of the recordings, and it "
+            "is not known; record with `deal-hw collect --motion balance`, or use a method that needs no "
             "policy: eki, deal, deal-paper-replay"
         )
     return problem.policy
@@ -180,7 +171,7 @@ def _replay(
         control = on_physics_steps(batch, path[:, ticks.start[begin] : ticks.start[end]], episode.step_s)
         moved = batch.advance(control, every)
         position[:, begin + 1 : end + 1], velocity[:, begin + 1 : end + 1] = moved
-        # `advance` sees a divergence only in the stretch in which it happens.
+        # `advance` reports a divergence only in the stretch in which it happens.
         bad = ~np.isfinite(position[:, begin]).all(axis=1)
         position[bad, begin + 1 :], velocity[bad, begin + 1 :] = np.nan, np.nan
     action = np.broadcast_to(episode.target[ticks.action], (N, T, episode.target.shape[1]))
@@ -229,8 +220,8 @@ class TransitionScale:
     Attributes:
         mean: (2 J + A + 2 J,).
         std: Likewise.
-        limit: Standardised inputs are cut to this. A member whose pole spins would own the critic's output,
-            and with it the softmax.
+        limit: Standardised inputs are cut at this. Otherwise a member whose pole spins dominates the critic's
+            output, and with it the softmax.
     """
 
     mean: FloatArray
@@ -253,13 +244,9 @@ class TransitionScale:
 def transitions(
     position: FloatArray, velocity: FloatArray, action: FloatArray, *, difference: bool = False
 ) -> npt.NDArray[np.float32]:
-    """Return (s, a, s') of rollouts, (N, T, 2 J + A + 2 J), not yet standardised.
+    """Return (s, a, s') of rollouts, (N, T, 2 J + A + 2 J), not yet standardised; or (s, a, s' - s).
 
-    Args:
-        position: (N, T + 1, J).
-        velocity: (N, T + 1, J).
-        action: (N, T, A).
-        difference: Return (s, a, s' - s).
+    Positions and velocities are (N, T + 1, J), actions (N, T, A).
     """
     state = np.concatenate([position, velocity], axis=2)
     after = np.diff(state, axis=1) if difference else state[:, 1:]
@@ -283,7 +270,7 @@ def demonstration(
 def recorded_states(problem: Problem, index: int, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return smoothed positions and velocities of an episode's samples, (n, C) each.
 
-    A rollout is far from the recording: orientations of both are put in one chart, that of the identity.
+    A rollout is far from the recording, so orientations of both are relative to the identity.
     """
     starts, episode = problem.starts[index], problem.episodes[index]
     position, velocity = starts.position[rows].copy(), starts.velocity[rows]

@@ -1,7 +1,7 @@
-"""What to record next: which excitation is most informative about what a recording left open.
+"""Advice on the next recording: which excitation is most informative about the open parameters.
 
-All figures are computed: each excitation of a menu is simulated at the estimate, and its Fisher information
-is added to what the calibration knows already.
+Each excitation of a menu is simulated at the estimate, and its Fisher information is added to that of the
+calibration.
 """
 
 from __future__ import annotations
@@ -40,16 +40,15 @@ class AdviceSettings:
     """Which excitations are tried, and when one is advised.
 
     Attributes:
-        worth: An excitation is worth naming where it takes a standard deviation to this share or less.
+        worth: Largest ratio of standard deviations, after to before, at which an excitation is advised.
         seconds: Length of an excitation [s].
-        balance_s: So long the robot is balanced first, at most a quarter of the whole [s].
+        balance_s: Balancing time at the start, at most a quarter of the whole [s].
         amplitudes: Shares of the joints' ranges.
-        low_effort: A low effort limit, as a share of the usual one: it shows what an effort is worth.
+        low_effort: A low effort limit, as a share of the usual one: it shows the unit of an effort.
         high_speed: A high speed limit, as a multiple of the usual one.
-        beyond: A joint of a robot without limits may leave its recorded range by this share of it on either
-            side.
-        faster: It may be so many times as fast as in the recordings; what is asked of it is half of that.
-        seed: Fixes what is random in excitations.
+        beyond: Margin on either side of the recorded range of a joint without limits, as a share of it.
+        faster: Trip speed of a joint without limits, as a multiple of the recorded one; requests get half.
+        seed: Seeds the excitations.
     """
 
     worth: float = 0.7
@@ -68,14 +67,14 @@ SETTINGS = AdviceSettings()
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What would help with one parameter.
+    """Advice for one parameter.
 
     Attributes:
         parameter: Its name.
         before: Its standard deviation now, in its own scale.
-        after: The one that another recording would leave; as before where none helps.
-        excitation: Which recording, in words; "" where none helps.
-        sentence: All of it as one sentence.
+        after: The one after another recording; equal to ``before`` where none helps.
+        excitation: The recording, in words; "" where none helps.
+        sentence: The advice in one sentence.
         command: `deal-hw` options that make the excitation; "" where none helps.
     """
 
@@ -101,13 +100,7 @@ class Advice:
 def menu_designs(
     description: RobotDescription, balances: bool = False, settings: AdviceSettings = SETTINGS
 ) -> dict[str, ExcitationDesign]:
-    """Return excitations that a robot can be recorded with, by what they are in words.
-
-    Args:
-        description: The robot.
-        balances: Whether they begin with a balancing policy.
-        settings: Which.
-    """
+    """Return the excitations of the menu by their description; ``balances``: a policy balances first."""
     balance_s = min(settings.balance_s, 0.25 * settings.seconds) if balances else 0.0
     top = min(5.0, description.control_rate_hz / 6)
     designs = [
@@ -143,7 +136,7 @@ def options(design: ExcitationDesign) -> str:
 def _variants(
     description: RobotDescription, settings: AdviceSettings
 ) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Return factors on effort and speed limit that are worth trying: as it is, low effort, high speed."""
+    """Return factors on effort and speed limit to try: both unchanged, low effort, high speed."""
     one = (1.0, 1.0)
     found = [(one, one)]
     fast = 1.0
@@ -164,19 +157,19 @@ def advise(
     settings: AdviceSettings = SETTINGS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
-    """Say for each weak or unidentified parameter of a result what to record next.
+    """Return advice for each weak or unidentified parameter of a result.
 
     Args:
         robot: The nominal model, with a fixed base.
-        result: What the calibration found.
-        balance: Makes the policy that balances; None for robots that stand by themselves.
+        result: The calibration's result.
+        balance: Makes the balancing policy; None for robots that stand by themselves.
         settings: Which excitations are tried.
         threads: Simulation threads.
     """
     space, K = result.space, len(result.space)
     known = result.distribution()
     before = np.full(K, np.inf) if known.covariance is None else np.sqrt(np.diag(known.covariance))
-    # An interval that was cut off at the range says less than its width.
+    # A truncated interval has more information than its width shows.
     before = np.minimum(before, space.width / np.sqrt(12.0))
     open_ = [k for k in range(K) if not _has_value(space, k, float(before[k])) or _said_weak(result, k)]
     if not open_:
@@ -184,7 +177,7 @@ def advise(
     designs = menu_designs(robot.description, balance is not None, settings)
     menu = {name: make_plan(robot.description, design) for name, design in designs.items()}
     predictions = predict_menu(robot, known, menu, balance=balance, threads=threads)
-    # What the model lacks will be in the next recording, too: it widens that interval like this one.
+    # Model error will also be in the next recording: it widens that interval like this one.
     widened = result.provenance.get("clustered", {}).get("widened", {})
     found = []
     for k in open_:
@@ -203,22 +196,14 @@ def predict_menu(
     balance: Callable[[], Behaviour] | None = None,
     threads: int | None = None,
 ) -> dict[str, ExpectedInformation]:
-    """Predict at the estimate what each excitation adds to what is known.
-
-    Args:
-        robot: The nominal model.
-        known: What is known; its mean is where is simulated.
-        menu: Excitations of one length.
-        balance: Makes the policy that balances.
-        threads: Simulation threads.
-    """
+    """Predict the information of each excitation of a menu at the estimate; all have one length."""
     space, one = known.space, np.eye(len(known.space))
     # The range bounds what the recordings leave open.
     flat = np.linalg.inv(np.diag(space.width**2 / 12.0))
     seen = 0.0 * one if known.covariance is None else np.linalg.inv(known.covariance + 1e-12 * one)
     bounded = np.asarray(np.linalg.inv(seen + flat), dtype=float)
     prior = Prior.of(dataclasses.replace(known, covariance=bounded))
-    # One member at the estimate: the linearised posterior is about this one robot.
+    # One member, at the estimate: the linearised posterior is about this one robot.
     there = dataclasses.replace(known, covariance=1e-18 * one)
     seconds = max(plan.seconds for plan in menu.values())
     rng = np.random.default_rng(0)
@@ -246,8 +231,8 @@ def _advice(
     usable = {name: found for name, found in predictions.items() if found.usable}
     if not usable:
         sentence = (
-            f"{name} is open at {_amount(space, k, before)}: none of {len(predictions)} excitations keeps "
-            "the limits in the simulation with the values found, so no advice can be computed"
+            f"{name} is open at {_amount(space, k, before)}: with the values found, none of "
+            f"{len(predictions)} excitations stays inside the limits in simulation, so there is no advice"
         )
         return Advice(name, before, before, "", sentence)
     best = min(usable, key=lambda name: float(usable[name].std[k]))
@@ -271,7 +256,7 @@ def _advice(
 
 
 def _amount(space: ParameterSpace, k: int, std: float) -> str:
-    """Return a standard deviation in words: a share on a log scale, the unit on a linear one."""
+    """Format a standard deviation: in percent on a log scale, with the unit on a linear one."""
     if space.log_scale[k]:
         return f"{100 * std:.2g} %"
     return f"{std:.2g} {space.free[k].unit}"
@@ -286,18 +271,10 @@ def next_recordings(
     settings: AdviceSettings = SETTINGS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
-    """Say for each weak or unidentified parameter what to record next.
+    """Return advice as :func:`advise` does, for the parameters that the result calls weak or unidentified.
 
-    A robot whose description knows no limits is kept to what its recordings covered; the noise that is
-    reckoned with is what the calibration found to be left.
-
-    Args:
-        robot: The nominal model.
-        result: What the calibration found.
-        episodes: The fitted recordings.
-        balance: Makes the policy that balances; None for robots that stand by themselves.
-        settings: Which excitations are tried.
-        threads: Simulation threads.
+    A robot without described limits stays inside what its recordings covered. The noise is the residual that
+    the calibration left.
     """
     open_ = [n for n, v in zip(result.space.names, result.verdicts, strict=False) if v != "identifiable"]
     if not open_:
@@ -310,7 +287,7 @@ def next_recordings(
         found = advise(known, result, balance=balance, settings=settings, threads=threads)
     except DealHwError as err:
         return _without(open_, str(err))
-    # A parameter that the verdict holds for identifiable needs no recording, wide as it may be.
+    # A parameter with the verdict identifiable needs no recording, however wide its interval is.
     return tuple(one for one in found if one.parameter in open_)
 
 
@@ -328,7 +305,7 @@ def _described(
     settings: AdviceSettings,
     threads: int | None,
 ) -> RobotDescription:
-    """Return the robot with the noise that is left, and with its recordings' limits where it has none."""
+    """Return the description with the residual as noise, and with the recordings' limits if it has none."""
     description = robot.description
     problem = Problem(robot, result.space, episodes, threads=threads)
     noise = _noise(problem, result)
@@ -357,7 +334,7 @@ def _described(
 
 
 def _noise(problem: Problem, result: CalibrationResult) -> FloatArray:
-    """Return what a position may be off, (J,): noise of the sensor, and what the model leaves unexplained."""
+    """Return the expected error of positions, (J,): the sensor's noise times the unexplained residual."""
     joints = len(problem.robot.description.joint_names)
     used = result.provenance.get("noise_std", ())
     noise = np.array(used) if len(used) == joints else problem.noise_std[:joints]
@@ -372,11 +349,8 @@ def _pairs(low: FloatArray, high: FloatArray) -> tuple[tuple[float, float], ...]
 def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]:
     """Return the one thing to do next, in words and as commands.
 
-    Of all recordings the one that helps most parameters most; where none helps, what to measure.
-
-    Args:
-        advice: What :meth:`Advice.to_json` gave for each open parameter.
-        robot: The robot's name where `deal-hw` can record it; "" for no commands.
+    It is the recording that helps most parameters most; without one, the measurement to make. ``advice`` is
+    :meth:`Advice.to_json` of each open parameter. Commands need a robot that `deal-hw` can record.
     """
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in advice:

@@ -1,7 +1,7 @@
-"""Trials: what a robot with given parameters would do under a behaviour, run through the safety filter.
+"""Trials: simulated robots with given parameters under a behaviour, behind the safety filter.
 
-The same closed loop as on the robot, at the control rate: state, behaviour, safety filter, set-point
-generator, latency, engine. Several members with their own parameters run side by side.
+It is the closed loop of the robot, at the control rate: state, behaviour, safety filter, set-point generator,
+latency, engine. Several members with their own parameters run side by side.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """D members that every candidate is tried on.
+    """D simulated robots on which every candidate is tried.
 
     Attributes:
         theta: Physical parameters, (D, K).
@@ -50,12 +50,12 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What one member did.
+    """Result of one member.
 
     Attributes:
         episode: Its recording without noise.
-        tripped: How it came near what ends a run; "" where it did not.
-        clipped: Commands that the safety filter changed.
+        tripped: Which limit it came near; "" for none.
+        clipped: Number of commands that the safety filter changed.
     """
 
     episode: SampledEpisode
@@ -64,7 +64,7 @@ class Trial:
 
 
 class TrialRunner:
-    """Runs behaviours on the members of a scenario; keeps the simulator from one candidate to the next.
+    """Runs behaviours on the members of a scenario; the simulator is kept between candidates.
 
     Args:
         robot: The nominal model, with a fixed base.
@@ -72,8 +72,8 @@ class TrialRunner:
         scenario: The members.
         seconds: Length of a run [s].
         threads: Simulation threads; None for all CPUs.
-        trip_share: Share of the ranges that trip which a trial may use. A few dozen simulated robots are not
-            all there are: a design that used the whole range on 48 of them tripped on one of the first three
+        trip_share: Share of the trip ranges that a trial may use. A few dozen simulated robots do not cover
+            all real ones: a design that used the whole range on 48 of them tripped on one of the first three
             emulated ones.
 
     Raises:
@@ -93,7 +93,7 @@ class TrialRunner:
         if robot.base is not None:
             raise ConfigurationError(
                 f"robot {description.name!r} has a floating base; excitations are designed for robots on a "
-                "stand (such as go2_suspended), where falling over is no matter"
+                "stand (such as go2_suspended), which cannot fall over"
             )
         self._robot, self._scenario, self._trip_share = robot, scenario, trip_share
         self._device_s = 1.0 / description.device_rate_hz
@@ -108,14 +108,10 @@ class TrialRunner:
         self._batch = ServoBatch(robot, space, len(scenario), threads)
 
     def run(self, behaviours: Sequence[Behaviour], until_trip: bool = False) -> list[Trial]:
-        """Run one behaviour a member, reset first; all ask for the same gains and limits at a time.
-
-        Args:
-            behaviours: One a member.
-            until_trip: End all trials as soon as one trips.
+        """Run one behaviour per member, each reset first; with ``until_trip``, up to the first trip.
 
         Raises:
-            ConfigurationError: They ask for different ones.
+            ConfigurationError: They request different gains or limits at a time.
         """
         description, scenario = self._robot.description, self._scenario
         for behaviour in behaviours:
@@ -165,7 +161,7 @@ class TrialRunner:
 
 
 class _Loop:
-    """Behaviours behind the safety filter, and what the safety module would have said."""
+    """Behaviours behind the safety filter, with the safety module's trip limits."""
 
     def __init__(self, description: RobotDescription, position: FloatArray, trip_share: float) -> None:
         self._description, self._trip_share = description, trip_share
@@ -185,7 +181,7 @@ class _Loop:
         sent = []
         for n, behaviour in enumerate(behaviours):
             if self.tripped[n]:
-                # What a robot would do after a trip is of no interest: its trial is not used.
+                # A tripped trial is not used, so its further motion does not matter.
                 sent.append(self.sent[-1][n])
                 continue
             x, v = position[n], velocity[n]
@@ -218,7 +214,7 @@ class _Loop:
         return command
 
     def watch(self, position: FloatArray, velocity: FloatArray) -> None:
-        """Note which members came near the limits that trip, (N, H, J) each."""
+        """Note the members that came near the limits that trip, (N, H, J) each."""
         limits, names = self._description.limits, self._description.joint_names
         low, high = np.array(limits.trip_position).T
         bounded = np.isfinite(low) & np.isfinite(high)

@@ -1,4 +1,4 @@
-"""The most informative excitation inside the limits: random designs, then one coordinate at a time."""
+"""Search of the most informative excitation inside the limits: random designs, then coordinate search."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ Criterion = Literal["determinant", "mean"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SearchSettings:
-    """How thoroughly excitations are searched."""
+    """Effort of an excitation search."""
 
     candidates: int = 40
-    """Random designs."""
+    """Number of random designs."""
     finalists: int = 4
-    """Designs that are kept; one that is worse than all of these is given up as soon as that is sure."""
+    """Number of designs to keep; a design is abandoned once it is certain to be worse than all of these."""
     rounds: int = 24
-    """Changes of one coordinate that are tried on the best."""
+    """Number of single-coordinate changes of the best design."""
     confirmed: int = 6
-    """Designs that are tried again on the members of the confirmation, where there is one."""
+    """Number of designs to repeat on the members of the confirmation, if there is one."""
     criterion: Criterion = "determinant"
-    """determinant: most information in all (D-optimal); mean: least mean standard deviation (A-optimal)."""
+    """determinant: most information in total (D-optimal); mean: least mean standard deviation (A-optimal)."""
     lowest_effort: float = 0.08
-    """Least factor on the effort limit that is tried: below it joints hardly move against their friction."""
+    """Lowest factor on the effort limit: below it joints hardly move against their friction."""
     top_hz: float = 8.0
-    """Greatest frequency that is tried [Hz]."""
+    """Highest frequency [Hz]."""
     ticks_a_cycle: float = 6.0
-    """The greatest frequency has at least so many commands a cycle."""
+    """Fewest commands per cycle of the highest frequency."""
 
     def __post_init__(self) -> None:
         if self.candidates < 1 or self.finalists < 1 or self.rounds < 0 or self.confirmed < 1:
@@ -54,15 +54,15 @@ class SearchSettings:
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """What the search found.
+    """Result of an excitation search.
 
     Attributes:
         design: The best design.
-        plan: Its plan, with the predicted standard deviations in it.
-        prediction: What it tells, on all members.
-        references: What other excitations tell, on the same members, by name.
-        tried: Designs tried.
-        tripped: Those that were discarded, by reason.
+        plan: Its plan, with the predicted standard deviations.
+        prediction: Its information on all members.
+        references: Information of other excitations on the same members, by name.
+        tried: Number of designs.
+        tripped: Number of discarded designs, by reason.
         trace: The best score, at first and after each change of a coordinate.
     """
 
@@ -88,14 +88,14 @@ def search_excitation(
     """Search the most informative excitation that keeps every member inside the limits.
 
     Args:
-        experiment: Predicts what a candidate tells.
+        experiment: Predicts a candidate's information.
         rng: Draws the candidates.
-        settings: How thoroughly.
-        balance: Makes what balances at first; None for robots that stand by themselves.
+        settings: Effort of the search.
+        balance: Makes the balancing behaviour of the start; None for robots that stand by themselves.
         references: Other excitations to compare with.
-        confirmation: The same experiment on other members, and more of them: the best designs are tried on
-            these, too, the one that is best there is returned, with what it tells there. Without it a search
-            on few members finds what suits those few.
+        confirmation: The same experiment on other, more members. The best designs are repeated on these, and
+            the best one there is returned with its prediction there. Without it, a search on few members
+            finds a design for these few.
         notify: Called with candidates done, candidates expected and a short line.
 
     Raises:
@@ -145,7 +145,7 @@ def search_excitation(
             steps.append((best, design))
         trace.append(score(best, wanted))
     if confirmation is not None:
-        # Half of them along the way that the best came, half the other finalists.
+        # Half of them from the history of the best design, half other finalists.
         chosen = steps[::-1][: (wanted.confirmed + 1) // 2]
         there = [d for _, d in chosen]
         chosen += [pair for pair in finals if pair[1] not in there][: wanted.confirmed - len(chosen)]
@@ -153,9 +153,9 @@ def search_excitation(
         best, design = max(again, key=lambda pair: score(pair[0], wanted))
         if not best.usable:
             raise CalibrationError(
-                f"what suits {len(experiment.scenario)} draws of {description.name!r} trips on one of "
-                f"{len(confirmation.scenario)} others ({best.tripped}); give narrower ranges (--range-ratio, "
-                "--calibration) or more draws (--draws)"
+                f"the best excitation for {len(experiment.scenario)} draws of {description.name!r} trips on "
+                f"one of {len(confirmation.scenario)} others ({best.tripped}); give narrower ranges "
+                "(--range-ratio, --calibration) or more draws (--draws)"
             )
     judge = experiment if confirmation is None else confirmation
     plan = make_plan(description, design)
@@ -172,7 +172,7 @@ def search_excitation(
 
 
 def score(prediction: ExpectedInformation, settings: SearchSettings) -> float:
-    """Return what the search maximises; minus infinity for what is not usable."""
+    """Return the quantity that the search maximises; minus infinity if not usable."""
     if not prediction.usable:
         return -np.inf
     return prediction.gain if settings.criterion == "determinant" else -float(np.mean(prediction.std))
@@ -194,7 +194,7 @@ class _Designer:
             self._speed = (0.4, largest_factor(description.speed_limit, description.limits.speed))
 
     def usual(self) -> list[ExcitationDesign]:
-        """Return designs that are known to be fair, such as the motion `rich`: the search starts here."""
+        """Return start designs of known quality, such as the motion `rich`."""
         low, fast = max(0.15, self._effort[0]), min(2.5, self._speed[1])
         fair: tuple[tuple[Family, float], ...] = (("steps", 0.5), ("multisine", 1.0), ("chirp", 1.0))
         balance_s = min(0.6, 0.25 * self._seconds) if self._balances else 0.0
@@ -234,7 +234,7 @@ class _Designer:
         )
 
     def neighbour(self, design: ExcitationDesign, k: int, rng: np.random.Generator) -> ExcitationDesign:
-        """Return the design with one coordinate changed: the k-th, round and round."""
+        """Return the design with one coordinate changed: the k-th, cyclically."""
         factor = float(np.exp(rng.choice((-1.0, 1.0)) * rng.uniform(0.15, 0.6)))
         high = float(np.clip(design.high_hz * factor, 0.5, self._top_hz))
         low = float(np.clip(design.low_hz * factor, 0.1, 0.8 * design.high_hz))

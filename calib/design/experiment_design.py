@@ -1,8 +1,8 @@
-"""How much a recording will tell before it is made: Fisher information of an excitation, and the best one.
+"""Expected information of a recording before it is made: Fisher information of an excitation.
 
-A candidate is run on simulated members drawn from what is known of the parameters, and the normal equations
-of multiple shooting (:class:`~deal_hw.calib.fit.residual.Shooting`) at the members' own parameters are its
-information: the same windows, sensor noise, unknown start states and latency as the calibration itself has.
+A candidate is run on simulated members drawn from the known distribution of the parameters. Its information
+is the normal equations of multiple shooting (:class:`~deal_hw.calib.fit.residual.Shooting`) at the members'
+own parameters. Windows, sensor noise, unknown start states and latency are those of the calibration itself.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ MakeBehaviour = Callable[[], Behaviour]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentSettings:
-    """How excitations are tried.
+    """Settings of :class:`Experiment`.
 
     Attributes:
         window_s: Window length of the information: the longest that the refinement uses [s].
-        start_std: Start positions vary by so many standard deviations of the sensor.
-        inner: Without a calibration members are drawn from this part of each range: its corners are no real
-            robots.
-        draws_per_member: So many draws are tried for each member that can be run at all.
+        start_std: Spread of start positions [standard deviations of the sensor].
+        inner: Part of each range from which members are drawn before a calibration: corners of the ranges are
+            no real robots.
+        draws_per_member: Number of draws per member that can be run.
     """
 
     window_s: float = 0.8
@@ -52,14 +52,14 @@ SETTINGS = ExperimentSettings()
 
 @dataclass(frozen=True, slots=True)
 class ExpectedInformation:
-    """What an excitation is predicted to tell.
+    """Predicted information of an excitation.
 
     Attributes:
         std: Standard deviation of each parameter in its own scale, root mean square over members, (K,).
-        gain: Information over what is known before [nats], from the members' mean covariance.
-        tripped: Why a member would have been stopped, or why nothing can be predicted; "" where all is well.
+        gain: Information gain over the prior [nats], from the members' mean covariance.
+        tripped: Why a member would have been stopped, or why nothing can be predicted; "" for neither.
         clipped: Commands that the safety filter changed, over all members.
-        beaten: Whether it was given up because others tell more.
+        beaten: Whether it was abandoned because others have more information.
     """
 
     std: FloatArray
@@ -70,13 +70,13 @@ class ExpectedInformation:
 
     @property
     def usable(self) -> bool:
-        """Whether all members ran to the end, and were all looked at."""
+        """Whether all members ran to the end and were evaluated."""
         return not self.tripped and not self.beaten
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known before the recording.
+    """Information before the recording.
 
     Attributes:
         information: Of parameters in their own scale and latency [s], (K + 1, K + 1).
@@ -86,31 +86,27 @@ class Prior:
 
     @classmethod
     def of(cls, known: ParameterDistribution) -> Prior:
-        """Return a distribution's: Gaussian, or as wide as the ranges."""
+        """Return the prior of a distribution: Gaussian, or as wide as the ranges."""
         space, K = known.space, len(known.space)
         information = np.zeros((K + 1, K + 1))
         flat = np.diag(12.0 / space.width**2)
         if known.covariance is None:
             information[:K, :K] = flat
         else:
-            # The range bounds what the covariance leaves open, and keeps an exact one invertible.
+            # The small term keeps an exact covariance invertible.
             information[:K, :K] = np.linalg.inv(known.covariance + 1e-12 * np.eye(K))
         low, high = known.latency_s
         information[K, K] = 12.0 / max(high - low, 1e-4) ** 2
         return cls(information)
 
     def posterior(self, hessian: FloatArray) -> FloatArray:
-        """Return the covariance of the parameters after data of this information, (K, K).
-
-        Args:
-            hessian: Information of parameters and latency, (K + 1, K + 1).
-        """
+        """Return the parameters' covariance, (K, K), after data of information (K + 1, K + 1)."""
         return np.asarray(np.linalg.inv(self.information + hessian)[:-1, :-1])
 
     def gain(self, covariance: FloatArray) -> float:
         """Return half the log ratio of determinants before and after [nats], for a covariance after, (K, K).
 
-        The D-optimal criterion. Directions that the data cannot see add nothing to it, so it needs no choice
+        It is the D-optimal criterion. Directions without information add nothing to it, so it needs no choice
         of an identifiable subspace.
         """
         before = np.linalg.inv(self.information)[:-1, :-1]
@@ -128,17 +124,7 @@ def information(
 ) -> FloatArray:
     """Return the Fisher information of a recording with the nominal sensor's noise, start states eliminated.
 
-    Args:
-        robot: The nominal model.
-        space: The parameters.
-        trial: The recording without noise.
-        theta: The parameters that made it, (K,).
-        latency_s: The latency that made it [s].
-        window_s: Length of the windows [s].
-        threads: Simulation threads.
-
-    Returns:
-        Of parameters in their own scale and latency [s], (K + 1, K + 1).
+    It is that of parameters in their own scale and latency [s], (K + 1, K + 1), at the trial's true ones.
     """
     J = len(robot.description.joint_names)
     std = np.concatenate([robot.description.sensor.position_std, np.ones(J)])
@@ -149,19 +135,19 @@ def information(
 
 
 class Experiment:
-    """Predicts what candidates tell, all on the same members, so that differences are the candidates'.
+    """Predicts the information of candidates, all on the same members.
 
     Args:
         robot: The nominal model.
-        known: What is known of the parameters and the latency.
+        known: Distribution of the parameters and the latency.
         seconds: Length of a run [s].
         draws: Members D.
         rng: Draws them.
-        rest: Behaviour that hardly moves the robot; members that it cannot keep inside the limits are drawn
-            again, for no excitation could. None to take the first draws.
+        rest: Behaviour that hardly moves the robot. Members that leave the limits even under it are drawn
+            again. None to take the first draws.
         threads: Simulation threads.
         settings: How members are drawn and tried.
-        prior: What is known before; the distribution by default.
+        prior: Information before the recording; that of ``known`` by default.
 
     Raises:
         CalibrationError: Hardly any draw can be run.
@@ -183,7 +169,7 @@ class Experiment:
         self.seconds, self.threads = seconds, threads
         self.prior = prior or Prior.of(known)
         self.refused = 0
-        """Draws that could not be run."""
+        """Number of draws that could not be run."""
         self._runner: TrialRunner | None = None
         self._order = list(range(draws))
         self._rest = rest
@@ -196,8 +182,8 @@ class Experiment:
         if len(kept) < draws:
             raise CalibrationError(
                 f"only {len(kept)} of {len(drawn)} draws from the parameters' ranges keep the limits of "
-                f"{self.robot.description.name!r} when nothing is asked of it; give narrower ranges "
-                "(--range-ratio), a calibration, or a policy that balances"
+                f"{self.robot.description.name!r} at rest; give narrower ranges (--range-ratio), a "
+                "calibration, or a policy that balances"
             )
         self.refused = (kept[-1] + 1) - draws
         return drawn.part(kept)
@@ -206,27 +192,27 @@ class Experiment:
         return TrialRunner(self.robot, self.space, scenario, self.seconds, self.threads)
 
     def afresh(self, draws: int, rng: np.random.Generator) -> Experiment:
-        """Return the same experiment on other members: what was chosen on some is judged on others."""
+        """Return the same experiment on other members, for an independent evaluation."""
         rest, threads, settings = self._rest, self.threads, self.settings
         return Experiment(
             self.robot, self.known, self.seconds, draws, rng, rest, threads, settings, self.prior
         )
 
     def playing(self, plan: ExcitationPlan, balance: MakeBehaviour | None) -> MakeBehaviour:
-        """Return what makes a plan's behaviour, which begins with what balances the robot, if anything."""
+        """Return the factory of a plan's behaviour, after ``balance`` if given."""
         description = self.robot.description
         return lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None)
 
     def predict(
         self, make: MakeBehaviour, bar: Callable[[ExpectedInformation], bool] | None = None
     ) -> ExpectedInformation:
-        """Predict what a behaviour tells.
+        """Predict a behaviour's information.
 
         Args:
             make: Makes the behaviour.
-            bar: Asked after each member whether to go on, with what the behaviour would tell if the members
-                left were known exactly: no prediction ends above that. Members that left the last finished
-                behaviour most in the dark come first, so most others end after one or two.
+            bar: Decides after each member whether to continue. Its argument is an upper bound: the prediction
+                if the remaining members were known exactly. Members with the least information in the last
+                finished behaviour come first, so most others end after one or two.
         """
         D, K = len(self.scenario), len(self.space)
         if self._runner is None:
@@ -250,8 +236,8 @@ class Experiment:
                 return dataclasses.replace(nothing, tripped=str(err))
             if not np.isfinite(covariances[n]).all():
                 return dataclasses.replace(nothing, tripped="a member diverged in its windows")
-            # Covariances are averaged, not gains: what leaves no trace on one robot in eight must not be made
-            # up for by what is a little sharper on the other seven.
+            # Covariances are averaged, not gains: a parameter without effect on one robot in eight must not
+            # be compensated by a little more information on the other seven.
             mean = np.mean(covariances, axis=0)
             found = ExpectedInformation(np.sqrt(np.diag(mean)), self.prior.gain(mean), clipped=clipped)
             if bar is not None and not bar(found):
@@ -264,7 +250,7 @@ class Experiment:
 def default_knowledge(
     space: ParameterSpace, latency_s: tuple[float, float] = LATENCY_RANGE_S
 ) -> ParameterDistribution:
-    """Return what is known before any calibration: the ranges."""
+    """Return the distribution before any calibration: the ranges."""
     return ParameterDistribution.uniform(space, latency_s)
 
 
@@ -278,8 +264,8 @@ def _draw(
     cubes_of_draws, (least, most) = settings.draws_per_member, settings.inner
     count = draws * cubes_of_draws
     if known.covariance is None:
-        # Latin hypercubes: each parameter is at its low and at its high end on some member, for it is at the
-        # ends that something leaves no trace, as a high effort limit does.
+        # Latin hypercubes: each parameter is at its low and at its high end on some member, because effects
+        # vanish at the ends, as that of a high effort limit does.
         K = len(known.space)
         cubes = [rng.permuted(np.tile(np.arange(draws), (K, 1)), axis=1).T for _ in range(cubes_of_draws)]
         unit = (np.concatenate(cubes) + rng.random((count, K))) / draws
@@ -287,7 +273,7 @@ def _draw(
     else:
         theta = known.sample(rng, count)
     low, high = known.latency_s
-    # Half of the searched range: hardly any robot has a delay at its end.
+    # Half of the searched range: few robots have a delay at its end.
     latency = rng.uniform(low, 0.5 * (low + high) if known.covariance is None else high, count)
     default = np.array(description.default_position)
     spread = settings.start_std * description.sensor.position_std

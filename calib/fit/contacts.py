@@ -1,11 +1,11 @@
-"""Where feet touch the floor: the strategy beside the one solver, start states following by secants.
+"""Solver for feet in contact with the floor: a strategy beside the one solver, with secants for start states.
 
-Feet that stick and slip kink every prediction, so the full Gauss-Newton step of all start states at once
-hardly ever helps, and a solver that insists on it stops with start states that explain nothing: measured on
-sensed Go2 targets, windows started from smoothed states cost six times the noise at the true parameters, and
-what was left was correlated over 5 to 13 samples. Given the parameters, though, windows do not depend on each
-other. So after a step of the parameters each window takes that way of following which suits it best, then a
-damped step of its own, and predictions are linearised by secants.
+Feet that stick and slip make kinks in every prediction. A full Gauss-Newton step of all start states at once
+rarely helps, and a solver that requires it stops at poor start states. On Go2 targets with sensor noise,
+windows from smoothed start states cost six times the noise at the true parameters. Their residuals were
+correlated over 5 to 13 samples. But given the parameters, windows are independent. So after each parameter
+step every window takes its best start-state update, then a damped step of its own. Predictions are linearised
+by secants.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContactSettings:
-    """Settings of the strategy where feet touch the floor.
+    """Settings of :func:`solve_contacts`.
 
     Attributes:
-        start_dampings: Levenberg's damping of start states, in units of the smoothed states' standard
+        start_dampings: Levenberg damping of start states, in units of the smoothed states' standard
             deviations; each window takes the best.
-        follow: How far start states follow a parameter step: kinks make the derivative too long as often as
-            right.
-        stretches: Secants, in turns: forward, backward, far and near ones miss different kinks.
-        gain: A cost that falls by less is noise of the kinks.
-        patience: So many runs of the solver without gain are the last.
+        follow: Shares of the linear start-state update after a parameter step. Because of kinks the full
+            update is too long as often as right.
+        stretches: Secant lengths, used in turn: forward, backward, far and near ones miss different kinks.
+        gain: A smaller decrease of the cost is noise from kinks.
+        patience: Most consecutive runs of the solver without gain.
         start_iterations: Most steps of start states alone.
     """
 
@@ -49,14 +49,7 @@ CONTACTS = ContactSettings()
 def solve_contacts(
     shooting: Shooting, point: Point, iterations: int, *, fixed_latency: bool
 ) -> tuple[Point, Normal, int]:
-    """Solve for parameters and start states; the best point that was seen is handed back.
-
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        iterations: Most derivatives of the solver.
-        fixed_latency: Keep the latency.
-    """
+    """Solve for parameters and start states; return the best point, its normal equations, and derivatives."""
     best, best_cost = settle(shooting, point, CONTACTS.start_iterations)
     bounds, waited, used = value_bounds(shooting.problem), 0, 0
     while used < iterations and waited <= CONTACTS.patience:
@@ -74,7 +67,7 @@ def solve_contacts(
 
 @dataclass(frozen=True, slots=True)
 class _Followed:
-    """Where start states followed to: the point, normal equations and gains before, residuals there, (M,)."""
+    """A point with updated start states; normal equations and gains before, residuals (M,) after."""
 
     point: Point
     normal: Normal
@@ -83,16 +76,10 @@ class _Followed:
 
 
 class Sticking:
-    """The residual as a function of the parameters, start states of feet that stick and slip following.
+    """The residual as a function of the parameters; start states of sticking and slipping feet follow them.
 
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        stretch: Factor on the secants' steps; negative for backward ones.
-
-    Attributes:
-        best: The point that cost least so far.
-        best_cost: Its cost.
+    ``stretch`` is a factor on the secants' steps, negative for backward ones. ``best`` is the point of the
+    lowest cost so far.
     """
 
     def __init__(self, shooting: Shooting, point: Point, stretch: float) -> None:
@@ -117,7 +104,7 @@ class Sticking:
         return self._shooting.derivative(self._here.normal)
 
     def _followed(self, point: Point) -> _Followed:
-        """Return where start states settle from a point, with what is known there."""
+        """Improve the start states at a point once, and linearise."""
         normal = self._shooting.normal(point, keep=True, stretch=self._stretch)
         point, gains = _settled(self._shooting, point, normal)
         found = _Followed(point, normal, gains, self._shooting.vector(point))
@@ -128,16 +115,7 @@ class Sticking:
 
 
 def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, float]:
-    """Fit start states alone; parameters stay, and no window's cost grows.
-
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        iterations: Most steps.
-
-    Returns:
-        The point and its cost.
-    """
+    """Fit start states alone; parameters stay, and no window's cost grows. Return the point and its cost."""
     cost = shooting.cost(point)
     for number in range(iterations):
         normal = shooting.normal(point, keep=True, stretch=CONTACTS.stretches[number % 2])
@@ -151,7 +129,7 @@ def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, fl
 def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, list[FloatArray]]:
     """Return the point after each window's best damped step, and the gains there, (W, S, P) each.
 
-    A gain is by what start states follow the parameters.
+    A gain is the derivative of the best start states by the parameters.
     """
     scale = np.maximum(shooting.state_std, 1e-12)
     gains, ways = [], []

@@ -1,12 +1,11 @@
 """Output-error fit: least squares on long predictions from smoothed states, as held-out motion is judged.
 
-Multiple shooting explains every sample with start states of its own, which a model that lacks something
-(backlash, a friction law, a slipped clock) uses to explain what is no start state. Over windows of seconds a
-damped robot forgets where it began, so start states need no fit, and what is minimised is what a user wants
-small: the error of a prediction. Each channel is measured by its own residual, which is estimated together
-with the parameters, so nobody has to say how good the model is. Residuals of a wrong model are
-autocorrelated: they count as so many as they have correlation times, and the search range is the prior for
-    the rest.
+Multiple shooting fits the start state of every window. Where the model is incomplete (backlash, a friction
+law, a drifting clock), those start states absorb the model error. A damped robot forgets its start state
+within seconds, so long windows need no fit of it. The cost is then what a user wants small: the error of a
+prediction. The scale of each channel is its own residual, estimated together with the parameters, so nobody
+has to state how good the model is. Residuals of a wrong model are autocorrelated: their number is divided by
+the correlation time. The search range serves as prior for the rest.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """How to fit.
+    """Settings of :func:`fit_output_error`.
 
     Attributes:
-        seconds: Length of the windows; shorter where no stretch is so long.
-        latency: Fit the latency; otherwise it stays that of the start.
-        prior_std: Spread of parameters around their nominal values, as a share of their range in its own
-            scale; infinite for none. By default as wide as the range itself.
+        seconds: Length of the windows [s]; shorter where no stretch is so long.
+        latency: Fit the latency; otherwise it stays at its start.
+        prior_std: Standard deviation of parameters around their nominal values, as a share of their range in
+            its own scale; infinite for none. The default is that of a uniform distribution over the range.
         robust: Large residuals weigh less (Huber).
         iterations: Most steps of the solver.
-        steps: Steps between two measurements of the residual.
-        converged: A round of steps that lowers the cost by a smaller share is the last: held-out motion does
-            not see it.
+        steps: Steps between two estimates of the residual scale.
+        converged: Relative decrease of the cost in a round of steps below which the fit ends: held-out motion
+            does not show it.
         reach: See :class:`deal_hw.calib.fit.solver.SolverSettings`.
-        longest_lag_s: Correlation of residuals is looked for up to here [s].
+        longest_lag_s: Longest lag of the residuals' autocorrelation [s].
     """
 
     seconds: float = 2.0
@@ -59,20 +58,20 @@ class Recipe:
 
 
 SHORT = Recipe(seconds=0.2)
-"""Windows in which even a far start does not diverge."""
+"""Windows in which even a distant start does not diverge."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutputErrorFit:
-    """Where an output-error fit ended, with predictions linearised there.
+    """Result of an output-error fit, with predictions linearised there.
 
     Attributes:
         theta: Physical parameters, (K,).
         latency_s: Total latency [s].
-        scale: What residuals were measured by, channel by channel, (M,): their root mean square, or where the
-            loss is robust their middle.
-        normal: Normal equations of weighed residuals and of what is known of the parameters by other means,
-            with their rows; nothing of a latency that is fixed. Its residuals are those over ``scale``.
+        scale: Scale of each channel's residuals, (M,): the root mean square; for a robust loss at most the
+            scaled median.
+        normal: Normal equations of weighted residuals and of the parameters' own priors, with their rows;
+            zero for a fixed latency. Its residuals are divided by ``scale``.
         iterations: Steps used.
     """
 
@@ -98,9 +97,9 @@ def fit_output_error(
         problem: Recordings and simulator.
         theta: Start, (K,).
         latency_s: Its latency [s].
-        recipe: How.
+        recipe: Settings.
         iterations: Most steps; 0 to linearise at the start, the recipe's by default.
-        central: Linearise the end by central differences, for what is said of the parameters there.
+        central: Linearise the result by central differences, which its uncertainty needs.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -117,10 +116,10 @@ def fit_output_error(
     left = recipe.iterations if iterations is None else iterations
     used = 0
     while left > 0:
-        # Residuals are measured anew every few steps: nobody has said how good the model is.
+        # The scale is estimated again every few steps: nobody has stated how good the model is.
         weighed, _ = _weighed(plain, point, recipe)
         before = weighed.cost(point)
-        # The prior holds what is not seen; autocorrelated residuals weigh too little for another hold.
+        # The prior holds insensitive parameters. Autocorrelated residuals weigh too little for one more hold.
         solver = SolverSettings(
             iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
         )
@@ -146,12 +145,9 @@ def fit_output_error(
 def prediction_rmse(
     problem: Problem, members: Sequence[tuple[FloatArray, float]], seconds: float
 ) -> FloatArray:
-    """Return root mean square errors of open-loop predictions from smoothed states, (N, M).
+    """Return the root mean square errors of predictions from smoothed states, (N, M).
 
-    Args:
-        problem: Recordings to predict.
-        members: Physical parameters, (K,), and latency [s] of each.
-        seconds: Length of the windows.
+    Windows last ``seconds``. Members are parameters, (K,), and latency [s].
     """
     theta, latency = np.stack([m[0] for m in members]), np.array([m[1] for m in members])
     squares, count = np.zeros((len(members), len(problem.channels))), np.zeros(len(problem.channels))
@@ -164,13 +160,10 @@ def prediction_rmse(
 
 
 def expected_residual(problem: Problem) -> FloatArray:
-    """Return what predictions of real recordings may be off, positions then velocities, (2 C,).
+    """Return the expected prediction error of real recordings, positions then velocities, (2 C,).
 
-    The residual of a fit over short windows from the model's own values, at least the sensor noise: what a
-    search is to be told where nobody knows how good the model is.
-
-    Args:
-        problem: Recordings and simulator.
+    It is the residual of a fit over short windows from the nominal values, and at least the sensor noise. A
+    search needs it as scale where nobody knows how good the model is.
     """
     fit = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
     std = problem.noise_std.copy()
@@ -179,16 +172,16 @@ def expected_residual(problem: Problem) -> FloatArray:
 
 
 def _errors(data: WindowData, residual: FloatArray) -> FloatArray:
-    """Return prediction minus measurement, (W, H, M), of whitened residuals; 0 where nothing was reported."""
+    """Return prediction minus measurement, (W, H, M), from whitened residuals; 0 for missing samples."""
     return np.asarray(np.nan_to_num(residual) * np.where(np.isfinite(data.std), data.std, 0.0))
 
 
 def _weighed(
     plain: Shooting, point: Point, recipe: Recipe, prior_share: float | None = None
 ) -> tuple[Shooting, FloatArray]:
-    """Return the fit with each channel measured by its own residual, and these measures, (M,).
+    """Return the fit with each channel scaled by its own residual, and these scales, (M,).
 
-    Residuals of a wrong model are autocorrelated: they count as so many as they have correlation times.
+    Standard deviations grow with the residuals' correlation time.
     """
     problem = plain.problem
     errors = [_errors(d, r) for d, r in zip(plain.data, plain.residuals(point), strict=True)]

@@ -1,6 +1,6 @@
-"""The refinement: least squares on multiple shooting in growing windows, the latency one more unknown.
+"""The refinement: least squares on multiple shooting in growing windows; the latency is one more unknown.
 
-The first answer of a calibration is the refinement of the model's own values, without any search.
+A calibration first refines the nominal values, without any search.
 """
 
 from __future__ import annotations
@@ -25,30 +25,28 @@ class RefinementSettings:
     """Settings of :func:`refine`.
 
     Attributes:
-        stages_s: Window lengths, short first: short windows have a wide basin, long ones the information [s].
-        contact_stages_s: The same where feet touch the floor: longer windows add more kinks than information.
-        given_stages_s: The same where start states are exact. Over a single sample predictions are nearly
-            straight in the motors' gains and hardly a foot lands otherwise than it did, so the basin is about
-            as wide as the range; windows of 0.1 s from the start ended in others (0.18 % off).
-        worse: A longer window whose chi2 grows by more than this factor is not kept: its start states are in
-            another basin, or the model is wrong in a way that adds up.
-        explained: A chi2 below this is not worth other start states.
-        shakes: Spreads of the start states that are drawn where contacts leave the solver stuck, in standard
-            deviations.
+        stages_s: Window lengths, short first [s]: short windows have a wide basin, long ones the information.
+        contact_stages_s: The same for feet on the floor: longer windows add more kinks than information.
+        given_stages_s: The same for exact start states. Over one sample, predictions are nearly linear in the
+            motors' gains and contacts hardly change, so the basin is about as wide as the range. Starting
+            with windows of 0.1 s ended in other minima (0.18 % off).
+        worse: Largest growth of chi2 with the window length. Beyond it, start states are in another basin or
+            model errors add up, and the longer window is not kept.
+        explained: Chi2 below which no other start states are drawn.
+        shakes: Spreads of the drawn start states where contacts stop the solver, in standard deviations.
         shake_count: Draws of each.
-        shaken: Draws that leave more than this share of the cost are the last: it is the model that is wrong.
+        shaken: Share of the cost above which a draw is the last one: then the model is wrong.
         robust_rounds: Rounds of Huber's weights, see :func:`refine_robust`.
         robust_iterations: Most steps of each.
-        rounds: Most rounds of weights where start states are exact.
+        rounds: Most rounds of weights for exact start states.
         round_iterations: Most steps of each.
-        given_chi2: Where start states are exact the truth leaves no residual at all in most windows; a kink
-            magnifies rounding in a few.
-        given_still: A round of weights that moves no parameter by more, in its own scale, is the last.
-        given_right: Where the chi2 of most of the shortest windows is below this the latency is the right
-            whole step.
-        most_windows: So many of the windows are most [-].
-        local_s: The local fit finds its way on so much of the recordings [s].
-        local_hopeless: Shortest windows whose chi2 stays above this are not explained by longer ones either.
+        given_chi2: Chi2 at the truth for exact start states, in most windows. A kink magnifies rounding in a
+            few.
+        given_still: Largest parameter change in a round of weights that ends the rounds, in its own scale.
+        given_right: Chi2 of most of the shortest windows below which the latency is the right whole step.
+        most_windows: Share of the windows that counts as most [-].
+        local_s: Length of data on which the local fit starts [s].
+        local_hopeless: Chi2 of the shortest windows above which longer ones are not tried.
     """
 
     stages_s: tuple[float, ...] = (0.2, 0.4, 0.8)
@@ -76,7 +74,7 @@ SETTINGS = RefinementSettings()
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """Where the refinement ended.
+    """Result of a refinement.
 
     Attributes:
         theta: Physical parameters, (K,).
@@ -84,7 +82,7 @@ class Refined:
         chi2: Cost over degrees of freedom; 1 where noise explains everything.
         normal: Normal equations there.
         point: The solver's point.
-        shooting: The cut into windows that was used last.
+        shooting: The windows used last.
         iterations: Iterations over all stages.
     """
 
@@ -114,13 +112,13 @@ def refine(
         problem: The problem.
         theta: Start, (K,).
         latency_s: Start latency [s].
-        stages_s: Window lengths, in order [s]; the usual ones by default.
-        iterations: Most iterations of the solver at a time.
+        stages_s: Window lengths, in order [s]; the settings' by default.
+        iterations: Most iterations of each run of the solver.
         fixed_latency: Keep the latency.
         notify: Called with the fit after each window length that is kept.
-        states: Where the first stage's windows start; the smoothed states by default.
-        shake: Search other start states where contacts leave the solver stuck; where states are exact, let
-            windows that no small step explains weigh less.
+        states: Start states of the first stage's windows; the smoothed states by default.
+        shake: With contacts, draw other start states where the solver stops early. With exact states, reduce
+            the weight of windows that no small step explains.
 
     Raises:
         InsufficientDataError: Not even the shortest window fits.
@@ -136,7 +134,7 @@ def refine(
     elif stages_s is None:
         stages_s = settings.contact_stages_s if problem.robot.base is not None else settings.stages_s
     result: Refined | None = None
-    # Fixed: a refinement is part of the data's analysis, not of the search's luck.
+    # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
     done = 0
     for seconds in stages_s:
@@ -172,14 +170,7 @@ def refine(
 def refine_windows(
     shooting: Shooting, point: Point, iterations: int = 6, fixed_latency: bool = False
 ) -> Refined:
-    """Refine from a point in the windows it is of, such as a part of all windows or weighed ones.
-
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        iterations: Most iterations.
-        fixed_latency: Keep the latency.
-    """
+    """Refine from a point in its own windows, such as a part of all windows or weighted ones."""
     point, normal, used = _solved(shooting, point, iterations, fixed_latency)
     return _refined(shooting, point, normal, used, fixed_latency)
 
@@ -193,21 +184,20 @@ def _solved(
 
 
 def _refined(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Refined:
-    free = len(shooting.problem.space) + (0 if fixed_latency else 1)
-    chi2 = normal.cost / max(normal.count - free, 1)
+    chi2 = normal.cost / _degrees(shooting, normal, fixed_latency)
     return Refined(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
 
 
+def _degrees(shooting: Shooting, normal: Normal, fixed_latency: bool) -> int:
+    """Return the residuals' degrees of freedom; at least 1."""
+    return max(normal.count - len(shooting.problem.space) - (not fixed_latency), 1)
+
+
 def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
-    """Refine on from where a refinement ended, large residuals weighing less.
+    """Continue a refinement, in its windows, with less weight on large residuals.
 
-    The windows' standard deviations are divided by the weights' roots, so that normal equations, intervals
-    and start states all see the same weights. ``chi2`` stays that of all residuals alike, or the loss would
-    hide that the model is wrong.
-
-    Args:
-        refined: Where to start; its windows are kept.
-        fixed_latency: Keep the latency.
+    The windows' standard deviations are divided by the roots of the weights. So normal equations, intervals
+    and start states use the same weights. ``chi2`` keeps equal weights, or the loss would hide model error.
     """
     plain, found, iterations = refined.shooting, refined, refined.iterations
     for _ in range(SETTINGS.robust_rounds):
@@ -219,24 +209,17 @@ def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
             plain.on(data), found.point, SETTINGS.robust_iterations, fixed_latency=fixed_latency
         )
         iterations += found.iterations
-    free = len(plain.problem.space) + (0 if fixed_latency else 1)
-    chi2 = plain.cost(found.point) / max(found.normal.count - free, 1)
+    chi2 = plain.cost(found.point) / _degrees(plain, found.normal, fixed_latency)
     return dataclasses.replace(found, chi2=chi2, iterations=iterations)
 
 
 def at_parameters(
     problem: Problem, theta: FloatArray, latency_s: float, length: int, states: States | None = None
 ) -> Refined:
-    """Return parameters with start states fitted to them, as if the refinement had ended there.
+    """Return given parameters with start states fitted from ``states``, as if the refinement had ended there.
 
-    A prediction from smoothed start states errs by what smoothing errs, which says nothing of the model.
-
-    Args:
-        problem: The problem.
-        theta: Physical parameters, (K,).
-        latency_s: Total latency [s].
-        length: Samples of a window.
-        states: Where start states begin; the smoothed states by default.
+    A prediction from smoothed start states contains the smoother's error, which says nothing about the model.
+    Windows have ``length`` samples.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -255,9 +238,9 @@ def at_parameters(
 def _whole_step(
     problem: Problem, theta: FloatArray, latency_s: float, seconds: float
 ) -> tuple[FloatArray, float]:
-    """Return the whole step of latency that explains most of the shortest windows, and parameters there.
+    """Return the latency, in whole steps, that explains most of the shortest windows, and its parameters.
 
-    A search may end beside it.
+    A search may end one step beside it.
     """
     step_s = problem.episodes[0].step_s
     low, high = (round(v / step_s) for v in problem.latency_range_s)
@@ -276,7 +259,7 @@ def _whole_step(
 
 
 def _most(normal: Normal) -> float:
-    """Return the chi2 that most windows stay below."""
+    """Return the quantile of the windows' chi2 at ``most_windows``."""
     each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in normal.residual])
     return float(np.quantile(each, SETTINGS.most_windows))
 
@@ -284,11 +267,11 @@ def _most(normal: Normal) -> float:
 def _from_known_states(
     plain: Shooting, point: Point, iterations: int, rounds: int
 ) -> tuple[Point, Normal, int]:
-    """Solve from exact states: most windows are predicted to rounding, so what others miss is a kink.
+    """Solve from exact states: most windows are predicted to rounding, and only kinks leave a residual.
 
-    A window in which feet slip at another moment than they did has a residual that no small step mends, and
-    least squares would bend the parameters to it. So after a first, plain round each window weighs less the
-    more it exceeds the median (Cauchy's weights), which leaves the solution to those that can be explained.
+    If feet slip at another moment than recorded, no small step removes the residual, and least squares would
+    bend the parameters to it. So after a first, plain round a window weighs less the more it exceeds the
+    median (Cauchy's weights). The solution then rests on windows that can be explained.
     """
     settings = SETTINGS
     point, normal, used = solve(plain, point, SolverSettings(iterations=iterations), fixed_latency=True)
@@ -315,10 +298,9 @@ def _with_contacts(
 ) -> tuple[Point, Normal, int]:
     """Solve; while the residual is unexplained, draw other start states and solve again."""
     settings = SETTINGS
-    free = len(shooting.problem.space) + (0 if fixed_latency else 1)
     point, normal, used = _solved(shooting, point, iterations, fixed_latency)
     for spread in settings.shakes if shake else ():
-        if normal.cost / max(normal.count - free, 1) < settings.explained:
+        if normal.cost / _degrees(shooting, normal, fixed_latency) < settings.explained:
             break
         before = normal.cost
         point = shooting.shaken(point, spread, settings.shake_count, rng)
@@ -330,16 +312,12 @@ def _with_contacts(
 
 
 def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None) -> Refined | None:
-    """Refine the model's own values; return None where they are too far to be refined.
+    """Refine the nominal values; return None where simulations from there diverge.
 
-    Costs a small part of a search. Where its residual is explained by the sensors' noise nothing is left to
-    search for. A part of the recordings says where the fit goes; all of them are fitted only where that part
-    can be explained.
-
-    Args:
-        problem: The problem.
-        notify: Called with the fit after each window length; on a damped robot the first is often nearly the
-            end, at a third of the time.
+    It costs a small part of a search. Where the sensors' noise explains its residual, no search is needed. It
+    fits a part of the recordings first, and all of them only where that part can be explained. ``notify``
+    gets the fit after each window length: on a damped robot the first is often nearly the result, in a third
+    of the time.
     """
     fixed = problem.fixed_latency_s is not None
     latency_s = problem.first_latency_s
@@ -366,7 +344,7 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
 
 
 def part_of(problem: Problem, seconds: float) -> Problem:
-    """Return the problem with pieces of a second, evenly spread, that add up to about so many seconds."""
+    """Return the problem with evenly spread pieces of a second that add up to about ``seconds``."""
     lengths = [len(e.sample) for e in problem.episodes]
     period_s = problem.episodes[0].period_s
     piece = max(round(1.0 / period_s), 1)

@@ -1,8 +1,7 @@
 """Multiple shooting: residuals of windows whose start states are unknowns, and their normal equations.
 
-Each window's start state is eliminated (Schur complement), so what is left is a small system in the
-parameters and the latency, and its inverse is their covariance with the start states' uncertainty already in
-it.
+Each window's start state is eliminated (Schur complement). The remaining small system in the parameters and
+the latency has their covariance as inverse, with the start states' uncertainty included.
 """
 
 from __future__ import annotations
@@ -22,15 +21,13 @@ class DifferenceSettings:
 
     Attributes:
         parameter: Of a parameter, in its own scale.
-        contact_parameter: The same where feet touch the floor: sticking and slipping kink predictions on
-            every scale, and a secant says more of them than a derivative.
-        noise_free_parameter: The same where states are known without error: the residual then has no floor to
-            hide a secant's error under.
+        contact_parameter: The same with feet on the floor. Sticking and slipping make kinks on every scale,
+            and a secant describes them better than a derivative.
+        noise_free_parameter: The same for noise-free states, where no noise hides a secant's error.
         latency_s: Of the latency [s].
         position: Of a start position [rad or m].
         velocity: Of a start velocity [rad/s or m/s].
-        contact_state: Of start states where feet touch the floor, in standard deviations of the smoothed
-            ones.
+        contact_state: Of start states with feet on the floor, in standard deviations of the smoothed ones.
     """
 
     parameter: float = 1e-4
@@ -50,7 +47,7 @@ States = list[tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Where the solver stands.
+    """A point of the solver.
 
     Attributes:
         value: Parameters in their own scale, then the latency [s], (K + 1,).
@@ -65,7 +62,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class WindowRows:
-    """Linearised residuals of one episode's windows; the last S rows are what is known of the start states.
+    """Linearised residuals of one episode's windows; the last S rows are the prior of the start states.
 
     Attributes:
         episode: Index of the episode.
@@ -86,13 +83,14 @@ class Normal:
 
     Attributes:
         cost: Sum of squared whitened residuals.
-        count: Residuals, not counting start states' unknowns.
+        count: Residuals minus the start states' unknowns.
         hessian: (K + 1, K + 1).
         gradient: (K + 1,).
         residual: Whitened residuals per episode, (W, H, M).
-        prior: Information that the parameters' priors gave to the hessian, (K + 1,).
-        back: Per episode what turns a parameter step into start-state steps: (W, 2C, K + 1) and (W, 2C).
-        rows: Linearised residuals per episode, where they were asked for.
+        prior: Information of the parameters' priors in the hessian, (K + 1,).
+        back: Per episode, gain from parameter steps to start-state steps, (W, 2C, K + 1), and the start
+            states' own step, (W, 2C).
+        rows: Linearised residuals per episode, if requested.
     """
 
     cost: float
@@ -111,11 +109,10 @@ class Shooting:
     Args:
         problem: The problem.
         length: Samples a window predicts.
-        data: The windows, where they are not all that the recordings hold.
-        given: Take the smoothed start states as they are; otherwise each is an unknown of its own. Exact
-            states are always given.
+        data: The windows; all windows of the recordings by default.
+        given: Use the smoothed start states; otherwise each is an unknown. Exact states are always given.
         prior_share: Spread of parameters around their nominal values as a share of their range, in their own
-            scale; infinite for no more than what their own priors say.
+            scale; infinite to use their own priors only.
     """
 
     def __init__(
@@ -154,21 +151,23 @@ class Shooting:
             self._state_step = np.maximum(DIFFERENCES.contact_state * self.state_std, self._state_step)
 
     @property
+    def device_periods(self) -> int:
+        """Device periods in all windows."""
+        return sum(len(d.windows) * d.windows.length * d.windows.stride for d in self.data)
+
+    @property
     def contacts(self) -> bool:
-        """Whether feet that stick and slip kink what start states change."""
+        """Whether sticking and slipping feet make kinks in the effect of start states."""
         return self.problem.robot.base is not None and not self.given
 
     def on(self, data: Sequence[WindowData]) -> Shooting:
-        """Return the same fit of other windows, such as a part of these, or weighed ones."""
+        """Return the same fit of other windows, such as a part of these, or weighted ones."""
         return Shooting(self.problem, self.length, data=data, given=self.given, prior_share=self.prior_share)
 
     def start(self, theta: FloatArray, latency_s: float, states: States | None = None) -> Point:
-        """Return the point at parameters (K,) and latency.
+        """Return the point at parameters (K,) and latency [s].
 
-        Args:
-            theta: Physical parameters, (K,).
-            latency_s: Total latency [s].
-            states: Where to take the windows' start states from; the smoothed ones by default.
+        ``states`` gives the windows' start states; the smoothed ones by default.
         """
         source = states or self.smoothed()
         return Point(
@@ -201,14 +200,14 @@ class Shooting:
     def normal(
         self, point: Point, keep: bool = False, stretch: float = 1.0, *, central: bool = False
     ) -> Normal:
-        """Return the normal equations at a point, derivatives by forward differences in one batch.
+        """Return the normal equations at a point; derivatives by forward differences in one batch.
 
         Args:
-            point: Where.
-            keep: Hand back the linearised residuals, too; they take much memory.
+            point: The point.
+            keep: Return the linearised residuals, too; they take much memory.
             stretch: Factor on the differences' steps; negative for backward differences.
-            central: Take central differences, twice as dear: the truncation of one-sided ones looks like
-                information where there is none.
+            central: Use central differences, at twice the cost: the truncation error of one-sided ones looks
+                like information where there is none.
         """
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.given else C
@@ -216,7 +215,7 @@ class Shooting:
         values = np.repeat(point.value[None], members, axis=0)
         steps = np.concatenate([np.full(K, self._parameter_step), [DIFFERENCES.latency_s], self._state_step])
         steps = stretch * steps[:members]
-        # A latency or a friction below nothing is no model: there differences are taken inwards.
+        # A negative latency or friction is no model: there, differences are taken inwards.
         low, high = value_bounds(self.problem)
         outside = (point.value + steps[: K + 1] < low) | (point.value + steps[: K + 1] > high)
         steps[: K + 1] *= np.where(outside, -1.0, 1.0)
@@ -246,7 +245,7 @@ class Shooting:
                 difference[two] = (predicted - other)[two] / 2
             jac = np.moveaxis(difference / data.std, 0, -1) / steps
             if np.isfinite(r).all():
-                # A column that diverges where its base does not says nothing about the way to go.
+                # A column that diverges beside a finite base gives no direction.
                 jac = np.nan_to_num(jac, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
             W = len(data.windows)
             r_flat, jac = r.reshape(W, -1), jac.reshape(W, -1, len(steps))
@@ -278,11 +277,11 @@ class Shooting:
         return Normal(cost, count, hessian, gradient, *found)
 
     def followed(self, point: Point, normal: Normal, step: FloatArray) -> Point:
-        """Return the point after a parameter step, (K + 1,), each window's start state moved as suits it.
+        """Return the point after a parameter step, (K + 1,), each window's start state moved as fits it best.
 
-        Next to a kink (stick-slip, a pole that passes the top) the derivative of a window's start state may
-        lead uphill, and one such window would hold up all parameters. So each takes the best of four ways: to
-        stay, to go where the last parameters had it best, to follow the step, or both.
+        Beside a kink (stick-slip, a pole that passes the top) the derivative of a window's start state may
+        point uphill. One such window would stop all parameters. So each takes the best of four ways: stay,
+        take its own step, follow the parameter step, or both.
         """
         value = point.value + step
         if self.given:
@@ -294,12 +293,10 @@ class Shooting:
         return self.moved(point, value, ways)
 
     def moved(self, point: Point, value: FloatArray, ways: Sequence[FloatArray]) -> Point:
-        """Return the point at other parameters, each window's start state moved by what costs least.
+        """Return the point at other parameters, each window's start state moved by its best step.
 
-        Args:
-            point: The start states before.
-            value: Parameters and latency, (K + 1,).
-            ways: Steps of the start states to choose from, (D, W, 2 C) an episode.
+        ``value``, (K + 1,), holds parameters and latency, ``ways`` the steps to choose from, (D, W, 2 C) per
+        episode.
         """
         C, position, velocity, observed = self.problem.coordinates, [], [], []
         for e, way in enumerate(ways):
@@ -315,7 +312,7 @@ class Shooting:
         return found
 
     def vector(self, point: Point) -> FloatArray:
-        """Return all whitened residuals at a point, those of what is known beforehand last, (M,)."""
+        """Return all whitened residuals at a point, priors last, (M,)."""
         found = []
         for e, residual in enumerate(self.residuals(point)):
             flat = residual.reshape(len(residual), -1)
@@ -327,10 +324,9 @@ class Shooting:
         return np.concatenate([*found, np.sqrt(self.prior_information) * (point.value - self.prior_mean)])
 
     def derivative(self, normal: Normal) -> FloatArray:
-        """Return the derivative of :meth:`vector` while start states follow, (M, K + 1).
+        """Return the derivative of :meth:`vector` with start states that follow, (M, K + 1).
 
-        Args:
-            normal: Normal equations at the point, with their rows.
+        ``normal`` holds the normal equations at the point, with their rows.
         """
         found = []
         for rows, (gain, _) in zip(normal.rows, normal.back, strict=True):
@@ -353,7 +349,7 @@ class Shooting:
         return float(prior + np.sum([c.sum() for c in self.window_costs(point)]))
 
     def window_costs(self, point: Point) -> list[FloatArray]:
-        """Return what each window costs at a point, (W,) an episode."""
+        """Return each window's cost at a point, (W,) per episode."""
         starts = enumerate(zip(self._observed(point), point.position, point.velocity, strict=True))
         return [self._window_costs(e, y[None], x[None], v[None])[0] for e, (y, x, v) in starts]
 
@@ -380,16 +376,11 @@ class Shooting:
         return self._known[1]
 
     def shaken(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
-        """Return the point with, window by window, the best of several drawn start states.
+        """Return the point with, window by window, the best of ``count`` drawn start states.
 
-        Given the parameters the windows do not depend on each other, so one batch searches them all at once.
-        It frees windows whose feet stick where they should slip, which no derivative tells.
-
-        Args:
-            point: Where the solver stands.
-            spread: How far start states are drawn, in standard deviations of the smoothed ones.
-            count: Draws; half of them around the smoothed states instead of the point's.
-            rng: Draws them.
+        Given the parameters, windows are independent, so one batch searches them all. It frees windows whose
+        feet stick where they should slip, which no derivative shows. Half of the draws are around the
+        smoothed states instead of the point's; ``spread`` is in the smoothed states' standard deviations.
         """
         std, ways = spread * self.state_std, []
         for e, data in enumerate(self.data):
@@ -408,7 +399,7 @@ class Shooting:
 
 
 def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Return the least and greatest parameters in their own scale, the latency [s] last, (K + 1,) each."""
+    """Return lower and upper bounds of the parameters in their own scale and of the latency [s], (K + 1,)."""
     space = problem.space
     low, high = problem.latency_range_s
     return np.append(space.to_scale(space.low), low), np.append(space.to_scale(space.high), high)
@@ -417,7 +408,7 @@ def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
 def _rows(
     episode: int, residual: FloatArray, jp: FloatArray, js: FloatArray, root: FloatArray, start: FloatArray
 ) -> WindowRows:
-    """Append to each window the rows of what is known of its start state."""
+    """Append to each window the rows of its start state's prior."""
     W, _, S = js.shape
     return WindowRows(
         episode,

@@ -1,8 +1,7 @@
 """The one solver of all fits: scipy's bounded least squares over the parameters and the latency.
 
-Where windows' start states are unknowns they follow the parameters (variable projection, Golub and Pereyra
-1973), so the solver sees the parameters alone. A robust loss is a weight of each residual, found from the
-residuals of the fit before.
+Unknown start states of windows follow the parameters (variable projection, Golub and Pereyra 1973), so the
+solver sees the parameters alone. A robust loss is a weight per residual, computed from the previous fit.
 """
 
 from __future__ import annotations
@@ -27,14 +26,14 @@ class SolverSettings:
 
     Attributes:
         iterations: Most steps.
-        first_step: Size of the first trust region in the parameters' own scale; 0.7 is about a factor two.
-        latency_unit_s: A latency of this length counts like a factor e of a parameter [s].
-        converged: A step that gains a smaller share of the cost is the last.
-        smallest_step: A step that is smaller, as a share of the way so far, is the last.
-        reach: Width of a prior around the start, in the parameters' own scale: what the residual hardly sees
-            stays where it was. It is as wide as a range of ratio 5; each new start moves it along.
-        gain: The solver is started again from where it ended while that gains a larger share of the cost.
-        settled: A step of start states alone that gains a smaller share of the cost is the last.
+        first_step: Radius of the first trust region in the parameters' own scale; 0.7 is about a factor two.
+        latency_unit_s: Latency change that counts like a factor e of a parameter [s].
+        converged: Relative decrease of the cost below which a step is the last.
+        smallest_step: Relative step length below which a step is the last.
+        reach: Width of a prior around the start, in the parameters' own scale, which holds insensitive
+            parameters. It is as wide as a range of ratio 5, and moves with each new start.
+        gain: Relative decrease of the cost below which the solver is not started again.
+        settled: Relative decrease of the cost below which a step of start states alone is the last.
     """
 
     iterations: int = 12
@@ -51,7 +50,7 @@ SOLVER = SolverSettings()
 
 
 class LeastSquares(Protocol):
-    """What the solver needs of a fit."""
+    """A fit, as the solver needs it."""
 
     def residual(self, value: FloatArray) -> FloatArray:
         """Return the whitened residuals, (M,), at parameters in their own scale and latency, (K + 1,)."""
@@ -68,17 +67,10 @@ def minimise(
     *,
     fixed_latency: bool,
 ) -> tuple[FloatArray, int]:
-    """Minimise the sum of squared residuals inside bounds.
+    """Minimise the sum of squared residuals inside bounds, (K + 1,) each.
 
-    Args:
-        fit: Residual and derivative.
-        value: Start: parameters in their own scale, then the latency [s], (K + 1,).
-        bounds: Least and greatest values, (K + 1,) each.
-        settings: How.
-        fixed_latency: Keep the latency.
-
-    Returns:
-        Where it ended, (K + 1,), and the derivatives that were computed.
+    Values are parameters in their own scale, then the latency [s], (K + 1,). Return the solution and the
+    number of derivatives.
     """
     low, high = bounds
     free = high > low
@@ -101,7 +93,7 @@ def minimise(
     def jacobian(step: FloatArray) -> FloatArray:
         nonlocal used
         used += 1
-        # Next to parameters whose simulation diverges a difference may not be finite: it shows no way.
+        # Beside parameters whose simulation diverges, a difference may not be finite: it gives no direction.
         rows = np.nan_to_num(fit.jacobian(at(step))[:, free] * unit[free], nan=0.0, posinf=0.0, neginf=0.0)
         return np.concatenate([rows, hold * np.eye(len(step))])
 
@@ -126,19 +118,12 @@ def solve(
 ) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states.
 
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        settings: How.
-        fixed_latency: Keep the latency.
-
-    Returns:
-        Where it ended, the normal equations there, and the derivatives that were computed.
+    Return the solution, the normal equations there, and the number of derivatives.
     """
     bounds, used, before = value_bounds(shooting.problem), 0, shooting.cost(point)
     normal: Normal | None = None
-    # Next to a kink steps shrink to nothing. A new trust region around start states that have settled since
-    # leads on, or shows that this is the end.
+    # Beside a kink, steps shrink to nothing. A new trust region around the updated start states continues, or
+    # shows that this is the end.
     while True:
         fit = _Following(shooting, point, normal)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
@@ -147,18 +132,14 @@ def solve(
         if used >= settings.iterations or not normal.cost < before * (1 - settings.gain):
             break
         before = normal.cost
-    # The rows are large and one-sided: who says what is known takes central differences at the end.
+    # The rows are large and one-sided; uncertainty uses central differences at the end.
     return point, dataclasses.replace(normal, rows=()), used
 
 
 def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
-    """Fit start states alone where nothing kinks; parameters stay, and no window's cost grows.
+    """Fit start states alone, without contacts, from a point and the normal equations there.
 
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        normal: Normal equations there.
-        iterations: Most steps.
+    Parameters stay, and no window's cost grows.
     """
     for _ in range(0 if shooting.given else iterations):
         moved = shooting.followed(point, normal, np.zeros_like(point.value))
@@ -169,12 +150,9 @@ def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int)
 
 
 class _Following:
-    """The residual as a function of the parameters alone, start states following.
+    """The residual as a function of the parameters alone; start states follow.
 
-    Args:
-        shooting: The windows.
-        point: Where to start.
-        normal: Normal equations there with their rows, where they are known.
+    It starts at a point and, if known, the normal equations there with their rows.
     """
 
     def __init__(self, shooting: Shooting, point: Point, normal: Normal | None) -> None:
@@ -213,8 +191,9 @@ class RobustSettings:
     Attributes:
         huber: Residuals beyond this many standard deviations weigh less; 95 % as efficient as least squares
             on noise (Huber 1964).
-        heavy_tails: Kurtosis (noise: 3) from which a robust fit is worth a trial.
-        least_scale: Residuals of a noise-free recording that the model explains are rounding [rad or m].
+        heavy_tails: Kurtosis (noise: 3) above which a robust fit is tried.
+        least_scale: Smallest residual scale; smaller residuals of noise-free recordings are rounding [rad or
+            m].
     """
 
     huber: float = 1.345
@@ -226,10 +205,10 @@ ROBUST = RobustSettings()
 
 
 def huber_weights(residual: FloatArray) -> FloatArray:
-    """Return the weight of each whitened residual, like its shape; 1 for all but the large ones.
+    """Return the weight of each whitened residual, in its shape; 1 for all but the large ones.
 
-    Their spread is measured by the median, at least that of the noise: a residual is not wild for being
-    small noise in a model that explains nothing.
+    Their spread is the scaled median, and at least that of the noise: small noise in a model that explains
+    nothing is no outlier.
     """
     size = np.abs(residual)
     spread = max(MAD_TO_STD * float(np.median(size)), 1.0)
@@ -237,12 +216,7 @@ def huber_weights(residual: FloatArray) -> FloatArray:
 
 
 def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) -> list[WindowData]:
-    """Return windows that weigh less the more their residual exceeds the median's (Cauchy's weights).
-
-    Args:
-        data: The windows of each episode.
-        residuals: Their whitened residuals, (W, H, M) each.
-    """
+    """Return windows with less weight the more their residual, (W, H, M), exceeds the median's (Cauchy)."""
     costs = [np.sum(r**2, axis=(1, 2)) for r in residuals]
     median = max(float(np.median(np.concatenate(costs))), 1e-12)
     return [
@@ -258,12 +232,10 @@ def kurtosis(residuals: Sequence[FloatArray]) -> float:
 
 
 def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robust: bool) -> FloatArray:
-    """Return what measures each channel's errors where no sensor's noise does, (M,).
+    """Return the scale of each channel's errors where the sensors' noise does not give it, (M,).
 
-    Args:
-        errors: Prediction minus measurement of each episode, (W, H, M).
-        seen: Whether each was reported, likewise.
-        robust: Measure by the median, or a channel that fails somewhere counts nowhere.
+    Errors, (W, H, M) per episode, count where they were ``seen``. A robust scale is limited by the median, so
+    that a local failure does not devalue the channel.
     """
     squares = np.sum(
         [np.sum(np.where(s, r, 0.0) ** 2, axis=(0, 1)) for r, s in zip(errors, seen, strict=True)], axis=0
@@ -279,9 +251,7 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
 def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
     """Return one plus twice the sum of the residuals' correlations up to their first zero, at least 1.
 
-    Args:
-        residuals: Whitened residuals of each episode, (W, H, M).
-        longest: Longest lag that is looked at [samples].
+    Residuals are whitened, (W, H, M) per episode; lags end at ``longest`` samples.
     """
     longest = min(longest, max(r.shape[1] for r in residuals) - 1)
     total = sum(float(np.sum(r**2)) for r in residuals)

@@ -1,4 +1,4 @@
-"""The page's charts: which series stand in which panels, the robot's drawing, and matrices."""
+"""The page's charts: series in their panels, the robot's drawing, and matrices."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChartSettings:
-    """How much charts show.
+    """Limits of what charts show.
 
     Attributes:
         channels: Channels whose residuals are drawn: those with the largest.
         panels: Channels whose motion is drawn: the first ones.
-        points: Points of all motion on the page; long series are thinned to their lows and highs.
+        points: Points of all motion on the page; long series are reduced to their lows and highs.
         lags: Longest lag of autocorrelations [samples].
         bins: Of histograms.
-        log_ratio: Positive series whose highest is this many times their lowest are drawn on a log scale.
-        told: Correlations of at least this size are listed.
-        listed: Up to so many of them.
+        log_ratio: Ratio of highest to lowest value above which positive series get a log scale.
+        strong: Least size of listed correlations.
+        listed: Most listed correlations.
         picture: Width of the robot's drawing [pixels].
     """
 
@@ -38,7 +38,7 @@ class ChartSettings:
     lags: int = 20
     bins: int = 30
     log_ratio: float = 20.0
-    told: float = 0.8
+    strong: float = 0.8
     listed: int = 12
     picture: int = 480
 
@@ -47,11 +47,9 @@ SETTINGS = ChartSettings()
 
 
 def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
-    """Draw real, nominal and calibrated motion, one panel a channel.
+    """Draw real, nominal and calibrated motion, one panel per channel.
 
-    Args:
-        shown: The motion.
-        panels: Panels of all overlays on the page, which share the points there may be.
+    All overlays of the page share the limit of points over ``panels``, the number of their panels.
     """
     M = min(len(shown.names), SETTINGS.panels)
     buckets = int(np.clip(SETTINGS.points / (6 * panels), 80, 1000))
@@ -82,7 +80,7 @@ def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
 
 
 def group(panels: Iterable[Panel], style: str = "") -> Markup:
-    """Return panels side by side, as many as the page's width holds; linked ones zoom together."""
+    """Return panels side by side, as many as fit in the page's width; linked ones zoom together."""
     return Markup(f'<div class="panels {style}">{"".join(p.html() for p in panels)}</div>')
 
 
@@ -94,19 +92,19 @@ def _wide(values: FloatArray, least: float = 1e-9) -> tuple[float, float]:
 
 
 def _from_zero(low: float, high: float) -> tuple[float, float]:
-    """Return the ends of a time axis, from 0 where that is near."""
+    """Return the ends of a time axis, from 0 if that is near."""
     return (0.0 if 0 < low < 0.05 * high else low), high
 
 
 def _frame(real: FloatArray) -> tuple[float, float]:
-    """Frame what was measured: a model that runs away must not shrink it."""
+    """Frame the measured motion: a diverging model must not shrink it."""
     low, high = _wide(real[np.isfinite(real)])
     margin = max(0.2 * (high - low), 1e-6 * abs(high), 1e-6)
     return low - margin, high + margin
 
 
 def residuals(shown: Residuals) -> tuple[Markup, str]:
-    """Draw whitened residuals over time, as histogram and as autocorrelation; say which, if not all."""
+    """Draw whitened residuals over time, as histogram and as autocorrelation; name the selection, if any."""
     M = shown.whitened.shape[2]
     size = np.array([_root_mean_square(shown.whitened[..., m]) for m in range(M)])
     order = np.argsort(-np.nan_to_num(size))[: SETTINGS.channels]
@@ -184,10 +182,9 @@ def _residual_row(shown: Residuals, m: int, size: float) -> Iterator[Panel]:
 
 
 def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
-    """Return the autocorrelation within windows at lags 1, 2, ... and the 95 % band of white noise.
+    """Return the autocorrelation of a channel's residuals, (W, H), at lags 1, 2, ... and white noise's band.
 
-    Args:
-        values: Whitened residuals of one channel, (W, H).
+    The band holds 95 %.
     """
     clean = np.nan_to_num(values)
     power = float(np.mean(clean**2)) or 1.0
@@ -197,7 +194,7 @@ def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
 
 
 def latency_scan(scan: Mapping[str, Any], tick_s: float | None) -> Markup | None:
-    """Draw the misfit of each whole tick of latency that was tried."""
+    """Draw the misfit of each fitted whole tick of latency."""
     ticks, chi2 = np.array(scan.get("ticks", ()), dtype=float), np.array(scan.get("chi2", ()), dtype=float)
     if len(ticks) < 2 or len(ticks) != len(chi2):
         return None
@@ -207,7 +204,7 @@ def latency_scan(scan: Mapping[str, Any], tick_s: float | None) -> Markup | None
 
 
 def _positive(title: str, x_title: str, series: Series, style: str = "", *, whole: bool = False) -> Panel:
-    """Return a panel of one series, on a log scale where it spans much."""
+    """Return a panel of one series, on a log scale if its range is wide."""
     finite = series.y[np.isfinite(series.y)]
     low, high = float(finite.min()), float(finite.max())
     log_y = low > 0 and high > SETTINGS.log_ratio * low
@@ -229,7 +226,7 @@ def _positive(title: str, x_title: str, series: Series, style: str = "", *, whol
 
 
 def trace(rows: Sequence[Mapping[str, float]]) -> Markup | None:
-    """Draw what the search noted of each generation, one panel a quantity."""
+    """Draw the search's values of each generation, one panel per quantity."""
     keys = list(dict.fromkeys(k for row in rows for k in row if k != "generation"))
     found = []
     for key in keys:
@@ -290,15 +287,15 @@ def correlations(matrix: FloatArray) -> Markup:
 
 
 def strongest(matrix: FloatArray, names: Sequence[str]) -> list[tuple[str, str, float]]:
-    """Return pairs of parameters whose estimates hang on each other most, strongest first."""
+    """Return the pairs of parameters with the strongest correlations, strongest first."""
     i, j = np.triu_indices(len(matrix), 1)
     size = np.nan_to_num(np.abs(matrix[i, j]))
-    order = [n for n in np.argsort(-size) if size[n] >= SETTINGS.told][: SETTINGS.listed]
+    order = [n for n in np.argsort(-size) if size[n] >= SETTINGS.strong][: SETTINGS.listed]
     return [(names[i[n]], names[j[n]], float(matrix[i[n], j[n]])) for n in order]
 
 
 def robot(drawing: RobotDrawing) -> Markup:
-    """Draw the robot where each predictor has it, with a bar that tells its size."""
+    """Draw the robot as each predictor places it, with a scale bar."""
     left, bottom, width, height = drawing.box
     scale = SETTINGS.picture / max(width, height)
     size = np.array([width, height]) * scale

@@ -1,4 +1,4 @@
-"""What the report shows, from robot, result and recordings: the only part of it that simulates."""
+"""Data of the report from robot, result and recordings: the only part of the report that simulates."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ class GatherSettings:
     """Settings of :func:`gather`.
 
     Attributes:
-        panels: Panels drawn of each sort of recordings, one a channel; more would make the page long and say
-            the same.
-        whitened_size: Samples times channels of a window that is whitened: its covariance has so many rows.
-        window_s: Longest window that is whitened [s].
+        panels: Most panels for each sort of recordings, one per channel.
+        whitened_size: Most samples times channels of a whitened window: the size of its covariance.
+        window_s: Longest whitened window [s].
     """
 
     panels: int = 24
@@ -41,10 +40,10 @@ SETTINGS = GatherSettings()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverlayPanel:
-    """One recording beside open-loop predictions that restart from the measured state.
+    """One recording beside predictions that restart from the measured state.
 
     Attributes:
-        title: Which recording: its file, and which part of it where several are shown.
+        title: The recording's file, with its part if several are shown.
         heldout: The search never saw it.
         names: The M measured channels.
         units: Unit of each channel, (M,).
@@ -52,7 +51,7 @@ class OverlayPanel:
         real: Measured values, (T, M).
         nominal: Predicted by the user's own model, (T, M); NaN where nothing was predicted.
         calibrated: Predicted by the calibrated model, likewise.
-        window_s: The prediction restarts this often [s].
+        window_s: Length of the predictions [s].
     """
 
     title: str
@@ -71,7 +70,7 @@ class Residuals:
     """Whitened prediction errors of the calibrated model: white and of unit variance where it is right.
 
     Attributes:
-        title: Which recording, as in :class:`OverlayPanel`.
+        title: The recording, as in :class:`OverlayPanel`.
         names: The M measured channels.
         time_s: Time at the end of each window's samples, (W, H) [s].
         whitened: Recording minus prediction, in standard deviations, (W, H, M); NaN where it diverged.
@@ -89,15 +88,15 @@ class ReportInputs:
 
     Attributes:
         robot: The robot's name.
-        result: What the calibration found.
+        result: The calibration's result.
         overlays: Recordings beside predictions, held-out ones first.
         residuals: Whitened errors of the fitted recordings.
         drawing: The robot at a moment of a held-out recording.
         heldout: Names of the held-out recordings.
-        heldout_s: How long they are together [s].
+        heldout_s: Their total length [s].
         tick_s: Device period, the unit of the latency scan [s]; None where unknown.
         telemetry: Verdicts of the telemetry checks, in words.
-        left_out: What is not drawn, in words.
+        left_out: Omitted recordings, in words.
     """
 
     robot: str
@@ -122,22 +121,22 @@ def gather(
     window_s: float = SETTINGS.window_s,
     threads: int | None = None,
 ) -> ReportInputs:
-    """Simulate what the report shows.
+    """Simulate the predictions of the report.
 
     Args:
         robot: The nominal model.
-        result: What the calibration found.
+        result: The calibration's result.
         episodes: The fitted recordings.
         holdout: Recordings that the search has not seen.
         telemetry: Verdicts of the telemetry checks, in words.
-        window_s: Drawn predictions restart this often [s]; where no recording is as long, more often.
+        window_s: Length of drawn predictions [s]; shorter where no recording is as long.
         threads: Simulation threads.
     """
     overlays: list[OverlayPanel] = []
     residuals: list[Residuals] = []
     left_out: list[str] = []
     drawing = None
-    # A recording that was cut into stretches is one recording to look at.
+    # A recording that was cut into stretches is shown as one.
     fitted, held = joined(episodes), joined(holdout)
     parts = Counter(e.name for e in (*fitted, *held))
     for group, heldout in ((held, True), (fitted, False)):
@@ -170,7 +169,7 @@ def gather(
 
 
 def _title(episode: SampledEpisode, other: str, parts: Counter[str]) -> str:
-    """Return what a recording is called, with the part of it where several are shown."""
+    """Return a recording's title, with its part if several are shown."""
     if not episode.name:
         return other
     between = f", {episode.time_s[0]:.4g} to {episode.time_s[-1]:.4g} s"
@@ -180,9 +179,9 @@ def _title(episode: SampledEpisode, other: str, parts: Counter[str]) -> str:
 def _predictions(
     problem: Problem, result: CalibrationResult, window_s: float
 ) -> Iterator[tuple[WindowData, MemberPrediction]]:
-    """Yield the windows of each recording and what the nominal and the calibrated model predict of them."""
+    """Yield the windows of each recording and their predictions by the nominal and the calibrated model."""
     theta = np.stack([result.space.nominal, result.estimate])
-    # The user's own model knows no latency: the same candidates as in the held-out error.
+    # The user's own model has no latency: the same candidates as in the held-out error.
     latency = np.array([0.0, result.latency_s])
     for data in _windows(problem, window_s):
         yield data, problem.predict(theta, latency, data)
@@ -201,7 +200,7 @@ def _overlay(
         title=title,
         heldout=heldout,
         names=problem.channel_names,
-        units=_units(problem),
+        units=problem.channel_units,
         time_s=episode.time_s,
         real=real,
         nominal=both[0],
@@ -222,7 +221,7 @@ def _worst_moment(
     far = np.where(np.isfinite(ends).all(axis=(0, 2)), far, -1.0)
     worst = int(np.argmax(far))
     row = int(sample[worst])
-    # Where nobody measured a coordinate, such as a base's place, all are drawn where it is estimated.
+    # An unmeasured coordinate, such as a base's place, is drawn at its estimate.
     states = np.tile(episode.position[row], (3, 1))
     states[1:, columns] = ends[:, worst, columns]
     return draw_robot(
@@ -236,17 +235,11 @@ def _worst_moment(
 
 
 def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
-    """Yield the windows of each recording, as long as wanted or as it holds."""
+    """Yield the windows of each recording, as long as requested or as it holds."""
     for index in range(len(problem.episodes)):
         alone = [np.full(len(e.sample), i == index) for i, e in enumerate(problem.episodes)]
         with contextlib.suppress(InsufficientDataError):
             yield from longest_windows(problem.part(alone), window_s)
-
-
-def _units(problem: Problem) -> tuple[str, ...]:
-    units = problem.robot.coordinate_units
-    every = (*units, *(f"{unit}/s" for unit in units))
-    return tuple(every[c] for c in problem.channels)
 
 
 def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str]) -> list[Residuals]:
@@ -273,7 +266,7 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
 
 
 def _whitened(problem: Problem, centre: Members, data: WindowData) -> FloatArray:
-    """Return the whitened residual of each window, (W, H, M); NaN where nothing was reported."""
+    """Return the whitened residual of each window, (W, H, M); NaN for missing samples."""
     whitened = whitened_residual(problem, centre, centre, [data]).reshape(data.measured.shape)
-    # A sample that nobody reported weighs nothing: its zero is no residual.
+    # A missing sample has weight zero: its zero is no residual.
     return np.where(np.isfinite(data.std) & np.isfinite(whitened), whitened, np.nan)

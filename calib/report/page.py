@@ -1,4 +1,4 @@
-"""What a calibration writes: the report's page, and the result folder with numbers, trace and model."""
+"""Output of a calibration: the report's page, and the result folder with numbers, trace and model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
-from deal_hw.calib.report.story import tell
+from deal_hw.calib.report.story import make_story
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import published_together, write_json
@@ -34,7 +34,7 @@ REPORT = "report.html"
 TEMPLATE = "report.html.j2"
 
 _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "split_half")
-"""Provenance with a place of its own on the page."""
+"""Provenance that the page shows elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Row:
     low: float
     high: float
     verdict: str
-    told: bool
+    has_value: bool
     outside: bool
     at_bound: str
     bar_left: float
@@ -57,11 +57,7 @@ class Row:
 
 
 def write_report(path: Path, inputs: ReportInputs) -> None:
-    """Write the report, whole or not at all.
-
-    Args:
-        path: The file; a folder gets ``report.html``.
-        inputs: What to show.
+    """Write the report to a file, or as ``report.html`` into a folder, whole or not at all.
 
     Raises:
         OSError: The file cannot be written.
@@ -73,10 +69,10 @@ def write_report(path: Path, inputs: ReportInputs) -> None:
 
 
 def render(inputs: ReportInputs) -> str:
-    """Return the page; all that comes from the user is escaped."""
+    """Return the page; everything from the user is escaped."""
     from jinja2 import Environment, StrictUndefined
 
-    # StrictUndefined: a name that the template has and this module lacks is an error, not a gap.
+    # StrictUndefined: a template name that this module lacks is an error, not a gap.
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -93,11 +89,11 @@ def render(inputs: ReportInputs) -> str:
     return environment.from_string(_asset(TEMPLATE)).render(
         inputs=inputs,
         result=result,
-        # Ours, and not HTML: quotes in them stay quotes.
+        # Our own files, not HTML: quotes in them stay quotes.
         style=Markup(_asset("report.css")),
         script=Markup(script),
         script_digest=script_digest(script),
-        story=tell(result),
+        story=make_story(result),
         drawing=None if inputs.drawing is None else charts.robot(inputs.drawing),
         rows=rows,
         trust=trust(result),
@@ -119,7 +115,7 @@ def render(inputs: ReportInputs) -> str:
         scan=charts.latency_scan(_mapping(provenance.get("latency_scan")), inputs.tick_s),
         correlations=None if matrix is None else charts.correlations(matrix),
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
-        told=charts.SETTINGS.told,
+        strong=charts.SETTINGS.strong,
         trace=charts.trace(result.trace),
         population=[]
         if result.population is None
@@ -142,7 +138,7 @@ def _asset(name: str) -> str:
 
 
 def script_digest(script: str) -> str:
-    """Return what the page's policy calls its one script: it runs no other, whatever a name holds."""
+    """Return the digest of the page's only script, for its policy, which forbids all others."""
     digest = hashlib.sha256(f"\n{script}".encode()).digest()
     return f"sha256-{base64.b64encode(digest).decode()}"
 
@@ -156,14 +152,14 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
     ]
     rows = []
     for k, p in enumerate(space):
-        # To the share of the range to which the alarm looks.
+        # Rounded to the share of the range that the alarm uses.
         bound = {0.0: "lower", 100.0: "upper"}.get(round(float(at[3][k]), 4), "")
         prior = ""
         if p.prior_mean is not None and p.prior_std is not None:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
             prior = f"expected {p.prior_mean:.4g} {p.unit} within {spread}"
         low, high = map(float, result.interval[k])
-        told = bool(with_value(result)[k])
+        has_value = bool(with_value(result)[k])
         rows.append(
             Row(
                 parameter=p,
@@ -171,8 +167,8 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
                 low=low,
                 high=high,
                 verdict=result.verdicts[k] if result.verdicts else "",
-                told=told,
-                outside=told and not low <= result.estimate[k] <= high,
+                has_value=has_value,
+                outside=has_value and not low <= result.estimate[k] <= high,
                 at_bound=bound,
                 bar_left=float(at[0][k]),
                 bar_width=max(float(at[1][k] - at[0][k]), 0.4),
@@ -185,13 +181,10 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
 
 
 def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, str, list[float | None]]]]:
-    """Return predictors, and of each joint (and of their mean) its unit and the error of each.
+    """Return the predictors, and for each joint and their mean the unit and each predictor's error.
 
-    An error is None where a prediction diverged. The sensor's noise stands beside them where it is known.
-    The mean is left out where joints have different units.
-
-    Args:
-        rmse: ``provenance.heldout_rmse``; empty where nothing was held out.
+    An error is None where a prediction diverged. The sensor's noise follows where it is known. The mean is
+    left out where joints have different units. ``rmse`` is ``provenance.heldout_rmse``.
     """
     by_joint, noise = _mapping(rmse.get("by_coordinate")), _mapping(rmse.get("noise"))
     means = _mapping(rmse.get("mean"))
@@ -207,7 +200,7 @@ def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, st
 
 
 def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
-    """Return the table of what to record next, in words."""
+    """Return the table of advised recordings, in words."""
     return [
         {
             "parameter": str(row["parameter"]),
@@ -220,7 +213,7 @@ def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
 
 
 def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
-    """Return a standard deviation in the parameter's own scale in words."""
+    """Format a standard deviation in the parameter's own scale."""
     if std is None:
         return "–"
     parameter = result.space[name]
@@ -228,13 +221,13 @@ def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
 
 
 def with_value(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return which parameters have a value, (K,): what the data cannot tell gets none on the page."""
+    """Return which parameters have a value on the page, (K,): unidentified ones have none."""
     K = len(result.space)
     return np.array([v != "not identifiable" for v in result.verdicts] or [True] * K, dtype=bool)
 
 
 def short(value: float, digits: int = 4) -> str:
-    """Return a number with so many digits."""
+    """Format a number with so many digits."""
     return f"{value:.{digits}g}" if math.isfinite(value) else "–"
 
 
@@ -251,16 +244,9 @@ def _plain(value: Any) -> str:
 def write_result(
     folder: Path, robot: RobotModel, result: CalibrationResult, report: ReportInputs | None = None
 ) -> dict[str, Path]:
-    """Write everything a calibration found; all of it appears, or none.
+    """Write everything a calibration found; all of it appears, or none. A report of None is not written.
 
-    Args:
-        folder: Where to write; made if need be.
-        robot: The nominal model.
-        result: What was found.
-        report: What the report shows; None to write none.
-
-    Returns:
-        The files by name; included files of the model that changed are among them.
+    Return the files by name; changed included files of the model are among them.
 
     Raises:
         DatasetError: The folder cannot be written.
@@ -293,7 +279,7 @@ def write_result(
                 )
                 names += [file.name for file in written]
             except ConfigurationError as err:
-                # A model that cannot be written must not cost the numbers.
+                # An error in the model must not cost the numbers.
                 unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
     except OSError as err:
         raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err

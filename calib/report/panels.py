@@ -1,7 +1,7 @@
-"""Charts that keep readable text at any width: an SVG that stretches, with ticks and words as HTML around it.
+"""Charts with readable text at any width: an SVG that stretches, with ticks and labels as HTML around it.
 
-The page's script reads the series back from the paths, so nothing is written twice; without it the charts
-stand as they are. Colours and line styles are classes of the page's style sheet.
+The page's script reads the series back from the paths, so nothing is stored twice. The charts also work
+without it. Colours and line styles are classes of the page's style sheet.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ WIDTH, HEIGHT = 8000, 2000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """One thing that a panel shows.
+    """One series of a panel.
 
     Attributes:
-        name: What the reader calls it.
+        name: Name for the reader.
         style: Class of the style sheet, such as "real".
         x: (n,), ascending.
         y: (n,); NaN leaves a gap.
@@ -46,14 +46,14 @@ class Panel:
     Attributes:
         title: Quantity with its unit in brackets.
         x_title: The same of the other axis.
-        series: What is drawn, later ones over earlier ones.
+        series: The series, later ones over earlier ones.
         x: Ends of the axis.
         y: Ends of the axis.
         log_y: Draw the logarithm.
         bands: Shaded ranges of y: low, high.
-        whole_x: Only whole numbers are ticks.
+        whole_x: Ticks at whole numbers only.
         no_y: No ticks at y.
-        linked: Zoom and cross-hair go along with the group's other linked panels.
+        linked: Zoom and cross-hair are shared with the group's other linked panels.
         style: Class of the figure, such as its width.
     """
 
@@ -69,7 +69,7 @@ class Panel:
     linked: bool = False
     style: str = ""
     label: str = field(default="", kw_only=True)
-    """What it shows, for those who do not see it; the title where it is empty."""
+    """Text for screen readers; the title if empty."""
 
     def html(self) -> Markup:
         """Return the panel as a figure."""
@@ -106,7 +106,7 @@ class Panel:
             return np.log10(values) if self.log_y else values
 
     def _rows(self, values: FloatArray, low: float, high: float) -> list[int]:
-        """Return heights in the chart's own units, 0 at its top; far outside they are cut off."""
+        """Return heights in the chart's own units, 0 at its top; values far outside are clipped."""
         share = np.clip((high - self._scaled(values)) / (high - low), -1.0, 2.0)
         return [round(HEIGHT * s) for s in share.tolist()]
 
@@ -128,7 +128,7 @@ class Panel:
             zero = self._rows(np.zeros(1), low, high)[0]
             d = "".join(f"M{a} {zero}V{b}" for a, b in zip(x, y, strict=True))
         else:
-            # A gap begins anew; a lone sample is a dot.
+            # A gap begins a new line; a lone sample is a dot.
             begins = np.diff(np.flatnonzero(seen), prepend=-9) > 1
             alone = begins & np.append(begins[1:], True)
             d = "".join(
@@ -147,14 +147,7 @@ class Panel:
 
 
 def ticks_of(low: float, high: float, most: int, *, whole: bool = False) -> list[tuple[float, str]]:
-    """Return up to about so many round values between two ends, with words of equal precision.
-
-    Args:
-        low: One end.
-        high: The other end, above it.
-        most: So many, give or take one.
-        whole: Only whole numbers.
-    """
+    """Return about ``most`` round values between two ends, with labels of equal precision."""
     step = nice_step((high - low) / most)
     step = max(round(step), 1) if whole else step
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -178,15 +171,9 @@ def _ends(ends: tuple[float, float]) -> str:
 
 
 def envelope(time: FloatArray, values: FloatArray, buckets: int = 350) -> tuple[FloatArray, FloatArray]:
-    """Thin a long series so that its picture stays the same: lowest and highest of each bucket, in order.
+    """Reduce a long series, (T,), without a visible change: lowest and highest of each bucket, in order.
 
-    Args:
-        time: (T,).
-        values: (T,); NaN leaves a gap.
-        buckets: Buckets; series of up to twice as many samples stay as they are.
-
-    Returns:
-        Times and values, up to two a bucket.
+    A value of NaN leaves a gap. Series of up to twice as many samples as buckets are unchanged.
     """
     if len(values) <= 2 * buckets:
         return time, values

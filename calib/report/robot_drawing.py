@@ -1,4 +1,4 @@
-"""A robot as line drawings: each shape's outline, seen in parallel from where its motion shows most."""
+"""A robot as line drawings: each shape's outline in parallel projection, from where its motion shows most."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class DrawingSettings:
     """Settings of :func:`draw_robot`.
 
     Attributes:
-        directions: Points by which round shapes are outlined.
+        directions: Points of the outline of round shapes.
         views: Moments of the motion that choose the view.
-        planar: Motion is planar where its share across the plane is less than this.
-        elevation: How far a view of motion in space looks down [rad].
-        margin: Around what moves, share of its size.
-        finest: Outlines are exact to this share of the picture.
+        planar: Largest share of motion across the plane of a planar motion.
+        elevation: Downward angle of the view of spatial motion [rad].
+        margin: Margin around moving parts, share of their size.
+        finest: Precision of outlines, share of the picture.
         round_size: Least share of the picture's other side: a thin robot is not drawn as a line.
     """
 
@@ -58,13 +58,13 @@ class Outline:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotDrawing:
-    """A robot at one moment, once for each who says where it is.
+    """A robot at one moment, once per predictor.
 
     Attributes:
-        caption: Which moment.
-        box: Left, bottom, width and height of the picture [m]; what moves lies inside.
-        fixed: What belongs to the world, far things first; may reach out of the picture.
-        moving: By who says where it is, such as "real" and "calibrated".
+        caption: The moment.
+        box: Left, bottom, width and height of the picture [m]; moving parts lie inside.
+        fixed: Parts of the world, far ones first; may reach out of the picture.
+        moving: By predictor, such as "real" and "calibrated".
     """
 
     caption: str
@@ -80,17 +80,17 @@ def draw_robot(
     reference: FloatArray | None = None,
     caption: str = "",
 ) -> RobotDrawing | None:
-    """Draw a robot; None where its model has no visible shape that moves.
+    """Draw a robot; None where its model has no visible moving shape.
 
     Args:
         robot: The robot's model.
         states: Tangent coordinates of one moment by name, (C,).
         motion: Tangent coordinates of the motion around it, which choose the view, (T, C).
         reference: Reference orientations of a floating base, (T + 1, 4): of the motion, then of the moment.
-        caption: Which moment it is.
+        caption: The moment in words.
     """
     shapes = read_scene(robot).shapes
-    # A body without a joint on its way to the world stays where it is.
+    # A body without a joint between it and the world is fixed.
     still = [robot.model.body_weldid[shape.body] == 0 for shape in shapes]
     if all(still):
         return None
@@ -141,7 +141,7 @@ def _view(centres: FloatArray) -> FloatArray:
     total = max(float(strength.sum()), 1e-300)
     outward = axes[:, 0]
     if strength[1] < SETTINGS.planar * total:
-        # Along one line, or at rest: any view across it shows it; the one from the side is usual.
+        # Along one line, or at rest, any view across it will do; the one from the side is usual.
         along = axes[:, 2] if abs(axes[2, 2]) < 0.9 and strength[2] > 0 else np.array([1.0, 0, 0])
         outward = np.cross(along, UP)
     flat = strength[0] < SETTINGS.planar * total
@@ -172,7 +172,7 @@ def _outlines(
 
 
 def _surface(shape: Shape) -> FloatArray:
-    """Return points of which a shape is the convex hull, in its own frame, (n, 3) [m]."""
+    """Return points with the shape as their convex hull, in its own frame, (n, 3) [m]."""
     if shape.kind == "mesh":
         return shape.vertices
     if shape.kind == "box":
@@ -195,11 +195,11 @@ def _surface(shape: Shape) -> FloatArray:
 
 
 def _hull(points: FloatArray, finest: float) -> FloatArray:
-    """Return the corners of a plane convex hull without those that hardly stand out, (n, 2)."""
+    """Return the corners of a plane convex hull, (n, 2), without nearly straight ones."""
     try:
         corners = points[ConvexHull(points).vertices]
     except QhullError:
-        # All on one line: there and back.
+        # All points on one line: the two ends.
         along = np.linalg.svd(points - points.mean(axis=0))[2][0]
         order = np.argsort(points @ along)
         return points[order[[0, -1]]]

@@ -1,4 +1,4 @@
-"""The page's first sentence: how well the calibrated simulator predicts motion that it was not given."""
+"""The page's first sentence: how well the calibrated simulator predicts unseen motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GIVEN = "motion that it was not given"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bar:
-    """One error beside the others.
+    """One bar of an error.
 
     Attributes:
         name: "nominal", "calibrated".
@@ -30,14 +30,14 @@ class Bar:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Story:
-    """What the page says first.
+    """The beginning of the page.
 
     Attributes:
         sentence: The result.
-        bars: Held-out errors; empty where nothing was held out.
+        bars: Held-out errors; empty if nothing was held out.
         floor: The sensor's noise on the bars' scale [%]; None where it is not known.
         floor_words: The same with its unit.
-        in_units: The errors in rad or m, where all joints have the same unit.
+        in_units: The errors in rad or m, if all joints have the same unit.
     """
 
     sentence: str
@@ -47,8 +47,8 @@ class Story:
     in_units: str = ""
 
 
-def tell(result: CalibrationResult) -> Story:
-    """Return the story of a result, by the measure of its verdict: the error over the signal's range."""
+def make_story(result: CalibrationResult) -> Story:
+    """Return the story of a result, in the measure of its verdict: the error over the signal's range."""
     errors = result.heldout_nrmse
     if "nominal" not in errors or "calibrated" not in errors:
         noise = ""
@@ -56,7 +56,7 @@ def tell(result: CalibrationResult) -> Story:
             size = f"{math.sqrt(result.chi2):.1f} times the sensor's noise"
             noise = f" On the fitted recordings its residuals are {size}."
         return Story(
-            sentence=f"Nothing says how well the calibrated simulator predicts {GIVEN}: no recording was "
+            sentence=f"It is not known how well the calibrated simulator predicts {GIVEN}: no recording was "
             f"held out.{noise}"
         )
     nominal, calibrated = errors["nominal"], errors["calibrated"]
@@ -85,12 +85,7 @@ def tell(result: CalibrationResult) -> Story:
 
 
 def compared(nominal: float, calibrated: float) -> str:
-    """Return how an error compares with the nominal model's, in words.
-
-    Args:
-        nominal: Error of the nominal model.
-        calibrated: Error of the calibrated one, in the same unit.
-    """
+    """Return in words how the calibrated error compares with the nominal one, in the same unit."""
     if not math.isfinite(calibrated):
         return "worse than the nominal model: it diverges"
     if not math.isfinite(nominal):
@@ -110,13 +105,13 @@ def _times(ratio: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share with two digits, as percent that no line break parts."""
+    """Format a share with two digits as percent, without a line break inside."""
     value = 100.0 * share
     return f"{value:.2g}\u00a0%" if value < 99.5 else f"{value:.0f}\u00a0%"
 
 
 def _in_units(rmse: Mapping[str, Any]) -> str:
-    """Return the errors in rad or m where all joints have one unit, else nothing."""
+    """Return the errors in rad or m if all joints have one unit, else nothing."""
     units = set((rmse.get("unit") or {}).values())
     mean = rmse.get("mean") or {}
     nominal, calibrated = mean.get("nominal"), mean.get("calibrated")

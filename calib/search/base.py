@@ -1,7 +1,7 @@
-"""A search that goes generation by generation, so that it can be watched, stopped, saved and resumed exactly.
+"""Searches by generations, which can be watched, stopped, saved and resumed exactly.
 
-A method is two classes: the :class:`Search`, which holds settings and makes for each run a :class:`Stepper`,
-which holds everything that changes. What a stepper saves between two generations, with the generator's state,
+A method is two classes. The :class:`Search` holds settings and makes a :class:`Stepper` for each run. The
+stepper holds everything that changes. Its saved state between two generations, together with the generator's,
 decides all that follows.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Kept, restore_generator
+from deal_hw.calib.search.resume import Stateful, restore_generator
 from deal_hw.calibration import (
     Z90,
     Alarm,
@@ -34,14 +34,14 @@ from deal_hw.types import FloatArray
 class Coordinates:
     """The map between a unit cube of K parameters (and the latency) and physical values.
 
-    Parameters are equal steps of their own scale, log for positive ones; the latency is linear.
+    Parameters are uniform in their own scale, log for positive ones; the latency is linear.
 
     Args:
-        problem: Gives the space and the range of the latency, or the latency.
-        margin_s: The latency's coordinate reaches so far beyond its range, or a latency of zero would sit at
-            infinity [s]; less than :func:`~deal_hw.calib.data.innovations.early_setpoints` can undo.
-        linear: Parameters are equal steps of their value, whatever their scale.
-        latency: Search the latency where it is not given; otherwise it then counts as none.
+        problem: Gives the space and the latency or its range.
+        margin_s: Extension of the latency's range [s], without which a latency of zero would be at infinity.
+            It is less than :func:`~deal_hw.calib.data.innovations.early_setpoints` can undo.
+        linear: Parameters are uniform in their value, whatever their scale.
+        latency: Search the latency if it is not given; otherwise it is zero.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Coordinates:
 
     @property
     def count(self) -> int:
-        """Coordinates: K, and one more where the latency is searched."""
+        """Number of coordinates: K, plus one if the latency is searched."""
         return len(self.space) + (self.fixed_latency_s is None)
 
     @property
@@ -77,7 +77,7 @@ class Coordinates:
         return Members(theta, latency)
 
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Draw unit coordinates, (count, C), over all ranges; the latency's without its margin."""
+        """Draw unit coordinates, (count, C), over all ranges; the latency without its margin."""
         unit = rng.random((count, self.count))
         if self.fixed_latency_s is None:
             inner = self._range[0] + (self._range[1] - self._range[0]) * unit[:, -1]
@@ -85,23 +85,14 @@ class Coordinates:
         return unit
 
     def clip_latency(self, latency_s: float) -> float:
-        """Return the latency inside the range that was asked for [s]."""
+        """Return the latency clipped to the requested range [s]."""
         if self.fixed_latency_s is not None:
             return self.fixed_latency_s
         return float(np.clip(latency_s, *self._range))
 
 
 class SearchLog:
-    """Book-keeping of one search.
-
-    Args:
-        method: Name of the method.
-        problem: What is searched.
-        budget: What may be used.
-        progress: Called after each generation.
-        settings: The method's settings, a dataclass.
-        coordinates: In which it searches; those of the problem by default.
-    """
+    """Trace, counts and result of one search."""
 
     def __init__(
         self,
@@ -121,13 +112,7 @@ class SearchLog:
         self._earlier_steps, self._earlier_seconds = 0, 0.0
 
     def note(self, message: str, members: Members, values: Mapping[str, float]) -> None:
-        """Write one generation into the trace and call the callback, which may raise to stop the run.
-
-        Args:
-            message: One short line.
-            members: What was simulated.
-            values: For the trace.
-        """
+        """Append one generation to the trace and call the callback, which may raise to stop the run."""
         self.trace.append({"generation": float(len(self.trace)), **values})
         if self._progress is not None:
             total = max(self.budget.generations, len(self.trace))
@@ -137,16 +122,16 @@ class SearchLog:
 
     @property
     def steps(self) -> int:
-        """Physics steps simulated so far, before a resume too."""
+        """Physics steps so far, including those before a resume."""
         return self._earlier_steps + self.problem.steps - self._steps
 
     @property
     def seconds(self) -> float:
-        """Wall clock so far, before a resume too [s]."""
+        """Wall clock so far, including that before a resume [s]."""
         return self._earlier_seconds + time.perf_counter() - self._start
 
     def save(self) -> dict[str, Any]:
-        """Return the state of the book-keeping as plain values."""
+        """Return the state as plain values."""
         return {"trace": self.trace, "steps": self.steps, "seconds": self.seconds}
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -159,8 +144,8 @@ class SearchLog:
         """Return the alarm of a search that left a residual."""
         return Alarm(
             f"After {len(self.trace)} generations the residual is {chi2:.1f} times its expected variance.",
-            "The search ended elsewhere than at the robot, or the model lacks something.",
-            "Refine it, search again (another --seed, more --generations, wider ranges), or doubt the model.",
+            "The search ended far from the robot's values, or the model is incomplete.",
+            "Refine it, search again (another --seed, more --generations, wider ranges), or check the model.",
         )
 
     def result(
@@ -173,19 +158,11 @@ class SearchLog:
         extra: Mapping[str, Any] | None = None,
         **better: Any,
     ) -> CalibrationResult:
-        """Return the result.
+        """Return the result; ``better`` are fields for which the method has better values.
 
         The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
-        calibrated: a searcher's population shrinks as its step rule says, too far where the ensemble is
-        small, and to nothing for diffusion evolution. The refinement computes intervals from the data.
-
-        Args:
-            centre: The estimate, one member.
-            population: The last population.
-            chi2: Mean squared whitened residual at the estimate.
-            alarms: Reasons to distrust the result.
-            extra: Further provenance.
-            better: Fields of the result that the method knows better than its population does.
+        calibrated: a population shrinks by the searcher's step rule, too far for small ensembles, and to
+        nothing for diffusion evolution. The refinement computes intervals from the data.
         """
         space = self.problem.space
         scaled = space.to_scale(population.theta)
@@ -217,14 +194,8 @@ class SearchLog:
         return replace(plain, **better)
 
 
-class Stepper(Kept, abc.ABC):
-    """One run of a search, between its generations.
-
-    Args:
-        log: Book-keeping of the run.
-        rng: The only source of randomness.
-        search: The method.
-    """
+class Stepper(Stateful, abc.ABC):
+    """One run of a search, between its generations."""
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         self.log, self.rng = log, rng
@@ -234,27 +205,23 @@ class Stepper(Kept, abc.ABC):
     @property
     @abc.abstractmethod
     def finished(self) -> bool:
-        """Whether there is nothing left to do."""
+        """Whether nothing is left to do."""
 
     @abc.abstractmethod
     def step(self) -> None:
-        """Do one generation and note it (``SearchLog.note``), which is once for each call."""
+        """Do one generation and call ``SearchLog.note`` once."""
 
     @abc.abstractmethod
     def result(self) -> CalibrationResult:
-        """Return what was found so far."""
+        """Return the result so far."""
 
 
 class Search(CalibrationMethod[Problem]):
-    """A calibration method whose run is a sequence of generations.
-
-    Attributes:
-        settings: How to run, a dataclass.
-    """
+    """A calibration method whose run is a sequence of generations; ``settings`` is a dataclass."""
 
     settings: Any
     stepper: ClassVar[type[Stepper]]
-    """Makes a run before its first generation; its arguments are those of :class:`Stepper`."""
+    """Makes a run before its first generation."""
 
     def coordinates(self, problem: Problem) -> Coordinates:
         """Return the coordinates in which this method searches."""
@@ -286,7 +253,7 @@ class Search(CalibrationMethod[Problem]):
 
 
 class RangedSearch(Search):
-    """A search whose settings say in which range: ``linear`` and ``latency``, as in :class:`Coordinates`."""
+    """A search with the settings ``linear`` and ``latency`` of :class:`Coordinates`."""
 
     def coordinates(self, problem: Problem) -> Coordinates:
         """Return the coordinates in which this method searches."""

@@ -1,9 +1,9 @@
-"""Critics: networks that tell recorded transitions from simulated ones.
+"""Critics: networks that separate recorded transitions from simulated ones.
 
-Two kinds share one interface. `ClippedCritic` is the paper's WGAN with weight clipping (eq. 5);
-`PenaltyCritic` holds its gradient near one instead (WGAN-GP, Gulrajani et al. 2017), which leaves it smooth
-enough for its hidden features to be regressed on. Both run on the CPU, in float32, and draw from one torch
-generator: the same seed, the same critic.
+Two kinds share one interface. `ClippedCritic` is the paper's WGAN with weight clipping (eq. 5).
+`PenaltyCritic` holds its gradient near one instead (WGAN-GP, Gulrajani et al. 2017). So it stays smooth
+enough for regression on its hidden features. Both run on the CPU, in float32, and draw from one torch
+generator: the same seed gives the same critic.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray
 
@@ -30,7 +30,7 @@ Samples = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CriticSettings:
-    """How a critic is built and trained.
+    """Size and training of a critic.
 
     Attributes:
         hidden: Units of the two hidden layers.
@@ -51,7 +51,7 @@ class CriticSettings:
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Use so many threads inside one operation; on a busy machine more than one can be 30 times slower."""
+    """Use ``count`` threads inside one operation; on a busy machine more than one can be 30 times slower."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -60,14 +60,8 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class Critic(Kept):
-    """A network with two hidden layers, ReLU, and one output (the paper's D).
-
-    Args:
-        inputs: Width of a sample.
-        settings: Size and training.
-        rng: Seeds the network's generator.
-    """
+class Critic(Stateful):
+    """A network with two hidden layers, ReLU, and one output (the paper's D)."""
 
     def __init__(self, inputs: int, settings: CriticSettings, rng: np.random.Generator) -> None:
         self.settings = settings
@@ -99,14 +93,9 @@ class Critic(Kept):
     def train(self, real: Samples, *fake: Samples) -> float:
         """Make the settings' updates on minibatches drawn with replacement (Algorithm 1, lines 4-7).
 
-        Args:
-            real: Samples of the recording, (n, inputs).
-            fake: Samples of the simulators, (m, inputs), in blocks that are never joined: a replay of 50
-                generations of 200 x 200 transitions is 72 MB. Rows are picked from the blocks by their index.
-
-        Returns:
-            The estimate of the Wasserstein distance in the last update: mean output on real minus on fake
-            samples.
+        Samples are (n, inputs). Those of the simulators come in blocks that are never joined: a replay of 50
+        generations of 200 x 200 transitions is 72 MB. Return the estimate of the Wasserstein distance in the
+        last update: mean output on real minus fake samples.
         """
         settings = self.settings
         data = torch.from_numpy(real)
@@ -161,14 +150,7 @@ class Critic(Kept):
 
     @torch.no_grad()
     def statistics(self, samples: Samples) -> FloatArray:
-        """Return the mean over samples of all hidden activations and the output.
-
-        Args:
-            samples: N groups of n samples, (N, n, inputs).
-
-        Returns:
-            (N, h1 + h2 + 1).
-        """
+        """Return the mean hidden activations and output, (N, h1 + h2 + 1), of samples, (N, n, inputs)."""
         groups, count, width = samples.shape
         per = max(16384 // count, 1)
         out = []
@@ -184,7 +166,7 @@ class ClippedCritic(Critic):
     """The paper's critic: WGAN, weights clipped to a box (eq. 5)."""
 
     def _make_optimiser(self) -> torch.optim.Optimizer:
-        # The paper names no optimiser; RMSprop is what WGAN's authors and EASI use.
+        # The paper names no optimiser; WGAN's authors and EASI use RMSprop.
         return torch.optim.RMSprop(self._parameters, lr=self.settings.learning_rate, foreach=True)
 
     def _update(self, real: Tensor, fake: Tensor) -> float:
@@ -202,7 +184,7 @@ class ClippedCritic(Critic):
 
 
 class PenaltyCritic(Critic):
-    """WGAN-GP: the gradient by the input is held at length one between real and simulated samples."""
+    """WGAN-GP: the gradient by the input has length one between real and simulated samples."""
 
     def _make_optimiser(self) -> torch.optim.Optimizer:
         return torch.optim.Adam(

@@ -1,19 +1,19 @@
-"""`deal`: the adversarial method that works; the paper's critic, another view of the data and another update.
+"""`deal`: the paper's adversarial method with another view of the data and another update.
 
-It keeps DEAL's idea (a critic learns what tells the recording from the population's rollouts, and the
-population moves to where it cannot tell) and deviates from the paper in three places, each for a measured
+It keeps DEAL's idea: a critic learns to separate the recording from the population's rollouts, and the
+population moves to where the critic cannot. It deviates from the paper in three places, each for a measured
 reason:
 
-- What the critic sees: innovations of short windows that restart at recorded states, not whole rollouts. A
-  replay of an unstable robot says little of its parameters after the first second.
-- What a member is told: not one score, but the mean of every hidden activation and of the output. One number
-  a member and a softmax lose what the critic knows (with the paper's update even the exact prediction error
-  as fitness ends at 27-54 % error).
-- How the population moves: an ensemble Kalman step regresses parameters on those statistics towards the
-  recording's own statistics, instead of the denoising step of eqs. 1-3 and 8-10.
+- Input of the critic: innovations of short windows that restart at recorded states, not whole rollouts. After
+  the first second, a replay of an unstable robot has little information about its parameters.
+- Output per member: not one score, but the mean of every hidden activation and of the output. One number per
+  member and a softmax lose what the critic knows. With the paper's update even the exact prediction error as
+  fitness ends at 27-54 % error.
+- Update: an ensemble Kalman step regresses parameters on those statistics towards the recording's own
+  statistics, instead of the denoising step of eqs. 1-3 and 8-10.
 
-And the critic is a WGAN-GP of 64-64 units with Adam, not a clipped WGAN of 256-256 (section 3.1): clipped
-weights make hidden features that hardly depend on the parameters.
+The critic is a WGAN-GP of 64-64 units with Adam, not a clipped WGAN of 256-256 (section 3.1): with clipped
+weights, hidden features hardly depend on the parameters.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
 from deal_hw.calib.search.eki import KalmanStepper
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -51,17 +51,16 @@ class DealSettings:
     Attributes:
         critic: Size and training.
         generations: Search steps; never more than the budget's.
-        clean_ticks: Window lengths in control periods of the stages where positions carry no noise.
-        noisy_ticks: The same where they do; a long window of a far simulator says nothing.
+        clean_ticks: Window lengths of the stages for positions without noise [control periods].
+        noisy_ticks: The same for noisy positions; a long window of a distant simulator has no information.
         widen: Least spread of a coordinate at the start of each further stage, in logits.
-        least_spread: Spread in logits below which members cannot be told apart and the search ends.
+        least_spread: Spread below which members cannot be separated and the search ends, in logits.
         near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
         keep: Share of the statistics' residual that one step leaves (noise-free recordings).
         step_clip: Largest step of a coordinate, in logits.
-        alarm_chi2: A noisy recording's residual above this is not explained, and the result says so.
-        noise_draws: Draws of the noise from which its effect on the statistics is estimated (noisy
-            recordings).
-        smooth_draws: How many of these a member's statistics are averaged over.
+        alarm_chi2: Chi2 of a noisy recording above which the result carries an alarm.
+        noise_draws: Draws of the noise that estimate its effect on the statistics (noisy recordings).
+        smooth_draws: Number of these draws in a member's mean statistics.
         torch_threads: Threads of the critic's arithmetic.
     """
 
@@ -83,7 +82,7 @@ class DealSettings:
 class _Deal(KalmanStepper):
     """A run of `deal`: stages of windows, one round of critic updates and one Kalman step a generation."""
 
-    KEPT = ("kalman", "_stage", "_spread", "_view")
+    STATE = ("kalman", "_stage", "_spread", "_view")
 
     settings: DealSettings
 
@@ -103,7 +102,7 @@ class _Deal(KalmanStepper):
 
     @property
     def finished(self) -> bool:
-        """Whether the last stage is over."""
+        """Whether the last stage has ended."""
         return self._last and self._stage_over
 
     def step(self) -> None:
@@ -112,8 +111,8 @@ class _Deal(KalmanStepper):
         members, centre = self.population(z)
         with torch_threads(self.settings.torch_threads):
             residual, gap = self._view.residual(members, centre)
-        # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise
-        # begins. Noise-free ones have no such end: each step takes a fixed share of what is left.
+        # Statistics of noisy recordings are whitened by their noise, so the tempering ends at the noise.
+        # Noise-free ones have no such end: each step leaves a fixed share of the residual.
         step = self.kalman.tell(residual, keep=None if self._noisy else self.settings.keep)
         self._spread = step.spread
         self.log.note(
@@ -151,7 +150,7 @@ class _Deal(KalmanStepper):
 
     @property
     def _stage_over(self) -> bool:
-        # Earlier stages bring the population near; a third of the budget is kept for the last.
+        # Earlier stages bring the population near; a third of the budget remains for the last.
         end = self._most if self._last else 2 * self._most // 3
         told_apart = self._spread > self._least_spread
         return len(self.log.trace) >= end or self.kalman.finished or not told_apart
@@ -168,18 +167,13 @@ class _Deal(KalmanStepper):
         self._view = kind(self.problem, self.settings, self._lengths[stage], self.rng, stage > 0)
 
 
-class _View(Kept, abc.ABC):
-    """What the critic sees of recording and population, and what the members are told.
+class _View(Stateful, abc.ABC):
+    """The critic's samples of recording and population, and the statistics of each member.
 
-    Args:
-        problem: Data and simulator.
-        settings: Critic, noise draws.
-        ticks: Window length in control periods.
-        rng: Seeds the critic and draws the noise.
-        move_starts: Linearise anew around each generation's most probable start states.
+    With ``move_starts`` it linearises around each generation's most probable start states.
     """
 
-    KEPT = ("_critic", "_offsets")
+    STATE = ("_critic", "_offsets")
 
     def __init__(
         self,
@@ -201,7 +195,7 @@ class _View(Kept, abc.ABC):
 
     @abc.abstractmethod
     def _width(self) -> int:
-        """Return how many innovations one sample of the critic holds."""
+        """Return the number of innovations in one sample of the critic."""
 
     @abc.abstractmethod
     def _make_context(self, data: WindowData) -> FloatArray:
@@ -217,14 +211,12 @@ class _View(Kept, abc.ABC):
     def _statistics(
         self, real: FloatArray, fake: FloatArray, good: npt.NDArray[np.bool_]
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Train the critic; return whitened statistics of the recording, of the members, and the distance."""
+        """Train the critic; return whitened statistics of recording and members, and the distance."""
 
     def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
         """Return the recording's statistics minus each member's, (N, F), and the Wasserstein estimate.
 
-        Args:
-            members: The population.
-            centre: The simulator whose prediction both are compared with.
+        Innovations are relative to the prediction of ``centre``.
         """
         parts = [self._innovations(members, centre, data) for data in self._windows]
         real = np.concatenate([part[0] for part in parts])
@@ -238,8 +230,8 @@ class _View(Kept, abc.ABC):
         return residual, gap
 
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
-        # Far members' windows run away by many scales; a critic that spends itself on them sees nothing in
-        # the middle.
+        # Windows of distant members run away by many scales. Without a limit the critic would fit those
+        # alone.
         limited = (5.0 * np.tanh(values / (5.0 * scale))).astype(np.float32)
         context = np.broadcast_to(self._context, (*values.shape[:-1], self._context.shape[1]))
         return np.concatenate([limited, context], axis=-1)
@@ -279,7 +271,7 @@ class _CleanView(_View):
         gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
         target, found = self._critic.statistics(data[None])[0], self._critic.statistics(imitation)
         std = found[good].std(axis=0)
-        # Units that are never active carry nothing and would divide by zero.
+        # Units that are never active carry no information and would divide by zero.
         alive = std > 1e-6 * max(float(std.max()), 1e-30)
         return target[alive] / std[alive], found[:, alive] / std[alive], gap
 
@@ -287,7 +279,7 @@ class _CleanView(_View):
 class _NoisyView(_View):
     """Noisy recordings: one sample is one control period of whitened innovations.
 
-    Members are given simulated noise of the same whitened size, or the critic would tell them by its absence.
+    Members get simulated noise of the same whitened size, or the critic would recognise them by its absence.
     """
 
     def _width(self) -> int:

@@ -1,15 +1,14 @@
 """Ensemble Kalman inversion: a population moves by the regression of its coordinates on its residuals.
 
-:class:`EnsembleKalman` knows no simulator: it is asked for an ensemble and told that ensemble's whitened
+:class:`EnsembleKalman` knows no simulator: ``ask`` returns an ensemble, and ``tell`` takes its whitened
 residuals. :class:`KalmanStepper` moves it in logits of a search range, for `eki` and `deal`. Perturbed
-observations and the tempered update are those of Iglesias, Law and Stuart (2013); the data-misfit controller
-is that of Iglesias and Yang (2021), the discrepancy rule for the regularisation that of Iglesias (2016). On a
-linear model with a Gaussian prior the ensemble is, for large N, a sample of the exact posterior once the
-tempering reaches 1.
+observations and the tempered update follow Iglesias, Law and Stuart (2013). The misfit controller is from
+Iglesias and Yang (2021), the discrepancy rule for the regularisation from Iglesias (2016). For a linear model
+with a Gaussian prior and large N, the ensemble samples the exact posterior once the tempering reaches 1.
 
 `eki` regresses on the vector of all window innovations, whitened for noise and start-state error; there is no
-critic. Short windows come first, because over a long one the unstable pole makes the prediction of a wrong
-simulator meaningless; long ones then hold the information.
+critic. Short windows come first, because an unstable pole makes long predictions of a wrong simulator
+meaningless. Long windows then hold the information.
 """
 
 from __future__ import annotations
@@ -20,17 +19,17 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, cut, explained, is_noisy, whitened_residual
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class KalmanStep:
-    """What one update did.
+    """Result of one update.
 
     Attributes:
-        inflation: By how much the noise was inflated, a >= 1 with the misfit controller.
+        inflation: Inflation factor of the noise, a >= 1 with the misfit controller.
         misfit: Mean over members of the mean squared residual.
         spread: Mean standard deviation of the coordinates after the step.
     """
@@ -40,16 +39,14 @@ class KalmanStep:
     spread: float
 
 
-class EnsembleKalman(Kept):
-    """An ensemble (N, C) that is moved towards residual zero.
+class EnsembleKalman(Stateful):
+    """An ensemble (N, C) that moves towards residual zero.
 
-    Args:
-        ensemble: Initial members, (N, C).
-        rng: Draws the perturbations.
-        step_clip: Largest move of a coordinate in one step; a regression far from its samples means nothing.
+    ``step_clip`` is the largest move of a coordinate in one step: a regression is not valid far from its
+    samples.
     """
 
-    KEPT = ("_members", "tempering")
+    STATE = ("_members", "tempering")
 
     def __init__(self, ensemble: FloatArray, rng: np.random.Generator, step_clip: float = 2.0) -> None:
         self._members = np.array(ensemble, dtype=float)
@@ -71,10 +68,11 @@ class EnsembleKalman(Kept):
 
         Args:
             residual: Observed minus predicted, (N, M), whitened: unit variance where the model is right. Rows
-                that are not finite are members whose simulation diverged; they restart from another member.
+                that are not finite are diverged members; they restart from another member.
             keep: None tempers by the misfit controller until ``finished``. A number in (0, 1) instead
                 inflates the noise until that share of the mean residual remains after the step (discrepancy
-                rule): for residuals whose meaning changes from step to step, where tempering has no end.
+                rule). It is for residuals that change their meaning between steps, where tempering has no
+                end.
         """
         residual = self._replace_diverged(residual)
         N, M = residual.shape
@@ -82,7 +80,7 @@ class EnsembleKalman(Kept):
         # Rows of `left` span members, rows of `right` span observations.
         centred = (residual.mean(axis=0) - residual) / np.sqrt(N - 1)
         left, scale, right = np.linalg.svd(centred, full_matrices=False)
-        # Members that predict alike leave no rank, and nothing moves.
+        # Members with equal predictions leave no rank, and nothing moves.
         rank = scale > 1e-10 * max(float(scale.max(initial=0.0)), 1e-300)
         left, scale, right = left[:, rank], scale[rank], right[rank]
         if keep is None:
@@ -91,8 +89,8 @@ class EnsembleKalman(Kept):
         else:
             mean = residual.mean(axis=0)
             inflation = _discrepancy(scale, right @ mean, mean, keep)
-        # z + C_zg (C_gg + a I)^-1 (y + sqrt(a) xi - g): the singular vectors make it N x N, and the
-        # perturbations are drawn in the span of the ensemble, the only part of them that acts.
+        # z + C_zg (C_gg + a I)^-1 (y + sqrt(a) xi - g): the singular vectors make it N x N. The perturbations
+        # are drawn in the span of the ensemble, the only part of them with an effect.
         projected = residual @ right.T + np.sqrt(inflation) * self._rng.standard_normal((N, len(scale)))
         deviation = (self._members - self._members.mean(axis=0)) / np.sqrt(N - 1)
         gain = (scale / (scale**2 + inflation))[:, None] * (left.T @ deviation)
@@ -122,7 +120,7 @@ class EnsembleKalman(Kept):
             return residual
         good = np.flatnonzero(~bad)
         if good.size < 2:
-            # Nothing to learn from: the next generation starts as it is, with residuals that move nothing.
+            # Nothing to learn from: residuals of zero move nothing.
             return np.zeros_like(residual)
         source = self._rng.choice(good, int(bad.sum()))
         self._members[bad] = self._members[source]
@@ -146,10 +144,7 @@ def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray,
 
 
 class KalmanStepper(Stepper):
-    """A run whose population is an ensemble Kalman inversion's, in logits.
-
-    The search's settings say by how many logits a coordinate may move in one step (``step_clip``).
-    """
+    """A run of ensemble Kalman inversion in logits; needs the setting ``step_clip`` [logits]."""
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
@@ -161,19 +156,19 @@ class KalmanStepper(Stepper):
         return EnsembleKalman(logit(unit), self.rng, step_clip=self.settings.step_clip)
 
     def population(self, z: FloatArray) -> tuple[Members, Members]:
-        """Return the members at logits z, (N, C), and the one at their mean."""
+        """Return the members at logits z, (N, C), and the member at their mean."""
         middle = logistic(z.mean(axis=0, keepdims=True))
         return self.coordinates.members(logistic(z)), self.coordinates.members(middle)
 
 
 def logit(unit: FloatArray, edge: float = 1e-9) -> FloatArray:
-    """Map the unit interval, but for its edges, to the real line: unbounded steps then stay inside."""
+    """Map the unit interval, without its edges, to the real line, where steps need no bounds."""
     inside = np.clip(unit, edge, 1 - edge)
     return np.asarray(np.log(inside) - np.log1p(-inside))
 
 
 def logistic(z: FloatArray) -> FloatArray:
-    """Undo :func:`logit`."""
+    """Return the inverse of :func:`logit`."""
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * z)))
 
 
@@ -182,11 +177,11 @@ class EkiSettings:
     """Settings of `eki`.
 
     Attributes:
-        noisy_ticks: Window lengths of the stages in control periods, where positions carry noise.
-        clean_ticks: The same where they carry none.
+        noisy_ticks: Window lengths of the stages for noisy positions [control periods].
+        clean_ticks: The same for positions without noise.
         step_clip: Largest step of a coordinate, in logits.
         widen: Least spread of a coordinate at the start of each further stage, in logits.
-        restart_chi2: A residual above this is not explained: the search starts again from the whole range.
+        restart_chi2: Chi2 above which the search starts again from the whole range.
         stage_generations: Most generations of one stage.
         near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
     """
@@ -203,7 +198,7 @@ class EkiSettings:
 class _Eki(KalmanStepper):
     """A run of `eki`: searches, each of several stages, each of several generations."""
 
-    KEPT = ("kalman", "_restarts", "_best", "_over", "_stage", "_generation", "_offsets")
+    STATE = ("kalman", "_restarts", "_best", "_over", "_stage", "_generation", "_offsets")
 
     settings: EkiSettings
 
@@ -227,7 +222,7 @@ class _Eki(KalmanStepper):
         return self._over
 
     def step(self) -> None:
-        """One Kalman step; at the end of a stage or search also the beginning of the next."""
+        """Do one Kalman step; at the end of a stage or search, begin the next."""
         z = self.kalman.ask()
         members, centre = self.population(z)
         residual = whitened_residual(self.problem, members, centre, self._windows, self._offsets)
@@ -285,8 +280,8 @@ class _Eki(KalmanStepper):
         self._offsets = None
         if stage:
             self.kalman.widen(self.settings.widen)
-            # From the second stage on the population is near enough to say better than a smoother where each
-            # window began: start states are linearised anew around the last generation's most probable ones.
+            # From the second stage on the population is near enough to locate window starts better than a
+            # smoother does: linearise around the last generation's most probable start states.
             self._offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self._windows]
 
     def _end_search(self) -> None:

@@ -1,4 +1,4 @@
-"""What a stopped run needs to go on: its state between two generations, a file for it, and whose file it is.
+"""Resuming a stopped run: its state between two generations, the checkpoint file, and the run's identity.
 
 A state is nested mappings and lists of plain JSON values and NumPy arrays; nothing is ever pickled.
 """
@@ -33,35 +33,35 @@ FORMAT = "deal_hw.checkpoint/2"
 _HEADER, _ARRAY = "state", "__array__"
 
 PACKAGES = ("deal-hw", "mujoco", "numpy", "scipy", "torch", "botorch", "cma", "gpytorch")
-"""Whose versions may change a run's numbers, where they are installed."""
+"""Packages whose versions may change a run's numbers, where installed."""
 
 
-class Kept:
-    """An object whose state is some of its attributes: plain values, arrays or objects of this kind."""
+class Stateful:
+    """An object whose state is some of its attributes: plain values, arrays or objects of this class."""
 
-    KEPT: ClassVar[tuple[str, ...]] = ()
-    """Names of the attributes on which all that follows depends."""
+    STATE: ClassVar[tuple[str, ...]] = ()
+    """Names of these attributes; they decide all that follows."""
 
     def save(self) -> State:
-        """Return the state; what changes later does not change it."""
-        held = {name: getattr(self, name) for name in self.KEPT}
-        return {k: v.save() if isinstance(v, Kept) else copy.deepcopy(v) for k, v in held.items()}
+        """Return a copy of the state."""
+        held = {name: getattr(self, name) for name in self.STATE}
+        return {k: v.save() if isinstance(v, Stateful) else copy.deepcopy(v) for k, v in held.items()}
 
     def load(self, state: State) -> None:
         """Continue from what :meth:`save` returned."""
-        for name in self.KEPT:
+        for name in self.STATE:
             held = getattr(self, name)
-            if isinstance(held, Kept):
+            if isinstance(held, Stateful):
                 held.load(state[name])
             else:
                 setattr(self, name, copy.deepcopy(state[name]))
 
 
 def restore_generator(rng: np.random.Generator, state: State) -> None:
-    """Set a generator to the state of ``rng.bit_generator``, so that it draws what it would have drawn.
+    """Set a generator to a state of ``rng.bit_generator``.
 
     Raises:
-        ConfigurationError: It is the state of another kind of generator.
+        ConfigurationError: The state belongs to another kind of generator.
     """
     try:
         rng.bit_generator.state = dict(state)
@@ -73,7 +73,7 @@ def pack(state: State) -> bytes:
     """Return a state as the bytes of an NPZ file: a JSON tree whose leaves name arrays beside it.
 
     Raises:
-        TypeError: It holds something else than plain values and arrays of numbers.
+        TypeError: It holds something other than plain values and arrays of numbers.
     """
     arrays: dict[str, Any] = {}
 
@@ -110,12 +110,12 @@ def unpack(data: bytes) -> dict[str, Any]:
 
 
 class SearchCheckpoint:
-    """A checkpoint file of one run; written whole or not at all. A :class:`deal_hw.calibration.StateStore`.
+    """A run's checkpoint file, written whole or not at all. A :class:`deal_hw.calibration.StateStore`.
 
     Args:
         path: The file.
         identity: Digest of everything that decides the run's numbers; a file of another run is refused.
-        fresh: Begin anew: a file that is there is not read, and is replaced by the first state.
+        fresh: Ignore an existing file; the first state replaces it.
     """
 
     def __init__(self, path: Path, identity: str, *, fresh: bool = False) -> None:
@@ -137,7 +137,7 @@ class SearchCheckpoint:
             raise DatasetError(f"{self.path} cannot be written: {err.strerror}") from err
 
     def load(self) -> dict[str, Any] | None:
-        """Return the saved state, or None where there is none to continue.
+        """Return the saved state, or None if there is none.
 
         Raises:
             ConfigurationError: The file belongs to another run.
@@ -149,27 +149,22 @@ class SearchCheckpoint:
             saved = unpack(read_bytes(self.path, RECORDING_BYTES))
             if saved.get("identity") != self.identity:
                 raise ConfigurationError(
-                    f"{self.path} is of a run with other data, settings or versions and cannot be resumed; "
-                    "remove it, or repeat the settings of that run"
+                    f"{self.path} belongs to a run with other data, settings or versions and cannot be "
+                    "resumed; remove it, or repeat the settings of that run"
                 )
             return dict(object_of(saved["run"]))
 
     def remove(self) -> None:
-        """Remove the file: the run is over."""
+        """Remove the file after the run."""
         for path in (self.path, self.path.with_suffix(".part")):
             path.unlink(missing_ok=True)
 
 
 class Restarts:
-    """Runs a search again and again; what an interrupted run had finished is not run a second time.
+    """Runs a search repeatedly; searches that an interrupted run had finished are not run again.
 
-    It is the running search's store: the last state of each search goes into the whole run's store. From its
-    last state a search that is over makes its result again, and the generator is where that search left it.
-
-    Args:
-        search: The search.
-        rng: The only source of randomness.
-        store: Where the whole run is kept; None to keep nothing.
+    It is the running search's store, and puts the last state of each search into the whole run's store. From
+    its last state a finished search makes its result again, with the generator as that search left it.
     """
 
     def __init__(
@@ -180,20 +175,16 @@ class Restarts:
         self._states: list[State] = [] if saved is None else list(saved["searches"])
         self._number = 0
         self.earlier_steps = 0
-        """Physics steps that the searches simulated before this process resumed them."""
+        """Physics steps of the searches before this process resumed them."""
         self.earlier_seconds = 0.0
-        """Wall clock that they took before this process resumed them [s]."""
+        """Wall clock of the searches before this process resumed them [s]."""
 
     def run(
         self, problem: Problem, number: int, budget: Budget, progress: ProgressCallback | None
     ) -> CalibrationResult:
-        """Return the result of search ``number``, 0 for the first.
+        """Return the result of search ``number``, 0 for the first; searches run in order.
 
-        Args:
-            problem: Data and simulator.
-            number: Which search; each follows the one before.
-            budget: What that search may use.
-            progress: Called after each of its generations.
+        See :meth:`CalibrationMethod.run` for the other arguments.
         """
         self._number = number
         steps, began = problem.steps, time.perf_counter()
@@ -204,7 +195,7 @@ class Restarts:
         return result
 
     def save(self, state: State) -> None:
-        """Keep the running search's state; see :class:`deal_hw.calibration.StateStore`."""
+        """Store the running search's state; see :class:`deal_hw.calibration.StateStore`."""
         self._states[self._number :] = [state]
         if self._store is not None:
             self._store.save({"searches": self._states})
@@ -217,20 +208,13 @@ class Restarts:
 def run_identity(
     problem: Problem, method: CalibrationMethod[Problem], budget: Budget, rng: np.random.Generator
 ) -> str:
-    """Return the digest of a run, by which its checkpoint is known.
+    """Return the digest of a run, which identifies its checkpoint; ``rng`` has not drawn yet.
 
-    It covers the recordings' samples and commands, what is known of their noise and latency, model, space,
-    method with its settings, budget, generator and versions; not the number of threads, which changes no
-    number.
-
-    Args:
-        problem: Data and simulator.
-        method: The method.
-        budget: How much it may use.
-        rng: The run's generator, before it has drawn anything.
+    It covers the recordings' samples and commands, their given noise and latency, model, space, method with
+    its settings, budget, generator and versions. The number of threads changes no result and is left out.
 
     Raises:
-        TypeError: The method holds something that cannot be told apart, such as a function.
+        TypeError: The method holds a value without a digest, such as a function.
     """
     versions = {}
     for name in PACKAGES:
@@ -255,12 +239,12 @@ def digest(value: Any) -> str:
     """Return the SHA-256 of nested mappings, sequences, dataclasses, methods, arrays and plain values.
 
     Raises:
-        TypeError: There is something else among them.
+        TypeError: A value has another type.
     """
-    return hashlib.sha256(json.dumps(value, default=_told_apart).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(value, default=_to_plain).encode()).hexdigest()
 
 
-def _told_apart(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {"array": [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]}
     if isinstance(value, CalibrationMethod):

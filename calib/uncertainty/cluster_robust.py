@@ -1,16 +1,16 @@
-"""Variances clustered by blocks of time: what holds where residuals are neither white nor of one size.
+"""Variances clustered by blocks of time, for residuals that are neither white nor of equal size.
 
-The usual covariance H^-1 believes in independent residuals of known variance. The cluster-robust one
-H^-1 (sum_b s_b s_b^T) H^-1 only believes that blocks of residuals are independent of each other: s_b is the
-score of block b (what it adds to half the cost's gradient), start states eliminated. Handed back is the ratio
-of both variances, coordinate by coordinate.
+The usual covariance H^-1 assumes independent residuals of known variance. The cluster-robust one
+H^-1 (sum_b s_b s_b^T) H^-1 only assumes independent blocks of residuals. s_b is the score of block b (its
+part of half the cost's gradient), start states eliminated. The result is the ratio of both variances,
+coordinate by coordinate.
 
 Small samples: a sum over few blocks is too small even where the model is right, because the fit follows the
-noise of each block. With P the projection on parameters and start states, a block's score has under white
-noise the covariance J_b^T (I - P_bb) J_b, so the ratio is taken to the sum of those: it is 1 on average
-however few blocks there are. This is the bias reduction of Bell and McCaffrey (2002), applied to the sum
-instead of to each block, which stays finite where one block alone tells a parameter; their effective number
-of blocks comes along.
+noise of each block. Under white noise a block's score has the covariance J_b^T (I - P_bb) J_b, with P the
+projection on parameters and start states. The ratio is taken to the sum of those, so its mean is 1 for any
+number of blocks. This is the bias reduction of Bell and McCaffrey (2002), applied to the sum instead of to
+each block, which stays finite where one block alone determines a parameter. The effective number of blocks is
+returned as well.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class ClusterSettings:
     """Settings of :func:`clustered`.
 
     Attributes:
-        fewest_blocks: With fewer blocks nothing can be said of how residuals are correlated.
-        enough_blocks: Blocks are made as long as so many of them allow.
-        parts: Parts that a window is cut into at first.
+        fewest_blocks: Fewest blocks that show how residuals are correlated.
+        enough_blocks: Blocks are as long as this number of them allows.
+        parts: Parts into which a window is cut first.
         shortest: Fewest samples of a part.
     """
 
@@ -47,12 +47,12 @@ SETTINGS = ClusterSettings()
 
 @dataclass(frozen=True, slots=True)
 class Clustered:
-    """How much more (or less) uncertain coordinates are than independent residuals of unit variance say.
+    """Uncertainty of coordinates relative to independent residuals of unit variance.
 
     Attributes:
         ratio: Variance over that of independent residuals, (P,).
-        degrees: Effective number of blocks that tell each coordinate, (P,).
-        blocks: Blocks.
+        degrees: Effective number of blocks that determine each coordinate, (P,).
+        blocks: Number of blocks.
         block_samples: Samples of a block.
     """
 
@@ -67,8 +67,8 @@ class _Level:
     """Blocks of one length.
 
     Attributes:
-        shift: What each block's score moves the estimate by, (B, P).
-        expected: Variance of that under independent residuals of unit variance, (B, P).
+        shift: Shift of the estimate by each block's score, (B, P).
+        expected: Its variance under independent residuals of unit variance, (B, P).
         follows: Blocks that come right after the one before them, (B - 1,).
     """
 
@@ -93,12 +93,12 @@ def clustered(
     Args:
         rows: Linearised residuals at the estimate.
         bread: Covariance under independent residuals of unit variance, (P, P); zero rows and columns for
-            coordinates that are fixed.
+            fixed coordinates.
         samples: Samples H of a window.
         correlation_samples: Autocorrelation time of the residuals; blocks are at least twice as long.
 
     Returns:
-        None where the recordings do not hold enough blocks.
+        None where the recordings hold too few blocks.
     """
     if not rows:
         return None
@@ -142,7 +142,7 @@ def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
     """Eliminate the start states.
 
     Returns:
-        The rows' derivatives by the parameters while start states follow, (W, R, P), and the start states'
+        The rows' derivatives by the parameters with following start states, (W, R, P), and the start states'
         normal matrices, (W, S, S).
     """
     js = rows.start
@@ -154,12 +154,9 @@ def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
 
 
 def without_starts(start: FloatArray, normal: FloatArray, x: FloatArray) -> FloatArray:
-    """Return columns, (W, R, n), without what start states can do of them.
+    """Return columns ``x``, (W, R, n), without their projection on the start states.
 
-    Args:
-        start: Derivatives by the start states, (W, R, S).
-        normal: The start states' normal matrices, (W, S, S).
-        x: The columns.
+    ``start`` are derivatives by the start states, (W, R, S), ``normal`` their normal matrices, (W, S, S).
     """
     if start.shape[2] == 0:
         return x
@@ -175,7 +172,7 @@ def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: i
         S = of_episode.start.shape[2]
         channels = (R - S) // samples
         sample_part = np.minimum(np.arange(samples) * parts // samples, parts - 1)
-        # What is known of the start state goes with the first part.
+        # The start state's prior goes with the first part.
         part = np.concatenate([np.repeat(sample_part, channels), np.zeros(S, dtype=np.int64)])
         score, information, start = (np.zeros((W, parts, *s)) for s in ((P,), (P, P), (P, P)))
         for p in range(parts):

@@ -1,4 +1,4 @@
-"""What the data can tell: intervals, verdicts, null directions in words, signs of a wrong model."""
+"""Uncertainty of a fit: intervals, identifiability, null directions in words, signs of a wrong model."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MismatchSettings:
-    """Residuals that noise does not make.
+    """Limits for residuals that noise explains.
 
     Attributes:
-        chi2: Mean squared residual over the noise's above which the model is wrong [-].
-        correlation_samples: Autocorrelation time above which it is [samples].
+        chi2: Mean squared residual over the noise variance above which the model is wrong [-].
+        correlation_samples: Autocorrelation time above which it is wrong [samples].
         negligible_chi2: Residuals this far below the noise need no explanation, autocorrelated or not [-].
-        white_samples: A local fit whose residual is autocorrelated longer may have ended in another minimum,
-            so a search follows [samples]. Cart-poles with sensors, 15 tuning seeds of ratio 5 and 20: the 11
-            local fits that ended where a fit from the truth ends were at 1.00; one in another minimum, with a
-            chi2 of 1.16 that passes for noise, was at 1.39.
+        white_samples: Longest autocorrelation time of a local fit that needs no search [samples]: beyond it
+            the fit may be in another minimum. Cart-poles with sensors, 15 tuning seeds of ratio 5 and 20: the
+            11 local fits that agreed with a fit from the truth were at 1.00. One in another minimum, with a
+            chi2 of 1.16, was at 1.39.
     """
 
     chi2: float = 1.3
@@ -46,23 +46,22 @@ class IntervalSettings:
     """Settings of :func:`uncertainty`.
 
     Attributes:
-        kinks: Factor on standard deviations for what linearising leaves out [-]: stick-slip and saturation
-            bend the likelihood. Measured on tuning seeds: without it 90 % intervals held 86-89 % of the
-            truths.
-        contact_kinks: The same where feet touch the floor [-]. On five sensed Go2 tuning seeds errors were
-            0.9 to 1.7 times (root mean square) what linearising says, about 1.5 over all; as it differs so
-            much from robot to robot, Student's quantile with four degrees of freedom, 1.3 times the normal
-            one, belongs to it.
-        identifiable_std: Up to this standard deviation, in ln units or parts of a linear range, a parameter
-            is identified [-].
-        weak_share: Up to this share of the prior's standard deviation the data say something [-].
-        blind_share: Beyond this share of the prior's standard deviation the data say nothing [-].
-        at_bound: A parameter so near an end of its range, as a share of the range, ended there [-].
-        prior_blocks: The overall inflation counts like so many blocks in a parameter's own: few blocks say
-            little.
+        kinks: Factor on standard deviations for nonlinearity [-]: stick-slip and saturation bend the
+            likelihood. On tuning seeds, 90 % intervals without it contained 86-89 % of the truths.
+        contact_kinks: The same with feet on the floor [-]. On five Go2 tuning seeds with sensor noise, errors
+            were 0.9 to 1.7 times the linear estimate (root mean square), about 1.5 over all. As it differs so
+            much between robots, it includes Student's quantile with four degrees of freedom, 1.3 times the
+            normal one.
+        identifiable_std: Largest standard deviation of an identified parameter, in ln units or parts of a
+            linear range [-].
+        weak_share: Largest standard deviation of a weakly identified parameter, as share of the prior's [-].
+        blind_share: Share of the prior's standard deviation above which the data have no information [-].
+        at_bound: Distance to an end of the range, as share of the range, that counts as at the bound [-].
+        prior_blocks: Number of blocks that the overall inflation counts for in a parameter's own inflation,
+            because a few blocks are poor evidence.
         lags: Longest lag of the autocorrelation time [samples].
-        near: Share of the refinement's step in parameters [-]: over a whole one dry friction kinks often
-            enough to look like information where a recording without noise has none.
+        near: Share of the refinement's parameter step for central differences [-]. Over a whole step, kinks
+            of dry friction can look like information that a noise-free recording does not have.
     """
 
     kinks: float = 1.2
@@ -81,20 +80,20 @@ MISMATCH, SETTINGS = MismatchSettings(), IntervalSettings()
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """What is known about parameters and latency.
+    """Uncertainty of parameters and latency.
 
     Attributes:
         covariance: Of the parameters in their own scale, (K, K).
         interval: 90 % intervals, physical, (K, 2).
         latency_interval_s: 90 % interval of the latency [s].
-        verdicts: One a parameter.
-        null_directions: Combinations that the data cannot see, in words.
+        verdicts: One per parameter.
+        null_directions: Combinations without effect on the recordings, in words.
         alarms: Signs that the model is wrong.
-        inflation: Factor on the variance for what the model does not explain.
-        shape: What the intervals keep whatever the covariance is.
-        clustered: Variances clustered by blocks of time over those of independent residuals; None where it
-            was not asked for or there are too few blocks. Its last entry is the latency's.
-        widened: Factor by which clustering made each parameter's interval wider, (K,).
+        inflation: Factor on the variance for model error.
+        shape: Properties of the intervals that the covariance does not hold.
+        clustered: Variances clustered by blocks of time over those of independent residuals; None if not
+            computed or with too few blocks. Its last entry is the latency's.
+        widened: Factor of clustering on each parameter's interval, (K,).
     """
 
     covariance: FloatArray
@@ -111,11 +110,11 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True)
 class PosteriorShape:
-    """Which intervals are not symmetric around the estimate.
+    """Intervals that are not symmetric around the estimate.
 
     Attributes:
-        blind: Parameters that the data cannot tell: their interval is the range's own, (K,).
-        bound: -1 or 1 for parameters that ended at the lower or upper bound and are fixed there, (K,).
+        blind: Parameters that the data do not determine: their interval is the range's own, (K,).
+        bound: -1 or 1 for parameters fixed at their lower or upper bound, (K,).
     """
 
     blind: npt.NDArray[np.bool_]
@@ -123,10 +122,9 @@ class PosteriorShape:
 
 
 def correlation_time(residuals: tuple[FloatArray, ...]) -> float:
-    """Return the integrated autocorrelation time of residuals, in samples; 1 for white ones.
+    """Return the integrated autocorrelation time of whitened residuals, (W, H, J) each, in samples.
 
-    Args:
-        residuals: Whitened residuals of windows, (W, H, J) each.
+    White residuals have 1.
     """
     worst = 1.0
     for r in residuals:
@@ -163,24 +161,23 @@ def uncertainty(
         space: The parameters.
         theta: Estimate, (K,).
         latency_s: Estimate [s].
-        normal: Normal equations there. Their gradient says how hard a bound is pressed; from their rows
-            variances are clustered, and without any residuals are believed to be independent but for their
-            correlation time.
+        normal: Normal equations there. Their gradient shows how hard a bound is pressed. Their rows give the
+            clustered variances; without rows, residuals count as independent but for their correlation time.
         chi2: Mean squared whitened residual.
         latency_range_s: Searched latencies [s].
         fixed_latency: The latency was given.
-        timing_std_s: Jitter of the samples' time that the recording shows [s].
-        kinks: Factor on standard deviations for what linearising leaves out.
+        timing_std_s: Jitter of the sample times [s].
+        kinks: Factor on standard deviations for nonlinearity.
     """
     K = len(space)
     tau = correlation_time(normal.residual)
     inflation = kinks**2 * max(1.0, chi2) * tau
     slope, known = normal.gradient, normal.prior
     data = normal.hessian - np.diag(known)
-    # The range is a flat prior; its variance keeps what the data cannot see as wide as the range.
+    # The range is a flat prior; its variance keeps directions without information as wide as the range.
     flat = np.append(space.width**2, (latency_range_s[1] - latency_range_s[0]) ** 2) / 12.0
     belief = known + 1.0 / flat
-    # Null directions see the range through their own scale, so only what was measured counts here.
+    # Null directions scale by the range themselves, so only what was measured counts here.
     unseen = null_space(space, data[:K, :K] / inflation + np.diag(known[:K]))
     blind = unseen.std > SETTINGS.identifiable_std * _unit(space)
     bound = _at_bound(space, theta, slope[:K]) * ~blind
@@ -189,7 +186,7 @@ def uncertainty(
     covariance = _covariance(precision, free)
     cluster = clustered(normal.rows, covariance / inflation, normal.residual[0].shape[1], tau)
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
-    # What the data cannot see stays as wide as the range, however autocorrelated its residuals are.
+    # Directions without information stay as wide as the range, however autocorrelated residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
     factor = np.maximum(factor, 1.0)
     covariance = covariance * np.outer(factor, factor)
@@ -228,7 +225,7 @@ def _at_bound(space: ParameterSpace, theta: FloatArray, slope: FloatArray) -> np
 
 
 def _covariance(precision: FloatArray, free: npt.NDArray[np.bool_]) -> FloatArray:
-    """Return the covariance with the others fixed; their rows and columns are zero."""
+    """Return the covariance of the free entries; rows and columns of fixed ones are zero."""
     covariance = np.zeros_like(precision)
     covariance[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
     return covariance
@@ -237,10 +234,10 @@ def _covariance(precision: FloatArray, free: npt.NDArray[np.bool_]) -> FloatArra
 def _bound_std(
     precision: FloatArray, free: npt.NDArray[np.bool_], k: int, slope: float, flat: FloatArray
 ) -> float:
-    """Return what reaches 90 % of a parameter that is fixed at its bound, over Z90.
+    """Return the 90 % reach of a parameter that is fixed at its bound, over Z90.
 
-    Its likelihood beyond the bound is cut off; inside it falls with the slope and the curvature that is left
-    when the others follow.
+    Its likelihood is cut off at the bound. Inside, it falls with the slope and with the curvature that is
+    left when the others follow.
     """
     others = free.copy()
     others[k] = True
@@ -248,16 +245,16 @@ def _bound_std(
     std, width = curvature**-0.5, float(np.sqrt(12.0 * flat[k]))
     mean = -abs(slope) / curvature
     reach = float(truncnorm.ppf(0.9, -mean / std, (width - mean) / std, loc=mean, scale=std))
-    # Far out in the tail the law is that of an exponential of the slope, and its quantile not finite.
+    # Far out in the tail the law is exponential in the slope, and its numerical quantile not finite.
     exponential = np.log(10.0) / max(abs(slope), 1e-300)
     return (reach if 0 < reach <= width else min(exponential, width)) / Z90
 
 
 def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> FloatArray:
-    """Return by how much clustering widens each standard deviation, (P,); at least 1.
+    """Return the factor of clustering on each standard deviation, (P,); at least 1.
 
-    Few blocks give a noisy variance. So it is drawn towards the uniform inflation, which counts like some
-    blocks, and only used where it is greater than chance makes it.
+    Few blocks give a noisy variance. So it is shrunk towards the uniform inflation, which counts like some
+    blocks, and used only where it is significantly larger.
     """
     if cluster is None:
         return np.ones(1)
@@ -273,23 +270,16 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
 def intervals(
     space: ParameterSpace, theta: FloatArray, covariance: FloatArray, shape: PosteriorShape | None = None
 ) -> FloatArray:
-    """Return 90 % intervals, (K, 2), inside the range.
-
-    Args:
-        space: The parameters.
-        theta: Estimate, (K,).
-        covariance: In each parameter's own scale, (K, K).
-        shape: Which are not symmetric.
-    """
+    """Return 90 % intervals, (K, 2), inside the range; the covariance is in each parameter's own scale."""
     K = len(space)
     std, center = np.sqrt(np.diag(covariance)), space.to_scale(theta)
     low = np.maximum(space.from_scale(center - Z90 * std), space.low)
     high = np.minimum(space.from_scale(center + Z90 * std), space.high)
-    # The estimate of a parameter that the data cannot see is arbitrary: its interval is the range's own 90 %.
+    # Without information the estimate is arbitrary: the interval is the range's own 90 %.
     blind = std > SETTINGS.blind_share * space.width / np.sqrt(12.0)
     if shape is not None:
         blind = blind | shape.blind
-        # What is beyond a bound was never searched; what is left lies on one side.
+        # Nothing was searched beyond a bound; the interval lies on one side.
         low = np.where(shape.bound < 0, space.low, low)
         high = np.where(shape.bound > 0, space.high, high)
         blind = blind & (shape.bound == 0)
@@ -327,7 +317,7 @@ def _alarms(
             Alarm(
                 f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
                 "The model's delay is constant: if commands jitter too, the intervals are too narrow.",
-                "Record over a link with less jitter, or with the device's own time stamps.",
+                "Record over a connection with less jitter, or with the device's own time stamps.",
             )
         )
     if chi2 > MISMATCH.chi2:
@@ -336,15 +326,15 @@ def _alarms(
         alarms.append(
             Alarm(
                 f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
-                "Something moves that the model does not have: a friction law, backlash or a varying delay.",
-                "Free a parameter for it or mend the hardware; trust predictions more than values.",
+                "The robot has something that the model lacks: a friction law, backlash or a varying delay.",
+                "Free a parameter for it or repair the hardware; trust predictions more than values.",
             )
         )
     ended = ended_at_bound(space, theta)
     for which, means in (
         (
             pressed,
-            "The data ask for a value outside the range, or the model is wrong. The intervals of the "
+            "The data prefer a value outside the range, or the model is wrong. The intervals of the "
             "other parameters hold for this value.",
         ),
         (~pressed, "The search ended there, but the data do not press the value to that end."),
@@ -357,7 +347,7 @@ def _alarms(
                 Alarm(
                     f"Ended at the bound of the search range: {listed(names)}.",
                     means,
-                    "Widen the range (--range NAME LOW HIGH) if such a value is possible, or doubt the "
+                    "Widen the range (--range NAME LOW HIGH) if such a value is possible, or check the "
                     "model.",
                 )
             )
@@ -365,19 +355,13 @@ def _alarms(
 
 
 def mismatch(chi2: float, window: str = "") -> Alarm:
-    """Return the alarm of residuals above the sensors' noise.
-
-    Args:
-        chi2: Mean squared residual over the noise's.
-        window: Over how long, in words.
-    """
+    """Return the alarm of residuals above the sensors' noise; ``window`` names the windows."""
     return Alarm(
         f"Residuals are {np.sqrt(chi2):.1f} times the sensor's noise{window}.",
         "The model does not explain the recording: it lacks something that the robot has (a friction law, "
-        "backlash, a delay that varies), or a range is too narrow. The intervals count all of it as noise.",
-        "Mend the causes that other alarms name, or widen ranges, and calibrate again. Judge this model by "
-        "its "
-        "held-out error.",
+        "backlash, a varying delay), or a range is too narrow. The intervals count all of it as noise.",
+        "Repair the causes that other alarms name, or widen ranges, and calibrate again. Judge this model by "
+        "its held-out error.",
     )
 
 
@@ -388,9 +372,9 @@ def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.b
 
 
 def with_rows(refined: Refined) -> Refined:
-    """Return the same with linearised residuals, from which variances are clustered.
+    """Return the fit with linearised residuals, from which variances are clustered.
 
-    Central differences where nothing kinks: what is said of directions without information depends on them.
+    Central differences where nothing has kinks: directions without information depend on them.
     """
     if refined.normal.rows:
         return refined
@@ -403,13 +387,7 @@ def with_rows(refined: Refined) -> Refined:
 
 
 def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> Uncertainty:
-    """Return what the data say where the refinement ended.
-
-    Args:
-        problem: The problem.
-        refined: Where; variances are clustered where it holds linearised residuals.
-        fixed_latency: The latency was given, or decided.
-    """
+    """Return the uncertainty of a refinement; variances are clustered if it holds linearised residuals."""
     return uncertainty(
         problem.space,
         refined.theta,
@@ -424,13 +402,9 @@ def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> U
 
 
 def widened_to(problem: Problem, known: Uncertainty, theta: FloatArray, std: FloatArray) -> Uncertainty:
-    """Return the statement with standard deviations that are at least these, correlations kept.
+    """Return ``known`` with standard deviations of at least ``std``, (K,), correlations kept.
 
-    Args:
-        problem: The problem.
-        known: The statement.
-        theta: The estimate it is about, (K,).
-        std: Least standard deviations in each parameter's own scale, (K,).
+    They are in each parameter's own scale; ``theta``, (K,), is the estimate.
     """
     own = np.sqrt(np.diag(known.covariance))
     factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)

@@ -1,15 +1,14 @@
-"""What the data cannot tell apart: combinations of parameters, and whole kinds of them.
+"""Parameters that the data cannot separate: combinations of them, and whole kinds.
 
-Any rotation of the directions of no information is as good as any other; the one with the fewest parameters
-in each is the one that a person can act on ("measure one of them"). A pair of single parameters hardly shows
-what is confounded, as a delay goes with the armatures of all joints together; so whole kinds are compared.
+Any rotation of the directions without information is equally valid. Those with the fewest parameters tell a
+user what to do ("measure one of them"). Pairs of single parameters often hide what is confounded: a delay
+goes with the armatures of all joints together. So whole kinds are compared.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
@@ -26,12 +25,11 @@ class NullSpaceSettings:
     """Settings of :func:`null_space` and :func:`confounded`.
 
     Attributes:
-        seen: Information below this, relative to what the range itself says, is none [-].
-        rounding: So is what lies this far below the direction that is seen best [-]: differences are not
-            more exact.
-        part: Parameters that move by less than this part of the one that moves most are not named [-].
+        seen: Information below this, relative to that of the range itself, counts as none [-].
+        rounding: The same relative to the direction with most information [-]: differences are no more exact.
+        part: Smallest part in a direction, relative to the largest, of a parameter that is named [-].
         wide: Standard deviation of a weak prior that keeps matrices invertible, in search ranges. With the
-            range itself as prior a kind that the data leave open would look known, and its partner would not
+            range itself as prior, a kind that the data leave open would look known, and its partner would not
             be named.
         narrower: Kinds are named where fixing one makes the other's interval narrower by this factor [-]: a
             third of its variance comes from the other.
@@ -51,7 +49,7 @@ SETTINGS = NullSpaceSettings()
 
 @dataclass(frozen=True, slots=True)
 class NullSpace:
-    """What the data cannot see.
+    """Directions without information.
 
     Attributes:
         directions: In each parameter's own scale, largest entry 1, few entries each, (D, K).
@@ -63,12 +61,7 @@ class NullSpace:
 
 
 def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
-    """Return the directions that the data see less than the range does.
-
-    Args:
-        space: The parameters.
-        hessian: Information of the data in each parameter's own scale, (K, K).
-    """
+    """Return the directions in which the data have less information, (K, K), than the range."""
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
     blind = values < max(SETTINGS.seen, SETTINGS.rounding * float(values[-1]))
@@ -81,13 +74,10 @@ def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
 
 
 def sparse_basis(vectors: FloatArray) -> FloatArray:
-    """Return other vectors that span the same, with small sums of absolute entries, (D, K).
+    """Return vectors with the same span as ``vectors``, (D, K), and small sums of absolute entries.
 
-    For each entry the vector with a 1 there and the least sum is a linear program; of those the smallest that
-    are independent are taken.
-
-    Args:
-        vectors: Independent rows, (D, K).
+    For each entry, the vector with a 1 there and the least sum is a linear program. The smallest independent
+    ones are taken.
     """
     D, K = vectors.shape
     if D < 2:
@@ -123,11 +113,11 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
 
 
 def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]:
-    """Name the combinations of parameters that the data cannot see."""
-    return tuple(_words(space, direction) for direction in unseen.directions)
+    """Describe the combinations of parameters without effect on the recordings."""
+    return tuple(_describe(space, direction) for direction in unseen.directions)
 
 
-def _words(space: ParameterSpace, direction: FloatArray) -> str:
+def _describe(space: ParameterSpace, direction: FloatArray) -> str:
     parts = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > SETTINGS.part]
     lead = np.sign(direction[parts[0]])
     up = [space.names[k] for k in parts if np.sign(direction[k]) == lead]
@@ -147,13 +137,12 @@ def _words(space: ParameterSpace, direction: FloatArray) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Confounded:
-    """Two kinds of parameters that the data tell apart badly.
+    """Two kinds of parameters that the data hardly separate.
 
     Attributes:
         first: A kind, or ``latency``.
         second: Another kind.
-        factor: How much narrower the first's intervals were (the median, element by element), were the second
-            known.
+        factor: How much narrower the first's intervals would be with the second known (median over elements).
     """
 
     first: str
@@ -162,25 +151,19 @@ class Confounded:
 
     @property
     def words(self) -> str:
-        """In a sentence."""
+        """The pair in a sentence."""
         degree = "" if self.factor >= SETTINGS.mostly else "partly "
         return (
             f"{self.first} and {self.second} are {degree}confounded: with {self.second} known the interval "
             f"of {self.first} would be {self.factor:.1f} times narrower"
         )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {"first": self.first, "second": self.second, "factor": self.factor}
-
 
 def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, ...]:
     """Return the confounded pairs of kinds, the worst first.
 
-    Args:
-        problem: Says which parameter is of which kind, and the ranges.
-        information: What the data say of parameters, in their own scale, and latency, (K + 1, K + 1); without
-            any prior.
+    ``information`` is that of the data on parameters, in their own scale, and latency, (K + 1, K + 1);
+    without priors.
     """
     space = problem.space
     low, high = problem.latency_range_s
@@ -192,7 +175,7 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
     }
     if problem.fixed_latency_s is None:
         kinds[LATENCY] = [len(space)]
-    # Latency first, so that a pair with it is said from its side.
+    # Latency first, so that a pair with it names it first.
     names = sorted(kinds, key=lambda name: (name != LATENCY, name))
     whole = _free_std(precision, [i for members in kinds.values() for i in members])
     found = []

@@ -1,11 +1,11 @@
-"""What discrete time does to a fit: the device acts on whole ticks, the simulator takes whole physics steps.
+"""Effects of discrete time on a fit: whole device ticks and whole physics steps.
 
 Latency: the device acts on period boundaries, so the fit is repeated at whole ticks.
 
-Physics step: an integrator of first order (MuJoCo's Euler, implicit and implicitfast) errs in proportion to
-its step, and a fit turns that error into damping, armature or delay. Half the step removes half of it, so
-where the fit would go with half the step says how far the step has moved it: twice as far. Whether the
-recordings agree with the finer step is asked too: data that were simulated with the model's own step do not.
+Physics step: the error of a first-order integrator (MuJoCo's Euler, implicit and implicitfast) is
+proportional to its step, and a fit turns it into damping, armature or delay. Half the step removes half the
+error. So the shift of the fit under half the step is half the shift that the step has caused. The recordings
+must also agree with the finer step: data that were simulated with the model's own step do not.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class ScanSettings:
     """Settings of :func:`scan_latency`.
 
     Attributes:
-        ticks: Ticks to either side of the latency found that are fitted at first.
+        ticks: Ticks on either side of the estimate that are fitted first.
         iterations: Most iterations of each fit.
-        contact_ticks: The same where feet touch the floor: a tick's fit costs ten times as much there,
-        contact_iterations: but starts from fitted states.
-        hopeless: A tick whose cost would be so many times the noise's above the least is not fitted: ten
-            standard deviations, as far as a kink is known to shift the least.
-        worse: Whole ticks that all cost this much more than the free latency did not converge: the free one
-            is kept.
+        contact_ticks: The same with feet on the floor, where a fit costs ten times as much.
+        contact_iterations: Likewise; these fits begin at fitted states.
+        hopeless: Predicted cost above the least at which a tick is not fitted [noise variances]: ten standard
+            deviations, the largest known shift by a kink.
+        worse: Cost above that of the free latency at which whole ticks have not converged; then the free
+            latency is kept.
         most: Most ticks.
     """
 
@@ -57,7 +57,7 @@ SCAN = ScanSettings()
 
 @dataclass(frozen=True, slots=True)
 class LatencyScan:
-    """What the refinement finds at whole device ticks of latency.
+    """Refinements at whole device ticks of latency.
 
     Attributes:
         ticks: Latencies [device ticks], (L,).
@@ -74,7 +74,7 @@ class LatencyScan:
 
     @property
     def weights(self) -> FloatArray:
-        """How plausible each latency is, (L,); sums to 1."""
+        """Probability of each latency, (L,); sums to 1."""
         cost = np.array([p.normal.cost for p in self.refined])
         scale = max(1.0, self.refined[self.best].chi2)
         weight = np.exp(-0.5 * (cost - cost.min()) / scale)
@@ -86,10 +86,10 @@ class LatencyScan:
 
 
 def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback | None) -> LatencyScan:
-    """Refine again at the whole device ticks around the latency found.
+    """Refine again at the whole device ticks around the estimated latency.
 
-    The device acts on period boundaries, so its latency is a whole number of ticks; knowing that sharpens the
-    other parameters, and the ticks that remain plausible say how much.
+    The device acts on period boundaries, so its latency is a whole number of ticks. Knowing that sharpens the
+    other parameters; the ticks that remain plausible show by how much.
     """
     tick = problem.episodes[0].step_s
     centre = round(refined.latency_s / tick)
@@ -99,13 +99,13 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
     if contacts:
         reach, iterations = SCAN.contact_ticks, SCAN.contact_iterations
     if not contacts:
-        # In a smooth problem the curvature says how far off a tick is worth a fit.
+        # In a smooth problem the curvature shows up to which distance a tick is worth a fit.
         worth_s = np.sqrt(SCAN.hopeless * max(1.0, refined.chi2) * _latency_variance(refined))
         low = max(low, min(math.ceil((refined.latency_s - worth_s) / tick), centre))
         high = min(high, max(math.floor((refined.latency_s + worth_s) / tick), centre))
     found: dict[int, Refined] = {}
     if problem.noise_free:
-        # That refinement was at a whole tick, with more iterations than are spent on its neighbours.
+        # The given refinement is at a whole tick, with more iterations than its neighbours get.
         found[centre] = refined
     waiting = [t for t in range(centre - reach, centre + reach + 1) if low <= t <= high and t not in found]
     while waiting and len(found) < SCAN.most:
@@ -120,7 +120,7 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
             )
         best = min(found, key=lambda tick: found[tick].normal.cost)
         if not waiting:
-            # The least must lie inside what was scanned, or it is not known to be one.
+            # A minimum must have neighbours on both sides.
             waiting = [t for t in (best - 1, best + 1) if low <= t <= high and t not in found]
     ticks = tuple(sorted(found))
     return LatencyScan(ticks, tuple(found[t] for t in ticks))
@@ -145,7 +145,7 @@ def _at_latency(refined: Refined, latency_s: float) -> Point:
 
 
 def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:
-    """Widen the best latency's statement by what the other plausible latencies would say."""
+    """Widen the uncertainty at the best latency by the spread over the plausible latencies."""
     space, tick = problem.space, problem.episodes[0].step_s
     center = space.to_scale(scan.refined[scan.best].theta)
     covariance = np.zeros_like(best.covariance)
@@ -154,7 +154,7 @@ def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertai
         covariance += weight * (best.covariance + np.outer(shift, shift))
     ticks = np.array(scan.ticks)
     spread = float(np.sqrt(np.sum(scan.weights * (ticks - ticks[scan.best]) ** 2)))
-    # A tick is decided or not: half a tick is the least that rounding leaves open.
+    # A tick is decided or not: rounding leaves at least half a tick open.
     half = max(Z90 * spread, 0.5) * tick
     latency = scan.refined[scan.best].latency_s
     low, high = problem.latency_range_s
@@ -171,10 +171,10 @@ class StepSettings:
     """Settings of :func:`check_step`.
 
     Attributes:
-        clearly: Chi-square by which one step must explain the recordings better than the other [-]. Where the
-            finer step is in truth d standard deviations worse the difference is -d^2 with a spread of 2 d,
-            so by chance it is above 4 in at most 2.3 % of recordings, whatever d is.
-        most_steps: More physics steps than this are not spent on the comparison.
+        clearly: Chi-square difference that decides between two steps [-]. If the finer step is in truth d
+            standard deviations worse, the difference is -d^2 with a spread of 2 d. So by chance it is above 4
+            in at most 2.3 % of recordings, for any d.
+        most_steps: Most physics steps of the comparison.
     """
 
     clearly: float = 4.0
@@ -186,12 +186,12 @@ STEP = StepSettings()
 
 @dataclass(frozen=True, slots=True)
 class StepCheck:
-    """What half the physics step says.
+    """Result of a comparison with half the physics step.
 
     Attributes:
         step_s: The model's physics step [s].
-        bias: By how much the step moves each parameter, in its own scale, and the latency [s], (K + 1,).
-        gain: By how much less chi-square half the step leaves; negative where it leaves more.
+        bias: Shift by the step of each parameter, in its own scale, and of the latency [s], (K + 1,).
+        gain: Decrease of chi-square with half the step; negative for an increase.
         note: Why nothing was compared.
     """
 
@@ -202,12 +202,12 @@ class StepCheck:
 
     @property
     def rejected(self) -> bool:
-        """Whether the recordings speak against the finer step, as simulated ones do."""
+        """Whether the recordings contradict the finer step, as simulated ones do."""
         return self.gain < -STEP.clearly
 
     @property
     def preferred(self) -> bool:
-        """Whether the recordings ask for the finer step."""
+        """Whether the recordings prefer the finer step."""
         return self.gain > STEP.clearly
 
     def to_json(self) -> dict[str, Any]:
@@ -218,21 +218,14 @@ class StepCheck:
 
 
 def check_step(problem: Problem, refined: Refined, settings: StepSettings | None = None) -> StepCheck:
-    """Compare predictions with the model's step and with half of it.
-
-    Args:
-        problem: Recordings and simulator.
-        refined: Where the fit ended, with linearised residuals.
-        settings: What it may cost.
-    """
+    """Compare predictions with the model's step and with half of it; the fit has linearised residuals."""
     step_s, K = problem.robot.step_s, len(problem.space)
     nothing = np.zeros(K + 1)
     if problem.robot.base is not None:
-        # Feet that touch at another moment change a prediction more than the step's error does.
+        # A contact at another moment changes a prediction more than the step's error does.
         return StepCheck(step_s, nothing, note="not compared for robots in contact")
     shooting, rows = refined.shooting, refined.normal.rows
-    samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
-    steps = 3.0 * samples * problem.episodes[0].step_s / step_s
+    steps = 3.0 * shooting.device_periods * problem.episodes[0].step_s / step_s
     if steps > (settings or STEP).most_steps:
         return StepCheck(step_s, nothing, note=f"not compared: it would take {steps:.1g} physics steps")
     finer = Shooting(halved(problem), shooting.length, data=shooting.data)
@@ -243,7 +236,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
     width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
     belief = refined.normal.prior + 12.0 / width**2
     if problem.fixed_latency_s is not None:
-        # A latency that is given takes nothing of the step's error.
+        # A given latency takes no part of the step's error.
         belief[-1] = np.inf
     cost, where = _refitted(rows, belief)
     finer_cost, finer_where = _refitted(moved, belief)
@@ -252,14 +245,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
 
 
 def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: StepCheck) -> Uncertainty:
-    """Return what is known, intervals as much wider as the step moves their parameters.
-
-    Args:
-        problem: Says the range of the latency.
-        known: What was known before.
-        theta: The estimate, (K,).
-        found: What half the step says; nothing changes where the recordings speak against it.
-    """
+    """Return ``known`` with intervals widened by the step's shift, unless the recordings contradict it."""
     if found.note or found.rejected:
         return known
     std = np.sqrt(np.diag(known.covariance)) + np.abs(found.bias[:-1]) / Z90
@@ -272,13 +258,7 @@ def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: Step
 
 
 def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
-    """Return the alarm of a step that is too coarse; none where it is fine.
-
-    Args:
-        problem: Says the parameters' names.
-        known: What was known before the step was counted.
-        found: What half the step says.
-    """
+    """Return the alarm of a step that is too coarse, if it is; ``known`` is without the step's shift."""
     if found.note or not found.preferred:
         return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
@@ -289,8 +269,7 @@ def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[
     return (
         Alarm(
             f"With half the physics step ({500 * found.step_s:g} ms) the recordings are explained better "
-            "(chi-square "
-            f"{found.gain:.3g} lower), and these would leave their intervals: {listed(names)}.",
+            f"(chi-square {found.gain:.3g} lower), and these would leave their intervals: {listed(names)}.",
             f"A step of {1e3 * found.step_s:g} ms is too coarse: its error went into these values.",
             f"Calibrate with --physics-step {found.step_s / 2:g} or less, and train with that step.",
         ),
@@ -305,7 +284,7 @@ def halved(problem: Problem) -> Problem:
 
 
 def _shifted(rows: WindowRows, change: FloatArray) -> WindowRows:
-    """Return the rows with predictions changed, (W, H, M) whitened; what is known of start states stays."""
+    """Return the rows with changed predictions, (W, H, M) whitened; priors of start states stay."""
     residual = rows.residual.copy()
     residual[:, : change[0].size] += change.reshape(len(change), -1)
     return dataclasses.replace(rows, residual=residual)
@@ -314,12 +293,7 @@ def _shifted(rows: WindowRows, change: FloatArray) -> WindowRows:
 def _refitted(
     rows: tuple[WindowRows, ...] | list[WindowRows], belief: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return the cost that a linear refit leaves, and the step to it, (K + 1,).
-
-    Args:
-        rows: Linearised residuals.
-        belief: What is known of parameters and latency without the data, (K + 1,).
-    """
+    """Return the cost after a linear refit, and its step, (K + 1,); ``belief`` is the prior information."""
     P = len(belief)
     cost, gradient, hessian = 0.0, np.zeros(P), np.diag(belief)
     for one in rows:

@@ -1,9 +1,8 @@
-"""Search alone, or search and refinement? Decided on inner folds of the fitted data, on nothing else.
+"""Cross-validation: search alone, or search and refinement? Decided on inner folds of the fitted data only.
 
-Where the model is right the refinement is nearer the truth. Where it is wrong it fits what the model lacks
-with parameters that have no part in it, and a search that stopped early may predict other motion better. So
-each fold's part is left out, both are fitted to the rest, and what predicts the left-out part better is
-taken.
+Where the model is right, the refinement is nearer the truth. Where it is wrong, the refinement fits model
+error with unrelated parameters, and a search that stopped early may predict other motion better. So each fold
+is left out, both are fitted to the rest, and the better predictor of the fold is taken.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ class CrossValidationSettings:
     """Settings of :func:`choose`.
 
     Attributes:
-        folds: Each costs a search and a refinement.
+        folds: Number of folds; each costs a search and a refinement.
         blocks: Stretches of each recording that a fold leaves out.
-        most_steps: More physics steps than this are not spent on folds.
+        most_steps: Most physics steps of all folds.
     """
 
     folds: int = 2
@@ -47,14 +46,14 @@ Member = tuple[FloatArray, float]
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What the folds say.
+    """Result of cross-validation.
 
     Attributes:
         chosen: Name of the candidate.
         errors: Error of each candidate in each fold: root mean squared prediction error in units of the
             sensor's noise.
-        window_s: Predictions restart this often [s].
-        steps: Physics steps it cost.
+        window_s: Length of the predictions [s].
+        steps: Physics steps used.
         note: Why nothing was compared.
     """
 
@@ -85,16 +84,10 @@ def choose(
     search_steps: int,
     robust: bool = False,
 ) -> Choice:
-    """Fit every candidate to the data without each fold and compare what they predict of it.
+    """Fit every candidate without each fold and compare the predictions of that fold.
 
-    Args:
-        problem: The problem, with the data to fit; held-out recordings are not among them.
-        search: The search.
-        budget: What it may use in each fold.
-        seed: Seeds the folds' searches.
-        length: Samples that are predicted at a time.
-        search_steps: What the search of all data cost [physics steps].
-        robust: Try the robust refinement, too.
+    The search on all data cost ``search_steps`` physics steps. Predictions have ``length`` samples.
+    ``robust`` adds the robust refinement.
     """
     window_s = length * problem.episodes[0].period_s
     if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
@@ -130,15 +123,15 @@ def on_folds(
     usual: str,
     window_s: float,
 ) -> Choice:
-    """Fit every candidate to the data without each fold and compare what they predict of it.
+    """Fit every candidate without each fold and compare the predictions of that fold.
 
     Args:
-        problem: All data that are fitted.
-        masks: For each fold which samples of each recording it leaves out, (T,) each.
+        problem: All fitted data.
+        masks: For each fold the samples of each recording that it leaves out, (T,) each.
         fits: Makes all candidates from a fold's data and its number.
-        errors: Returns what each candidate's prediction of a part is off, (N,).
-        usual: Name of the candidate that is taken where nothing is better or no fold can be fitted.
-        window_s: Predictions restart this often [s].
+        errors: Returns each candidate's prediction error on a part, (N,).
+        usual: Name of the candidate to take where nothing is better or no fold can be fitted.
+        window_s: Length of the predictions [s].
     """
     found: dict[str, list[float]] = {}
     for fold, left_out in enumerate(masks):
@@ -155,15 +148,11 @@ def on_folds(
 
 
 def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.NDArray[np.bool_]]]:
-    """Return for each fold which samples of each recording it leaves out, (T,) each.
+    """Return for each of ``count`` folds the samples of each recording that it leaves out, (T,) each.
 
-    Where there are as many motions as folds, whole motions are left out, every other one: other motion is
-    what a calibration is for. The stretches of a single motion are left out likewise. A single recording is
-    divided into blocks, so that all phases of the motion are on both sides.
-
-    Args:
-        problem: The problem.
-        count: Folds.
+    With enough motions, whole motions are left out in turn: a calibration must predict other motion. The
+    stretches of a single motion are left out likewise. A single recording is divided into blocks, so that all
+    phases of the motion are on both sides.
     """
     episodes = problem.episodes
     unit = motion_numbers(episodes)
@@ -179,14 +168,10 @@ def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.N
 
 
 def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]]:
-    """Return for each fold which samples of each recording it leaves out, (T,) each: one stretch of time.
+    """Return for each of ``count`` folds the samples that it leaves out, (T,) each: one stretch of time.
 
-    Blocks of both sides that take turns share whatever drifts (a gear that warms up), and a fit that follows
-    the drift predicts them well. What a calibration is for comes later.
-
-    Args:
-        problem: The problem.
-        count: Folds.
+    Alternating blocks share any drift (a gear that warms up), so a fit that follows the drift predicts them
+    well. The use of a calibration comes later in time.
     """
     lengths = [len(episode.sample) for episode in problem.episodes]
     fold = np.arange(sum(lengths)) * count // sum(lengths)
@@ -195,7 +180,7 @@ def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]
 
 
 def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:
-    """Return which motion each episode is of, counted from 0: stretches of one follow each other."""
+    """Return the number of each episode's motion, from 0; stretches of one motion follow each other."""
     number, found = -1, []
     last: tuple[int, int] | None = None
     for episode in episodes:
@@ -210,10 +195,7 @@ def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:
 def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]], length: int) -> FloatArray:
     """Return the root mean squared prediction error of each candidate in units of the sensor's noise, (N,).
 
-    Args:
-        problem: Recordings to predict from their smoothed states.
-        fits: Parameters, (K,), and latency [s] of each candidate.
-        length: Samples that are predicted at a time; fewer where no stretch is so long.
+    Predictions start from smoothed states and have ``length`` samples, or fewer where no stretch is so long.
     """
     theta, latency = np.stack([f[0] for f in fits]), np.array([f[1] for f in fits])
     total, count = np.zeros(len(fits)), 0
@@ -228,7 +210,7 @@ def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]],
     for data in windows:
         observed = problem.predict(theta, np.maximum(latency, 0.0), data).observed
         error = (observed - data.measured) / data.std
-        # A diverged member is as wrong as the whole range.
+        # A diverged member counts as an error of the whole range.
         span = np.ptp(data.measured, axis=(0, 1)) / data.std
         total += np.sum(np.where(np.isfinite(error), error, span) ** 2, axis=(1, 2, 3))
         count += int(np.count_nonzero(np.isfinite(data.std)))

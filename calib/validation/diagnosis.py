@@ -1,10 +1,10 @@
-"""What an unexplained residual looks like, and what to mend next: chosen on motion that was not fitted.
+"""Causes of an unexplained residual and the next repair, chosen on motion that was not fitted.
 
-Three kinds of evidence, one statistic. Play in the gears is a candidate model of its own: refitted on a part
-of the recordings, it predicts the rest. Other causes have signatures, which a regression adds to the
-parameters: found on some windows, they predict the others. A delay that varies at random predicts no sample,
-but it says where the residual is large: a process driven by it is held against one that pushes all the same.
-The statistic is the held-out deviance, twice the logarithm of the likelihood ratio, noise level estimated.
+Three kinds of evidence use one statistic. Play in the gears is a candidate model: refitted on a part of the
+recordings, it predicts the rest. Other causes have signatures, which a regression adds to the parameters:
+fitted on some windows, they predict the others. A random delay predicts no sample, but where the residual is
+large: it is compared with a random force of constant size. The statistic is the held-out deviance: twice the
+logarithm of the likelihood ratio, with an estimated noise level.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ class DiagnosisSettings:
     """Settings of :func:`diagnose`.
 
     Attributes:
-        evidence: Held-out deviance that a cause must gain to be named [-]: 20 is odds of 22,000 to 1.
-        noticed: It must explain this share of the held-out squared residual, too [-].
-        most: Most causes that are named.
-        alike: Bodies are named whose mass explains at least this share of what the best one's does [-].
-        decisive: Play that explains this share says what else there is only once it is mended [-].
-        most_play: Widest play that is tried, as a share of what the commands span [-].
-        least_play: Joints are named whose play is at least this share of the widest one [-].
+        evidence: Least gain in held-out deviance of a named cause [-]: 20 is odds of 22,000 to 1.
+        noticed: Least share of the held-out squared residual that it explains [-].
+        most: Most named causes.
+        alike: Least explained share of a named body's mass, relative to the best one's [-].
+        decisive: Share explained by play from which other causes are searched only after its repair [-].
+        most_play: Widest play, as a share of the commands' span [-].
+        least_play: Least play of a named joint, as a share of the widest one [-].
         play_s: Windows of the candidate with play [s].
         parameter_prior: Spread of parameters in the regression, as a share of their range [-].
         latency_prior_s: The same of the latency [s].
-        burst_part: Bursts are where so small a part of the time
-        burst_share: holds so much of the residual, [-] both,
-        burst_kurtosis: and its kurtosis is that high (noise: 3).
-        burst_size: A burst's squared residual over the median's [-].
+        burst_part: Bursts occupy at most this part of the time [-],
+        burst_share: hold at least this share of the squared residual [-],
+        burst_kurtosis: and have at least this kurtosis (noise: 3).
+        burst_size: Least squared residual of a burst over the median [-].
     """
 
     evidence: float = 20.0
@@ -77,7 +77,7 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     "backlash": (
         "play in the gear",
         "The joint does not follow its motor at once when the motor turns back.",
-        "Mend the gear of {}, or free servo_play there in the parameters.",
+        "Repair the gear of {}, or free servo_play there in the parameters.",
     ),
     "delay": (
         "a timing error that changes",
@@ -87,7 +87,7 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     "damping": (
         "a force that grows with speed",
         "Damping was not free, or follows another law (the square of speed).",
-        "Free dof_damping or servo_damping of {}; if they are free, doubt the law.",
+        "Free dof_damping or servo_damping of {}; if they are free already, check the law.",
     ),
     "inertia": (
         "a force in proportion to acceleration",
@@ -110,19 +110,19 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
         "Leave out {}.",
     ),
 }
-"""What each cause looks like, what it means, and what to do about it, {} being where."""
+"""For each cause: how the residual looks, what it means, and what to do, with {} for the place."""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """One cause that the residual looks like.
+    """One cause of the residual.
 
     Attributes:
-        cause: Which.
+        cause: The cause.
         share: Share of the held-out squared residual that it explains.
-        deviance: Held-out deviance that it gains.
-        joints: Joints or bodies that show it most, most first.
-        alarm: For people.
+        deviance: Gain in held-out deviance.
+        joints: Joints or bodies that show it, strongest first.
+        alarm: The alarm for the user.
     """
 
     cause: Cause
@@ -134,14 +134,14 @@ class Diagnosis:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a residual is judged by.
+    """Evidence for a diagnosis.
 
     Attributes:
         rows: Linearised residuals, per episode.
         prior: Information on the parameters and the latency, (P,).
-        found: What causes would do.
-        answers: How the windows answer to commands, per episode; none where that is not known.
-        period_s: Time from sample to sample [s].
+        found: Signatures of the causes.
+        answers: Responses of the windows to commands, per episode; empty if unknown.
+        period_s: Sampling period [s].
         time_s: Time of each sample in its recording, per episode (W, H) [s].
     """
 
@@ -154,12 +154,7 @@ class Evidence:
 
 
 def diagnose(problem: Problem, refined: Refined) -> tuple[Diagnosis, ...]:
-    """Return what the residual of a fit looks like, best supported first.
-
-    Args:
-        problem: The problem.
-        refined: Where the fit ended, with linearised residuals.
-    """
+    """Return the causes of a fit's residual, best supported first; the fit has linearised residuals."""
     play = find_play(problem, refined)
     if play is not None and play.share >= SETTINGS.decisive:
         return (play,)
@@ -168,10 +163,10 @@ def diagnose(problem: Problem, refined: Refined) -> tuple[Diagnosis, ...]:
 
 
 def evidence(problem: Problem, refined: Refined) -> Evidence:
-    """Return what the residual of a fit is judged by; see :func:`diagnose`."""
+    """Return the evidence for :func:`diagnose`."""
     space, data = problem.space, refined.shooting.data
     width = np.append(SETTINGS.parameter_prior * space.width, SETTINGS.latency_prior_s)
-    # A parameter at the end of its range explains no more.
+    # A parameter at the end of its range cannot explain more.
     free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
     episodes = [problem.episodes[d.episode] for d in data]
     return Evidence(
@@ -188,13 +183,9 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
 
 
 def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
-    """Fit a model with play in every gear to a part of the recordings; return what it says of the rest.
+    """Fit a model with play in every gear to a part of the recordings, and compare predictions of the rest.
 
-    The model without has seen all of them.
-
-    Args:
-        problem: The problem.
-        refined: Where its fit ended.
+    The fit without play, ``refined``, has used all recordings.
     """
     description, names = problem.robot.description, problem.robot.actuator_names
     known = any(p.kind == "servo_play" for p in problem.space.parameters)
@@ -249,7 +240,7 @@ def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
 
 
 def name_causes(known: Evidence) -> list[Diagnosis]:
-    """Return the causes that evidence supports, the best first, each beside those before it."""
+    """Return the causes that evidence supports, best first; each is tested together with those before it."""
     left = _Left.of(known)
     found: list[Diagnosis] = []
     taken: list[Signature] = []
@@ -260,7 +251,7 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
         share = 1 - float(np.exp(-max(gains) / left.count))
         if max(gains) <= SETTINGS.evidence or share <= SETTINGS.noticed:
             break
-        found.append(_told(left, taken, group, share, max(gains)))
+        found.append(_cause_diagnosis(left, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
     varying = _varying_delay(known)
@@ -273,7 +264,7 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
 
 
 def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
-    """Return what is added at a time: a cause at all joints, or the mass of one body."""
+    """Return the units of the selection: a cause at all joints, or the mass of one body."""
     causes = dict.fromkeys(s.cause for s in found if s.cause != "mass")
     return [
         *([s for s in found if s.cause == cause] for cause in causes),
@@ -291,26 +282,26 @@ def _finding(
     return Diagnosis(cause, float(share), float(deviance), tuple(joints), alarm)
 
 
-def _told(
+def _cause_diagnosis(
     left: _Left, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
 ) -> Diagnosis:
     cause = group[0].cause
     if cause == "mass":
-        return _told_mass(left, taken, share, deviance)
+        return _mass_diagnosis(left, taken, share, deviance)
     gains = np.array([left.gain(taken, [signature]) for signature in group])
     order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
     joints = [group[k].where for k in order[:4]]
     return _finding(cause, share, deviance, joints, listed(joints))
 
 
-def _told_mass(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
-    """Name each body that explains about as much: without a known torque motion shows ratios of masses."""
+def _mass_diagnosis(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
+    """Name each body that explains about as much: without a known torque, motion shows mass ratios only."""
     bodies = [s for s in left.known.found if s.cause == "mass"]
     gains = {k: left.gain(taken, [body]) for k, body in enumerate(bodies)}
     alike = sorted(
         (k for k, gain in gains.items() if gain >= SETTINGS.alike * deviance), key=lambda k: -gains[k]
     )
-    # The signature is a change per share of the mass, and the residual is prediction minus measurement.
+    # The signature is a change per share of the mass; the residual is prediction minus measurement.
     change = {k: -float(left.coefficients([*taken, bodies[k]])[-1]) for k in alike}
     ways = [
         f"{bodies[k].where} {100 * abs(change[k]):.2g} % {'heavier' if change[k] > 0 else 'lighter'}"
@@ -326,14 +317,14 @@ def _told_mass(left: _Left, taken: Sequence[Signature], share: float, deviance: 
 
 @dataclass(frozen=True, slots=True)
 class _Left:
-    """Residuals and their derivatives without what start states can do of either.
+    """Residuals and their derivatives, both without their projection on the start states.
 
     Attributes:
         known: The evidence.
-        effective: Derivatives by parameters while start states follow, (W, R, P) an episode.
-        normal: Start states' normal matrices, (W, S, S) an episode.
-        rest: The residual without what start states explain, (W, R) an episode.
-        columns: The same of each signature, by its identity.
+        effective: Derivatives by parameters with following start states, (W, R, P) per episode.
+        normal: Start states' normal matrices, (W, S, S) per episode.
+        rest: The residual, (W, R) per episode.
+        columns: Each signature's columns, by its identity.
     """
 
     known: Evidence
@@ -344,7 +335,7 @@ class _Left:
 
     @classmethod
     def of(cls, known: Evidence) -> _Left:
-        """Take start states out of the evidence."""
+        """Remove the start states from the evidence."""
         both = [eliminated(rows) for rows in known.rows]
         rest = [
             without_starts(rows.start, normal, rows.residual[..., None])[..., 0]
@@ -363,7 +354,7 @@ class _Left:
         return left
 
     def design(self, taken: Sequence[Signature]) -> list[FloatArray]:
-        """Return derivatives by the parameters and by signatures, (W, R, P + n) an episode."""
+        """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
         columns = [self.columns[id(s)] for s in taken]
         return [np.concatenate(parts, axis=2) for parts in zip(self.effective, *columns, strict=True)]
 
@@ -385,7 +376,7 @@ class _Left:
         return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
 
     def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
-        """Return what parameters and signatures leave, (W, R) an episode."""
+        """Return the residual after the regression, (W, R) per episode."""
         found = self.coefficients(taken)
         return [r - x @ found for x, r in zip(self.design(taken), self.rest, strict=True)]
 
@@ -395,7 +386,7 @@ class _Left:
         return sum(r.size - len(r) * n.shape[1] for r, n in zip(self.rest, self.normal, strict=True))
 
     def held_out(self, taken: Sequence[Signature]) -> float:
-        """Return the cost of each fold's windows, parameters and signatures fitted to the others, in all."""
+        """Return the total cost of each fold's windows with the regression fitted to the others."""
         matrix, vector, squares, prior = self._normal(taken)
         fold = FOLDS.of(len(squares))
         cost = 0.0
@@ -407,24 +398,24 @@ class _Left:
         return cost
 
     def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
-        """Return the held-out deviance that more signatures gain beside those taken."""
+        """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
 def _varying_delay(known: Evidence) -> Diagnosis | None:
-    """Return whether each command seems to act late by another time; see :mod:`.random_delay`."""
+    """Return whether each command seems to have its own delay; see :mod:`.random_delay`."""
     found = random_delay(known.rows, known.answers, known.period_s)
     if found is None or not (found.gain > SETTINGS.evidence and found.share > SETTINGS.noticed):
         return None
     seen = (
         f"{100 * found.share:.2g} % of the squared residual comes where commands change fast, as if each "
-        f"acted late by another time (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
+        f"had its own delay (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
     )
     return _finding("delay", found.share, found.deviance, (), "", seen)
 
 
 def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None:
-    """Return whether the residual comes in bursts, and when; None where it does not."""
+    """Return when the residual comes in bursts; None where it does not."""
     power: list[FloatArray] = []
     values: list[FloatArray] = []
     for time_s, rows in zip(known.time_s, residual, strict=True):

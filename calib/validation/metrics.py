@@ -1,4 +1,4 @@
-"""How good a calibration is: on motion that it has not seen, and against a truth that only a bench knows."""
+"""Quality of a calibration: on unseen motion, and against a truth that only a bench knows."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from deal_hw.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldoutErrors:
-    """Errors of open-loop predictions, by predictor.
+    """Errors of predictions from the measured state, by predictor.
 
     Attributes:
         names: The n measured coordinates.
-        window_s: Predictions restarted from the measured state this often [s].
+        window_s: Length of the predictions [s].
         nrmse: Root mean square error over the signal's range, mean over the coordinates.
         rmse: Root mean square errors of the coordinates, (n,) [rad or m]; infinite where it diverged.
         units: Unit of each coordinate, (n,).
         span: Range of each coordinate's signal, (n,) [rad or m].
-        noise: Root mean square of the sensor's noise, estimated from the recordings, (n,) [rad or m]: no
-            prediction of what was measured errs by less. NaN where the states are known without noise.
+        noise: Root mean square of the sensor's noise, estimated from the recordings, (n,) [rad or m]: a lower
+            bound of the error. NaN for noise-free states.
     """
 
     names: tuple[str, ...]
@@ -74,16 +74,16 @@ def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
 
 
 class HeldOut:
-    """Recordings that no search has seen: what each candidate predicts of them is simulated once.
+    """Held-out recordings; each candidate is simulated once.
 
     Args:
         robot: The robot's model.
         space: The parameters.
         episodes: The recordings.
-        window_s: Predictions restart from the smoothed reported state this often [s].
+        window_s: Length of the predictions, each from the smoothed reported state [s].
         threads: Simulation threads.
         truth: Noise-free positions at the episodes' samples, (T, n) each in the order of the measured
-            coordinates, where there are any; else the reported ones are what is predicted.
+            coordinates; None to predict the reported ones.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -120,11 +120,7 @@ class HeldOut:
         self._simulate({None: None})
 
     def errors(self, candidates: Mapping[str, tuple[FloatArray, float]]) -> HeldoutErrors:
-        """Return the errors of candidates and of "null".
-
-        Args:
-            candidates: Name to physical parameters, (K,), and latency [s].
-        """
+        """Return the errors of candidates (parameters, (K,), and latency [s], by name) and of "null"."""
         keys: dict[str, tuple[bytes, float] | None] = {
             name: (np.asarray(theta, dtype=np.float64).tobytes(), latency_s)
             for name, (theta, latency_s) in candidates.items()
@@ -145,7 +141,7 @@ class HeldOut:
         )
 
     def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:
-        """Keep root mean squares, (n,), of all samples, and of those that were reported."""
+        """Store root mean squares, (n,), of all samples, and of the reported ones."""
         given = [fit for fit in fits.values() if fit is not None]
         squares, counts = np.zeros((2, len(fits), len(self._columns))), np.zeros(2)
         for data, reference, span in zip(self._windows, self._references, self._spans, strict=True):
@@ -155,7 +151,7 @@ class HeldOut:
                 predicted = self.problem.predict(theta, latency, data).position[..., self._columns]
             else:
                 predicted = _still(self.problem, data)[None, ..., self._columns]
-            # A diverged member is as wrong as the whole range.
+            # A diverged member counts as an error of the whole range.
             error = np.where(np.isfinite(predicted), predicted - reference[sample], span)
             squares[0] += np.sum(error**2, axis=(1, 2))
             counts[0] += sample.size
@@ -168,7 +164,7 @@ class HeldOut:
 
 
 def _still(problem: Problem, data: WindowData) -> FloatArray:
-    """Return positions where nothing moves, (W, H, C): a base's chart moves, its orientation does not."""
+    """Return constant poses, (W, H, C): a base's reference moves, its orientation does not."""
     sample = data.windows.samples()
     still = np.repeat(data.start_position[:, None], sample.shape[1], axis=1)
     charts = problem.episodes[data.episode].reference
@@ -182,14 +178,10 @@ def _still(problem: Problem, data: WindowData) -> FloatArray:
 def signal_range(
     episode: SampledEpisode, values: FloatArray, columns: IntArray, rotation: slice
 ) -> FloatArray:
-    """Return the range that each measured coordinate covers in a recording, (n,).
+    """Return the range of each measured coordinate in a recording, (n,), from its values, (T, n).
 
-    Args:
-        episode: The recording.
-        values: The coordinates' values, (T, n).
-        columns: Which coordinates they are, (n,).
-        rotation: Which coordinates are a base's rotation vector: their charts move with the base, so their
-            range is that of the whole turn from the first orientation.
+    The reference of a base's rotation vector moves with the base, so its range is that of the turn from the
+    first orientation.
     """
     span = np.ptp(values, axis=0)
     if episode.reference is not None:
@@ -206,13 +198,13 @@ def error_percent(theta: FloatArray, truth: FloatArray) -> float:
 
 
 def log_error_x100(theta: FloatArray, truth: FloatArray) -> float:
-    """Return 100 times the mean |ln(p / p*)|: symmetric, so that no side of the truth is cheaper."""
+    """Return 100 times the mean |ln(p / p*)|, which is symmetric around the truth."""
     return float(100.0 * np.mean(np.abs(np.log(theta / truth))))
 
 
 @dataclass(frozen=True, slots=True)
 class IntervalScore:
-    """How good 90 % intervals are.
+    """Quality of 90 % intervals.
 
     Attributes:
         coverage90: Share of parameters whose interval holds the truth.
@@ -242,8 +234,8 @@ def fisher_std(
 ) -> FloatArray:
     """Return the standard deviations of the Fisher bound at the truth, in each parameter's own scale, (K,).
 
-    The bound of the same windows with the same unknowns (start states and latency) under the true noise, with
-    the range as a prior, as the intervals have it.
+    The bound has the same windows, unknowns (start states and latency) and range prior as the intervals, but
+    the true noise.
 
     Args:
         problem: The recordings and the simulator.
@@ -251,11 +243,11 @@ def fisher_std(
         latency_s: True latency [s].
         states: True positions and velocities at the samples of each episode, (T, J) each.
         noise_std: True standard deviation of the measured channels, (M,).
-        length: Samples a window predicts.
+        length: Samples of a window.
     """
     shooting = Shooting(problem, length)
     hessian = shooting.normal(shooting.start(theta, latency_s, list(states))).hessian
-    # The problem whitens by the noise it estimated, the bound is that of the true noise.
+    # The problem whitens by estimated noise, the bound uses the true noise.
     estimated = problem.noise_std[problem.channels]
     ratio = float(np.mean((estimated / np.maximum(noise_std, estimated * 1e-3)) ** 2))
     low, high = problem.latency_range_s

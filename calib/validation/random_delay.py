@@ -1,9 +1,9 @@
-"""Does each command act late by another time? Asked of what is left of a fit.
+"""Test for a random delay of each command, on the residual of a fit.
 
-Random delays predict no sample, but they say where the residual is large: each pushes in proportion to what
-its command changed. Held against that are random forces that push all the same, white or slow, which is what
-anything else looks like that a model lacks. All are Gaussian processes beside white noise; what decides is
-the likelihood of windows that were left out.
+Random delays predict no sample, but they predict where the residual is large: each pushes in proportion to
+the change of its command. The alternative is a random force of constant size, white or slow, which is how any
+other model error looks. All are Gaussian processes beside white noise. The likelihood of left-out windows
+decides.
 """
 
 from __future__ import annotations
@@ -26,9 +26,8 @@ class Folds:
     """Windows that are left out in turn.
 
     Attributes:
-        parts: In so many turns.
-        rounds: Each turn leaves out so many stretches of windows that follow each other; one where there are
-            too few windows for more.
+        parts: Number of turns.
+        rounds: Stretches of consecutive windows that each turn leaves out; one where windows are too few.
     """
 
     parts: int = 4
@@ -48,10 +47,10 @@ class RandomDelaySettings:
     """Settings of :func:`random_delay`.
 
     Attributes:
-        windows: Windows that are compared, spread over the recordings.
-        rows: Residuals of each, from its start, that are.
+        windows: Number of windows, spread over the recordings.
+        rows: Residuals of each window, from its start.
         slow_s: Correlation time of the slow force [s].
-        most: Greatest variance of a process over that of the noise, and least inverse, as a logarithm [-].
+        most: Largest absolute log ratio of the variances of process and noise [-].
     """
 
     windows: int = 60
@@ -68,10 +67,10 @@ class RandomDelay:
     """How well random delays explain a residual.
 
     Attributes:
-        deviance: Held-out deviance that they gain over white noise.
+        deviance: Gain in held-out deviance over white noise.
         gain: The same over the best of all other processes.
-        share: Share of the residual's variance that they make.
-        std_s: Their standard deviation [s].
+        share: Share of the residual's variance.
+        std_s: Standard deviation of the delays [s].
     """
 
     deviance: float
@@ -83,12 +82,9 @@ class RandomDelay:
 def random_delay(
     rows: Sequence[WindowRows], answers: Sequence[SignatureResponse], period_s: float
 ) -> RandomDelay | None:
-    """Hold random delays against other processes; None where there is nothing to compare.
+    """Compare random delays with other processes; None where there is nothing to compare.
 
-    Args:
-        rows: Linearised residuals, per episode.
-        answers: How the windows answer to commands, per episode.
-        period_s: Time from sample to sample [s].
+    Residuals and the windows' responses to commands are given per episode.
     """
     every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
     chosen = every[:: max(-(-len(every) // SETTINGS.windows), 1)]
@@ -97,7 +93,7 @@ def random_delay(
     windows = [_Window.of(rows[e], answers[e], w) for e, w in chosen]
     change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])
     rms = np.sqrt(np.mean(change**2, axis=0))
-    # Without a process: noise alone.
+    # The process of power 0: noise alone.
     found = {"noise": _Process([0.0 * w.residual for w in windows], [w.residual**2 for w in windows])}
     found |= {
         "delay": _Process.of(windows, "delay", rms, period_s),
@@ -117,13 +113,13 @@ def random_delay(
 
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """The first residuals of a window without what its start state can do.
+    """The first residuals of a window without their projection on the start state.
 
     Attributes:
-        residual: In the directions that are left, (D,).
+        residual: In the remaining directions, (D,).
         basis: These directions, (H M, D).
-        response: Whitened answer to a set-point, (A, H, M).
-        change: What the set-points changed by, (H, A).
+        response: Whitened response to a set-point, (A, H, M).
+        change: Changes of the set-points, (H, A).
     """
 
     residual: FloatArray
@@ -135,7 +131,7 @@ class _Window:
     def of(cls, rows: WindowRows, answer: SignatureResponse, w: int) -> _Window:
         R, S, M = rows.residual.shape[1], rows.start.shape[2], answer.response.shape[3]
         H = min(answer.response.shape[2], max(SETTINGS.rows // M, 4))
-        # What is known of the start state comes last.
+        # The start state's prior comes last.
         kept = np.concatenate([np.arange(H * M), np.arange(R - S, R)])
         basis = np.linalg.qr(rows.start[w][kept], mode="complete")[0][:, S:] if S else np.eye(len(kept))
         residual = basis.T @ rows.residual[w][kept]
@@ -147,7 +143,7 @@ class _Process:
     """A random process beside white noise, along each window's own axes.
 
     Attributes:
-        power: Variance of the process of unit intensity along each axis, one array a window.
+        power: Variance of the process of unit intensity along each axis, one array per window.
         squares: The squared residual along it.
     """
 
@@ -162,7 +158,7 @@ class _Process:
         rms: FloatArray,
         period_s: float,
     ) -> _Process:
-        """Return the process of late commands, or that of forces as large as commands change, (A,) rms."""
+        """Return the process of late commands, or that of forces as large as command changes, (A,) rms."""
         power, squares = [], []
         for window in windows:
             A, H, M = window.response.shape
@@ -189,7 +185,7 @@ class _Process:
         return float(np.mean(np.concatenate(self.power)))
 
     def held_out(self) -> float:
-        """Return -2 log likelihood of windows, each time with what is most likely in the others."""
+        """Return -2 log likelihood of each fold's windows under the parameters most likely in the others."""
         fold = FOLDS.of(len(self.power))
         total = 0.0
         for k in range(FOLDS.parts):
@@ -200,7 +196,7 @@ class _Process:
         return total
 
     def fitted(self, windows: npt.NDArray[np.bool_]) -> tuple[float, float]:
-        """Return intensity over the noise's variance, and that variance, most likely in some windows."""
+        """Return the most likely ratio of intensity to noise variance, and that variance, in some windows."""
         power, squares = self._of(windows)
         scale = float(np.mean(power))
         if scale <= 0:

@@ -1,9 +1,10 @@
 """Errors that commands and measurements share: a sign, two joints' order, a unit, a scale, the clock.
 
-No comparison of the two channels shows them. What can is the model: gravity, what joints do to each other,
-and how fast masses move. So each error is undone in turn, and the model is fitted to recordings without it.
-The one that then predicts motion that no fit has seen, where the recordings as they are cannot be predicted,
-is named. Many cannot be told: parameters or a symmetry take them up.
+Comparing the two channels does not show them. The model can: by gravity, coupling between joints, and how
+fast masses move. So each error is undone in turn, and the model is fitted to the corrected recordings. An
+error is named if the corrected recordings are predicted well on unseen motion and the original ones are not.
+Many errors cannot be found: parameters or a symmetry compensate for them. Page 'Calibration' of the
+documentation lists them.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Kind = Literal["sign", "order", "clock", "unit", "scale"]
 
 DEGREES = 180 / math.pi
 UNITS = {"rad": (1 / DEGREES, "degrees", "deg"), "m": (1e-3, "millimetres", "mm")}
-"""What a value is multiplied by that was written in the unit named, and how a column map writes that unit."""
+"""Factor of a value that was written in the named unit, and that unit in a column map."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,17 +39,17 @@ class SharedErrorSettings:
     """Settings of :func:`find_shared_error`.
 
     Attributes:
-        factor: Clocks and positions are tried so many times as fast or large, and one part of that [-].
-        stretch_s: Recordings are divided into stretches of this length [s]: every other one is predicted,
-        part_s: and so much of them, evenly spread, is fitted and as much predicted [s].
+        factor: Clocks and positions are tried this factor faster or larger, and slower or smaller [-].
+        stretch_s: Recordings are divided into stretches of this length; every other one is predicted [s].
+        part_s: Length of data that is fitted, and that is predicted, evenly spread [s].
         window_s: Windows of the fits [s]; windows of other clocks have as many samples.
-        tried: So many candidates are fitted, those that the model's own values predict best.
+        tried: Number of candidates that are fitted: those that the nominal values predict best.
         iterations: Most steps of each fit.
-        evidence: Held-out deviance that a candidate must gain [-], as in the diagnosis,
-        decisive: and the share of the held-out squared residual that it must explain [-];
-        noticed: where it leaves nothing but noise, so much is enough [-].
-        alike: Candidates are named together whose held-out squared residual is within this factor of the
-            best one's [-].
+        evidence: Least gain in held-out deviance of a candidate [-], as in the diagnosis.
+        decisive: Least share of the held-out squared residual that it explains [-].
+        noticed: The same where only noise remains [-].
+        alike: Largest ratio of the held-out squared residual to the best one's for candidates that are named
+            together [-].
     """
 
     factor: float = 2.0
@@ -71,11 +72,11 @@ class SharedError:
     """An error that commands and measurements may share.
 
     Attributes:
-        kind: What is wrong.
-        joints: At which joints; none for the clock.
-        undo: What would mend the recordings.
+        kind: Kind of error.
+        joints: Affected joints; none for the clock.
+        undo: The correction of the recordings.
         words: The error, such as "positions of elbow were in degrees".
-        do: How to mend it.
+        do: How to correct it.
     """
 
     kind: Kind
@@ -87,14 +88,14 @@ class SharedError:
 
 @dataclass(frozen=True, slots=True)
 class FoundError:
-    """A shared error without which the recordings are predicted far better.
+    """A shared error whose correction improves predictions decisively.
 
     Attributes:
-        errors: The error, and those that predict as well.
-        chi2: Mean squared residual over the noise's without it, on motion that was not fitted.
-        before: The same of the recordings as they are.
-        deviance: Held-out deviance that undoing it gains.
-        test: The recordings as they are, on that motion.
+        errors: The error, and those whose correction predicts as well.
+        chi2: Mean squared residual over the noise variance after the correction, on unseen motion.
+        before: The same of the original recordings.
+        deviance: Gain in held-out deviance.
+        test: The original recordings of the unseen motion.
         length: Samples of a window.
     """
 
@@ -107,23 +108,18 @@ class FoundError:
 
     @property
     def alarm(self) -> Alarm:
-        """For people."""
+        """The alarm for the user."""
         words = ", or ".join(error.words for error in self.errors)
         before = f"instead of {self.before:.3g}" if np.isfinite(self.before) else "where it diverged before"
         return Alarm(
-            f"The recordings look as if {words}, in commands and measurements alike: mended, motion that was "
-            f"not fitted is predicted with chi2 {self.chi2:.3g} {before}.",
-            "The parameters would make up for that error; no comparison of the two channels shows it.",
+            f"The recordings look as if {words}, in commands and measurements alike. After this correction, "
+            f"motion that was not fitted is predicted with chi2 {self.chi2:.3g} {before}.",
+            "The parameters would compensate for this error. Comparing the two channels does not show it.",
             f"{' Or: '.join(error.do for error in self.errors)} Check it at the robot.",
         )
 
     def confirmed(self, theta: FloatArray, latency_s: float) -> bool:
-        """Return whether an estimate predicts the recordings as they are no better than that.
-
-        Args:
-            theta: Physical parameters, (K,).
-            latency_s: Total latency [s].
-        """
+        """Return whether an estimate predicts the original recordings no better, at a latency [s]."""
         chi2 = _predicted(self.test, theta, latency_s, self.length)
         return _decides(chi2, self.chi2, _samples(self.test, self.length))
 
@@ -138,11 +134,7 @@ class FoundError:
 
 
 def shared_errors(problem: Problem) -> Iterator[SharedError]:
-    """Yield the errors that a recording of a robot may have in both channels.
-
-    Args:
-        problem: The problem.
-    """
+    """Yield the errors that a robot's recordings may have in both channels."""
     facts = problem.robot.description
     names, units, J = facts.joint_names, facts.position_units, len(facts.joint_names)
     same = ChannelChange.none(J)
@@ -209,7 +201,7 @@ def shared_errors(problem: Problem) -> Iterator[SharedError]:
 
 
 def _where(names: Sequence[str], group: Sequence[int]) -> tuple[str, str, tuple[str, ...]]:
-    """Return whose positions, which of them, and the names of a group of joints."""
+    """Return a description of the positions, a suffix for advice, and the names of a group of joints."""
     at = tuple(names[j] for j in group)
     if len(group) == len(names) > 1:
         return "all positions", "", at
@@ -217,11 +209,9 @@ def _where(names: Sequence[str], group: Sequence[int]) -> tuple[str, str, tuple[
 
 
 def find_shared_error(problem: Problem, local: Refined | None) -> FoundError | None:
-    """Return the error without which recordings are predicted that cannot be predicted as they are.
+    """Return the error whose correction makes unpredictable recordings predictable.
 
-    Args:
-        problem: The problem.
-        local: The fit of the recordings as they are; None where it diverged.
+    ``local`` is the fit of the original recordings; None where it diverged.
     """
     if problem.robot.base is not None or problem.noise_free:
         return None
@@ -251,7 +241,7 @@ def find_shared_error(problem: Problem, local: Refined | None) -> FoundError | N
 
 
 def _decides(before: float, after: float, count: int) -> bool:
-    """Return whether a candidate predicts so much better that it is named."""
+    """Return whether the prediction improves so much that the candidate is named."""
     settings = SETTINGS
     share = settings.noticed if after <= MISMATCH.chi2 else settings.decisive
     if not np.isfinite(after) or not after < (1 - share) * before:
@@ -266,7 +256,7 @@ def _samples(test: Problem, length: int) -> int:
 def _screened(
     problem: Problem, change: ChannelChange, episodes: Sequence[SampledEpisode], length: int
 ) -> float:
-    """Return how far the model's own values are off recordings so changed, in most samples."""
+    """Return the nominal values' median prediction error on changed recordings."""
     try:
         changed = change.on(problem, episodes)
         every = []
@@ -286,7 +276,7 @@ def _fitted(
     unseen: Sequence[SampledEpisode],
     length: int,
 ) -> float:
-    """Return the held-out chi2 of a fit to recordings so changed; infinite where simulations diverge."""
+    """Return the held-out chi2 of a fit to changed recordings; infinite where simulations diverge."""
     try:
         train = change.on(problem, seen)
         window_s = length * train.episodes[0].period_s

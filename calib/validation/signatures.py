@@ -1,8 +1,8 @@
-"""What each cause of a wrong model would do to the predictions, by simulation.
+"""Signatures: the effect of each cause of model error on the predictions, by simulation.
 
-A disturbance such as a force against the velocity is put into the windows that were fitted, along the motion
-that was fitted; the change of the prediction is the cause's signature. So what friction holds stays held, and
-what one joint does to the next counts. A body's mass is changed itself.
+A disturbance, such as a force against the velocity, is applied in the fitted windows along the fitted motion.
+The change of the prediction is the cause's signature. So joints held by friction stay held, and coupling
+between joints counts. For a body, the mass itself is changed.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ class SignatureSettings:
     """Settings of :func:`signatures`.
 
     Attributes:
-        push: Size of a disturbance, as a share of the torque that the joint's own inertia took [-].
-        heavier: Share by which a mass is changed [-].
-        low_speeds: Speeds, as parts of a joint's rms speed, within which friction's excess at low speed falls
-            to 1/e [-].
+        push: Size of a disturbance, as a share of the torque that the joint's own inertia needed [-].
+        heavier: Relative change of a mass [-].
+        low_speeds: Speeds at which friction's excess at low speed falls to 1/e, as parts of a joint's rms
+            speed [-].
         still: Part of the rms speed below which a velocity has no direction [-].
-        nudge: Change of a set-point for one sample that shows how a joint answers [rad or m].
+        nudge: Change of a set-point for one sample that shows a joint's response [rad or m].
     """
 
     push: float = 0.2
@@ -47,10 +47,10 @@ SETTINGS = SignatureSettings()
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """What one cause at one place does to the predictions.
+    """Effect of one cause at one place on the predictions.
 
     Attributes:
-        cause: Which.
+        cause: The cause.
         where: Joint or body.
         columns: Change of the whitened predictions by each of n disturbances, per episode (W, H M, n).
     """
@@ -62,13 +62,13 @@ class Signature:
 
 @dataclass(frozen=True, slots=True)
 class SignatureResponse:
-    """How an episode's windows answer to commands.
+    """Response of an episode's windows to commands.
 
     Attributes:
-        response: Whitened predictions by a set-point that is changed at the first sample and back at the
-            next, over the area of that, (A, W, H, M) [1/(rad s) or 1/(m s)]. It is the mean over all
-            windows: where friction holds a joint there is none.
-        change: What the set-points changed by from sample to sample, (W, H, A) [rad or m].
+        response: Whitened change of the predictions by a unit pulse of a set-point in the first sample,
+            (A, W, H, M) [1/(rad s) or 1/(m s)]. It is the mean over all windows; where friction holds a joint
+            it is zero.
+        change: Change of the set-points from sample to sample, (W, H, A) [rad or m].
     """
 
     response: FloatArray
@@ -76,12 +76,7 @@ class SignatureResponse:
 
 
 def signatures(problem: Problem, fit: Refined) -> list[Signature]:
-    """Return what causes do in the windows of a fit.
-
-    Args:
-        problem: The problem.
-        fit: Where a fit of windows ended.
-    """
+    """Return the effects of all causes in the windows of a fit."""
     states = fit.shooting.states(fit.point)
     C, joints = problem.coordinates, problem.robot.joints
     moved = np.concatenate(
@@ -119,14 +114,14 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             seen = np.flatnonzero(problem.channels == c)
             offset = np.zeros((*data.measured.shape, 1))
             moving = held_direction(states[data.episode][1][data.windows.samples()][..., c], speed[c])
-            # The sensor sits on the motor's side of the play.
+            # The sensor is on the motor's side of the play.
             offset[:, :, seen, 0] = (moving[..., None] / data.std[:, :, seen]) * problem.noise_std[c]
             found.setdefault(("backlash", name), []).append(offset.reshape(len(offset), -1, 1))
     return [Signature(cause, where, tuple(columns)) for (cause, where), columns in found.items()]
 
 
 def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
-    """Return how the windows of a fit answer to commands; see :func:`signatures`."""
+    """Return the responses to commands of a fit's windows; see :func:`signatures`."""
     responses, changes = [], []
     for e, data in enumerate(fit.shooting.data):
         path = _path(problem, fit, data)
@@ -147,11 +142,9 @@ def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
 
 
 def held_direction(velocity: FloatArray, speed: float) -> FloatArray:
-    """Return the direction of the last motion, (W, H): the velocity's, kept where a joint is still.
+    """Return the direction of a joint's last motion, (W, H): its velocity's sign, kept while it is still.
 
-    Args:
-        velocity: Of a joint, (W, H).
-        speed: Its rms.
+    ``speed`` is the rms of the velocity.
     """
     moving = np.abs(velocity) > SETTINGS.still * speed
     index = np.where(moving, np.arange(velocity.shape[1]), 0)
@@ -159,7 +152,7 @@ def held_direction(velocity: FloatArray, speed: float) -> FloatArray:
 
 
 def _forces(velocity: FloatArray, speed: float) -> dict[Cause, list[FloatArray]]:
-    """Return forces on a joint by their cause, of order 1, in the windows, (W, S)."""
+    """Return forces of order 1 on a joint in the windows, (W, S), by cause."""
     v = velocity / max(speed, 1e-300)
     against = -np.sign(v)
     return {
@@ -183,7 +176,7 @@ def _bodies(problem: Problem) -> list[Parameter]:
 
 
 def _inertia(problem: Problem, coordinate: int) -> float:
-    """Return a joint's inertia where the model stands at zero [kg m^2 or kg]."""
+    """Return a joint's inertia in the model's zero pose [kg m^2 or kg]."""
     joint = coordinate - problem.robot.joints.start
     return float(problem.robot.model.dof_M0[problem.robot.qvel[joint]])
 
@@ -210,7 +203,7 @@ def _predict(
 
 
 def _changes(observed: FloatArray, data: WindowData) -> FloatArray:
-    """Return how members after the first, (1 + n, W, H, M), whitened, differ from it, (n, W, H M)."""
+    """Return the whitened differences of members from the first, (1 + n, W, H, M), as (n, W, H M)."""
     found = np.nan_to_num((observed[1:] - observed[:1]) / data.std, nan=0.0, posinf=0.0, neginf=0.0)
     return np.asarray(found.reshape(*found.shape[:2], -1))
 

@@ -1,8 +1,7 @@
-"""Do two halves of the data agree? Each is refined alone from the whole's estimate.
+"""Split-half check: two halves of the data, each refined alone from the estimate on all, must agree.
 
-The halves are alternating blocks of the refinement's own windows, so no sample is predicted in both and both
-hold every phase of the motion. It costs some iterations over each half, less than one stage of the
-refinement.
+The halves are alternating blocks of the refinement's own windows. So no sample is predicted in both, and both
+hold every phase of the motion. It costs less than one stage of the refinement.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ class SplitHalfSettings:
 
     Attributes:
         iterations: Most iterations of each half's fit.
-        most_steps: More physics steps than this are not spent on the comparison.
-        fewest_windows: Fewer windows are not halved.
-        false_alarms: How often any parameter of a right model may be flagged [-]: with many parameters some
-            intervals of halves always miss each other.
+        most_steps: Most physics steps of the comparison.
+        fewest_windows: Fewest windows that are halved.
+        false_alarms: Probability that any parameter of a right model is flagged [-]: among many parameters,
+            intervals of some halves always miss each other.
     """
 
     iterations: int = 6
@@ -47,12 +46,12 @@ SETTINGS = SplitHalfSettings()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplitHalfRow:
-    """What two halves of the data say of one parameter when each is calibrated alone.
+    """One parameter's estimates from two halves of the data.
 
     Attributes:
         name: The parameter.
-        first: Estimate and 90 % interval (low, high) of one half. The estimate is None where that half cannot
-            tell the parameter: the interval is then the range's own.
+        first: Estimate and 90 % interval (low, high) of one half. The estimate is None where that half does
+            not identify the parameter: the interval is then the range's own.
         second: The same of the other half.
     """
 
@@ -62,7 +61,7 @@ class SplitHalfRow:
 
     @property
     def agree(self) -> bool | None:
-        """Whether the intervals overlap; None where a half cannot tell the parameter."""
+        """Whether the intervals overlap; None where a half does not identify the parameter."""
         if self.first[0] is None or self.second[0] is None:
             return None
         return self.first[1] <= self.second[2] and self.second[1] <= self.first[2]
@@ -70,14 +69,15 @@ class SplitHalfRow:
 
 @dataclass(frozen=True, slots=True)
 class SplitHalf:
-    """What two halves of the data say.
+    """Result of the split-half check.
 
     Attributes:
-        rows: One a parameter; none where the comparison was not made.
+        rows: One per parameter; empty without a comparison.
         flagged: Parameters that differ by more than chance.
-        reach: How far the halves' estimates lie from the whole's, in each parameter's own scale, (K,).
-        steps: Physics steps it cost.
-        note: Why it was not made.
+        reach: Largest distance of a half's estimate from that on all data, in each parameter's own scale,
+            (K,).
+        steps: Physics steps used.
+        note: Why nothing was compared.
     """
 
     rows: tuple[SplitHalfRow, ...]
@@ -100,7 +100,7 @@ class SplitHalf:
         }
 
     def alarms(self, space: ParameterSpace) -> tuple[Alarm, ...]:
-        """Return one alarm that names all that is flagged; none where nothing is."""
+        """Return one alarm that names all flagged parameters, if there are any."""
         if not self.flagged:
             return ()
         both = {
@@ -112,20 +112,17 @@ class SplitHalf:
             Alarm(
                 "Two halves of the data disagree about "
                 f"{listed([name + both.get(name, '') for name in self.flagged])}.",
-                "A value that depends on what is fitted means that the model lacks something. The intervals "
-                "were widened to hold both.",
+                "A value that depends on the choice of data means that the model is incomplete. The "
+                "intervals were widened to hold both.",
                 "Find what the model lacks (see the other alarms), or fit only motion like that of the task.",
             ),
         )
 
 
 def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> SplitHalf:
-    """Refine two halves of the windows alone and compare; the latency stays what it is.
+    """Refine two halves of the windows alone and compare with ``refined``; the latency stays.
 
-    Args:
-        problem: The problem.
-        refined: Where the refinement of all windows ended.
-        known: What is known there; what the data cannot tell is not compared.
+    Parameters that ``known`` calls unidentified are not compared.
     """
     shooting, K = refined.shooting, len(problem.space)
     nothing = np.zeros(K)
@@ -146,11 +143,11 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
         found = refine_windows(
             *half_of(shooting, refined.point, half, block), SETTINGS.iterations, fixed_latency=True
         )
-        told = uncertainty_at(problem, with_rows(found), fixed_latency=True)
-        # A half holds few blocks: what all of them say of clustering holds for it, too.
-        std = np.sqrt(np.diag(told.covariance)) * np.maximum(known.widened / told.widened, 1.0)
+        own = uncertainty_at(problem, with_rows(found), fixed_latency=True)
+        # A half holds few blocks: the clustering of all blocks holds for it, too.
+        std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
         estimates.append(found.theta)
-        halves.append(widened_to(problem, told, found.theta, std))
+        halves.append(widened_to(problem, own, found.theta, std))
     return agreement(problem, refined.theta, known, estimates, halves, problem.steps - before)
 
 
@@ -162,38 +159,29 @@ def agreement(
     halves: Sequence[Uncertainty],
     steps: int,
 ) -> SplitHalf:
-    """Return whether two halves agree.
-
-    Args:
-        problem: All data.
-        theta: The estimate of all data, (K,).
-        known: What is known there; what the data cannot tell is not compared.
-        estimates: Of each half, (K,).
-        halves: What is known from each half.
-        steps: Physics steps that it cost.
-    """
+    """Return whether two halves agree, given estimates, (K,), and uncertainties of all data and halves."""
     space = problem.space
 
     def three(half: int, k: int) -> tuple[float | None, float, float]:
         estimate, (low, high) = float(estimates[half][k]), map(float, halves[half].interval[k])
-        told = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
-        return estimate if told else None, low, high
+        identified = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
+        return estimate if identified else None, low, high
 
     rows = tuple(
         SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
     )
-    told = ~known.shape.blind
-    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(told.sum()), 1)))
+    identified = ~known.shape.blind
+    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
     far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*(np.sqrt(np.diag(h.covariance)) for h in halves))
-    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and r.agree is False)
+    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and identified[k] and r.agree is False)
     return SplitHalf(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
 
 
 def widened_by_split_half(
     problem: Problem, known: Uncertainty, theta: FloatArray, split: SplitHalf
 ) -> Uncertainty:
-    """Return what is known, flagged parameters' intervals holding the estimates of both halves."""
+    """Return ``known`` with intervals of flagged parameters that hold the estimates of both halves."""
     if not split.flagged:
         return known
     flagged = np.array([name in split.flagged for name in problem.space.names])
@@ -202,13 +190,9 @@ def widened_by_split_half(
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
-    """Return every other block of the windows and the point in them.
+    """Return every other block of the windows, from block ``half``, and the point in them.
 
-    Args:
-        shooting: All windows.
-        point: The point in all of them.
-        half: 0 or 1.
-        block: Windows in a block; blocks are counted on from recording to recording.
+    The count of windows continues over recordings.
     """
     data, position, velocity, first = [], [], [], 0
     for e, of_episode in enumerate(shooting.data):
@@ -223,9 +207,8 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:
-    """Return how many physics steps the comparison takes at most."""
+    """Return the most physics steps that the comparison takes."""
     substeps = problem.episodes[0].step_s / problem.robot.step_s
-    samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
-    # One normal matrix and one line of damped steps an iteration.
+    # One normal matrix and one line of damped steps per iteration.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
-    return float(SETTINGS.iterations * members * samples * substeps)
+    return float(SETTINGS.iterations * members * shooting.device_periods * substeps)

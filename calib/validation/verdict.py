@@ -1,4 +1,4 @@
-"""Checks after a fit, and whether the result can be used: one colour; held-out motion is asked first."""
+"""Checks after a fit, and the verdict on its use in one colour; the held-out error decides first."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class VerdictSettings:
     """Settings of the checks and of :func:`trust`.
 
     Attributes:
-        worse: A held-out error above the nominal model's by more than this factor is worse [-]: less is
-            chance where the nominal model was right.
-        at_end: A latency ended at the end of its range where it is within this share of it [-].
-        causes: So many causes of a residual are alarms; all are in the provenance.
+        worse: Ratio to the nominal model's held-out error above which a result is worse [-]: less is chance
+            where the nominal model was right.
+        at_end: Distance to an end of the latency range, as a share of it, that counts as at the end [-].
+        causes: Most causes of a residual that become alarms; all are in the provenance.
     """
 
     worse: float = 1.02
@@ -46,7 +46,7 @@ class Validation:
     """Which checks follow a refinement."""
 
     local_first: bool = True
-    """Refine the model's own values first; where that explains the recordings there is no search."""
+    """Refine the nominal values first; where that explains the recordings there is no search."""
 
     cross_validation: bool = True
     """Where the residual is unexplained, keep the refinement only if it predicts better on inner folds."""
@@ -58,21 +58,14 @@ class Validation:
     """Refine two halves of the data alone and compare."""
 
     physics_step: bool = True
-    """Predict with half the physics step; intervals count what the step moves."""
+    """Predict with half the physics step; intervals include the step's shift."""
 
     diagnosis: bool = True
-    """Say what an unexplained residual looks like."""
+    """Name causes of an unexplained residual."""
 
 
 def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
-    """Return an alarm where a latency that was searched ended at the end of its range.
-
-    The lower end counts where it is above zero.
-
-    Args:
-        problem: The problem.
-        latency_s: The estimate [s].
-    """
+    """Return an alarm where a searched latency ended at an end of its range; zero is no such end."""
     if problem.fixed_latency_s is not None:
         return ()
     low, high = problem.latency_range_s
@@ -87,19 +80,14 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
         Alarm(
             f"The latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "
             f"{1e3 * high:g} ms).",
-            f"The robot may act {side} than that; then other parameters make up for it.",
+            f"The robot may act {side} than that; then other parameters compensate for it.",
             f"Calibrate again with --latency-range {wider[0]:g} {wider[1]:g}.",
         ),
     )
 
 
 def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
-    """Return whether the residual is larger, or autocorrelated longer, than noise is.
-
-    Args:
-        refined: A fit.
-        longest: Autocorrelation time up to which it passes for noise [samples].
-    """
+    """Return whether the residual exceeds noise, or is autocorrelated over more than ``longest`` samples."""
     if refined.chi2 <= MISMATCH.negligible_chi2:
         return False
     if refined.chi2 > MISMATCH.chi2:
@@ -110,13 +98,9 @@ def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples)
 def judge(
     problem: Problem, refined: Refined, known: Uncertainty, settings: Validation
 ) -> tuple[Uncertainty, dict[str, Any]]:
-    """Check and return what is then known, and facts for the provenance.
+    """Run the checks; return the updated uncertainty and facts for the provenance.
 
-    Args:
-        problem: The problem.
-        refined: Where the refinement ended, with linearised residuals.
-        known: What is known there.
-        settings: Which checks.
+    ``refined`` has linearised residuals, and ``known`` is its uncertainty.
     """
     facts: dict[str, Any] = {"inflation": known.inflation}
     ended = np.flatnonzero(ended_at_bound(problem.space, refined.theta))
@@ -143,13 +127,9 @@ def judge(
 def with_step(
     problem: Problem, refined: Refined, known: Uncertainty, theta: FloatArray
 ) -> tuple[Uncertainty, dict[str, Any]]:
-    """Return what is known, the physics step counted, and what the check found, as plain JSON values.
+    """Check the physics step; return the updated uncertainty and the result as plain JSON values.
 
-    Args:
-        problem: The problem.
-        refined: Where a fit of windows ended, with linearised residuals.
-        known: What was known before.
-        theta: The estimate that is about, (K,).
+    ``refined`` has linearised residuals; ``theta``, (K,), is the estimate of ``known``.
     """
     step = check_step(problem, refined)
     alarms = step_alarm(problem, known, step)
@@ -160,7 +140,7 @@ def with_step(
 def with_causes(
     problem: Problem, refined: Refined, known: Uncertainty
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
-    """Return what is known, alarmed by what the residual looks like, and all causes as plain JSON values."""
+    """Add alarms for causes of the residual; return all causes as plain JSON values, too."""
     found = diagnose(problem, refined)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
     return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
@@ -168,7 +148,7 @@ def with_causes(
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Whether a calibration can be used.
+    """The verdict on the use of a calibration.
 
     Attributes:
         colour: Green: use it. Amber: it has a known weakness. Red: do not use it.
@@ -184,7 +164,7 @@ class Trust:
 
     @property
     def sentence(self) -> str:
-        """All of it in one line."""
+        """The verdict in one line."""
         return f"{self.seen} {self.means} {self.do}"
 
 
@@ -201,7 +181,7 @@ def trust(result: CalibrationResult) -> Trust:
     if nominal is None or calibrated is None:
         record = "Record one more motion and name it with --holdout."
         if mismatch:
-            means = "The model does not explain them, and no held-out recording says whether it is better."
+            means = "The model does not explain them, and no held-out recording shows whether it is better."
             return Trust("red", noise, means, f"Do not use it. {record}")
         gain = "There is no held-out recording."
     elif not calibrated <= SETTINGS.worse * nominal:
@@ -221,7 +201,7 @@ def trust(result: CalibrationResult) -> Trust:
         return Trust(
             "amber",
             f"{gain} {noise}",
-            "The model is better than yours, and lacks something that the robot has.",
+            "The model is better than yours, but it lacks something that the robot has.",
             "Use it, but trust predictions more than single values.",
         )
     if result.alarms:
@@ -233,20 +213,21 @@ def trust(result: CalibrationResult) -> Trust:
         return Trust(
             "amber",
             gain,
-            "No test was made of whether the model explains the recordings.",
-            f"Compare the held-out error with what your task can bear. {record}".strip(),
+            "The method does not test whether the model explains the recordings.",
+            f"Compare the held-out error with the error that your task allows. {record}".strip(),
         )
-    untold = result.verdicts.count("not identifiable")
-    if result.null_directions or untold:
+    unidentified = result.verdicts.count("not identifiable")
+    if result.null_directions or unidentified:
         return Trust(
             "amber",
             f"{gain} {noise}"
-            + (f" {untold} of {len(result.space)} parameters have no value." if untold else ""),
-            "The model explains the recordings, but they do not tell all parameters.",
-            "Use it: training keeps the whole range of those. Or record what is advised below.",
+            + (f" {unidentified} of {len(result.space)} parameters have no value." if unidentified else ""),
+            "The model explains the recordings, but they do not identify all parameters.",
+            "Use it: training draws these parameters from their whole range. Or record the motion advised "
+            "below.",
         )
     if record:
         return Trust(
-            "amber", f"{gain} {noise}", "Nothing says whether the model holds on other motion.", record
+            "amber", f"{gain} {noise}", "No recording shows whether the model holds on other motion.", record
         )
-    return Trust("green", f"{gain} {noise}", "What is left is the sensor's noise.", "Use it.")
+    return Trust("green", f"{gain} {noise}", "The remaining error is the sensor's noise.", "Use it.")

@@ -1,4 +1,4 @@
-"""The tables of figures that `deal-hw bench` prints: cells to run, rows to keep, sentences about them.
+"""The tables of `deal-hw bench`: cells to run, rows to store, summaries.
 
-A bench returns its cells, and :func:`deal_hw.bench.rows.run_cells` runs those that are not done yet.
+A bench returns its cells, and :func:`deal_hw.bench.rows.run_cells` runs the missing ones.
 """

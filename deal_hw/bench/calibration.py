@@ -1,10 +1,9 @@
-"""The calibration benches: methods against hidden truths, one row a cell.
+"""The calibration benches: methods against hidden truths, one row per cell.
 
-- fixed-range: each seed's truth lies off the middle of a fixed range whose midpoint is the wrong nominal
-  model.
-- mismatch: the same on robots that do what no simulator here does (profile ``realistic``).
-- paper: ranges [theta / xi, xi theta] on a linear scale around the truth itself, as DEAL's tables have it. A
-  searcher that ignores the data and returns the midpoint of the log range scores 0 there.
+- fixed-range: each seed's truth is off the middle of a fixed range, whose midpoint is the wrong nominal
+model. - mismatch: the same on robots with effects that no simulator here has (profile ``realistic``).
+- paper: ranges [theta / xi, xi theta] on a linear scale around the truth itself, as in DEAL's tables. A
+  search that ignores the data and returns the midpoint of the log range has an error of 0 there.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from deal_hw.bench.tasks import DEMONSTRATION_S, TASKS, make_case
 from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["fixed-range", "mismatch", "paper"]
-PAPER_NOTE = "centred target: a searcher that ignores the data scores 0 here"
+PAPER_NOTE = "centred target: a search that ignores the data has an error of 0 here"
 KEY = (
     "task",
     "space",
@@ -32,7 +31,7 @@ KEY = (
     "range_ratio",
     "seed",
 )
-"""What names a cell."""
+"""Fields that identify a cell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,16 +39,16 @@ class Cell:
     """One calibration of one robot by one method.
 
     Attributes:
-        protocol: How truth and range lie to each other.
+        protocol: Relation of truth and range.
         task: Name of the task.
         space: Name of the parameter set; "" for the task's default.
         profile: Profile of the robot.
         demonstration: "excite" or "policy".
-        demonstration_s: How long it is [s].
+        demonstration_s: Its length [s].
         method: Name of the method.
         refined: Whether the refinement follows.
         range_ratio: Ratio of the search range.
-        seed: Decides everything.
+        seed: Seed of everything.
     """
 
     protocol: Protocol
@@ -65,7 +64,7 @@ class Cell:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What names the cell in a file of rows."""
+        """The cell's identity in a file of rows."""
         return tuple(getattr(self, name) for name in KEY)
 
 
@@ -82,7 +81,7 @@ def make_cells(
     demonstration: str = "excite",
     demonstration_s: float = DEMONSTRATION_S,
 ) -> list[Cell]:
-    """Return the cells of a bench, seed by seed, so that a stopped bench has whole seeds.
+    """Return the cells of a bench, seed by seed, so that a stopped bench has complete seeds.
 
     Raises:
         UnknownNameError: There is no such task or method.
@@ -112,7 +111,7 @@ def make_cells(
 
 
 def cells(chosen: Sequence[Cell], *, population: int | None, generations: int, threads: int | None) -> Cells:
-    """Return what runs cells; see :func:`run_cell`."""
+    """Return the cells with the function that runs each; see :func:`run_cell`."""
 
     def make(cell: Cell) -> Callable[[], Row]:
         return lambda: run_cell(cell, population=population, generations=generations, threads=threads)
@@ -121,9 +120,9 @@ def cells(chosen: Sequence[Cell], *, population: int | None, generations: int, t
 
 
 def run_cell(cell: Cell, *, population: int | None, generations: int, threads: int | None) -> dict[str, Any]:
-    """Run one cell; an error is kept in the row, so that the other cells still run.
+    """Run one cell; an error goes into the row, so that the other cells still run.
 
-    Without a population each method has its usual one.
+    Without a population each method has its default.
     """
     from deal_hw.calib.methods import usual_budget
 

@@ -1,4 +1,4 @@
-"""Figures of benches: what each method ends at, beside what needs no data, and what policies do then."""
+"""Figures of benches: the methods' errors beside no-data baselines, and the resulting policies' errors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 NO_DATA = ("midpoint", "midpoint-linear", "nominal", "deal-paper-flat")
-"""Methods that do not look at the recording."""
+"""Methods that do not use the recording."""
 POLICIES = {
     "udr": "uniform\nrandomisation",
     "retrained": "the calibrated\ndistribution",
     "oracle": "the truth",
 }
-"""Under what a policy was trained, by the end of its fields' names."""
+"""The distribution of a policy's training, by the end of its fields' names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,13 +32,13 @@ class FigureSettings:
     """Settings of the figures.
 
     Attributes:
-        colors: Of range ratios, after Okabe and Ito (2008): told apart with any colour vision.
+        colors: Of range ratios, after Okabe and Ito (2008): distinct with any colour vision.
         markers: Of the same, for print without colours.
-        floor: Smaller parameter errors are drawn here: an exact result has no place on a log scale.
-        decades: An axis is logarithmic where its values span more than this factor.
+        floor: Smallest drawn parameter error: an exact result has no place on a log scale.
+        decades: Ratio of an axis's values above which it is logarithmic.
         width: Of a panel [inches].
         height: Of a panel's title and labels [inches].
-        mark_height: What each method adds to that [inches].
+        mark_height: Additional height per method [inches].
         dpi: Of the PNG.
     """
 
@@ -61,12 +61,12 @@ class _Panel:
 
     Attributes:
         title: What was calibrated.
-        field: What is drawn of a row.
-        label: Of the axis of values.
-        mark: What a mark is, with the range ratio.
-        rows: Whose.
-        baselines: Fields of what needs no method, by name.
-        floor: Smaller values are drawn here.
+        field: The drawn field of a row.
+        label: Label of the axis of values.
+        mark: Meaning of a mark, with the range ratio.
+        rows: The rows.
+        baselines: Fields of the no-data baselines, by name.
+        floor: Smallest drawn value.
     """
 
     title: str
@@ -78,18 +78,18 @@ class _Panel:
     floor: float = 0.0
 
     def values(self, rows: Sequence[Row], field: str) -> Any:
-        """Return a field of rows that have it."""
+        """Return a field of the rows that have it."""
         known = [row[field] for row in rows if row.get(field) is not None]
         return np.maximum(np.array(known, dtype=float), self.floor)
 
 
 def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -> None:
-    """Draw the rows of a bench; a panel for each task and profile, and one for policies where there are any.
+    """Draw the rows of a bench: a panel for each task and profile, and one for policies, if there are any.
 
-    Where no row has a value (every prediction diverged), nothing is drawn.
+    Without any value (every prediction diverged), nothing is drawn.
 
     Args:
-        path: Of the PNG.
+        path: The PNG.
         rows: Rows without errors, at least one.
         settings: Colours and sizes.
     """
@@ -113,10 +113,10 @@ def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -
         _methods(axes, panel, ratios, settings)
     if trained:
         _policies(places[-1], trained)
-    # One legend for all panels: a colour means the same in each.
+    # One legend for all panels: a colour has the same meaning in each.
     named = [pair for axes in places for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    told = {label: handle for handle, label in sorted(named, key=lambda pair: "no data" in pair[1])}
-    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=columns + 1, fontsize=9)
+    legend = {label: handle for handle, label in sorted(named, key=lambda pair: "no data" in pair[1])}
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=columns + 1, fontsize=9)
     figure.savefig(path, dpi=settings.dpi)
 
 
@@ -151,7 +151,7 @@ def _panels(rows: Sequence[Row], settings: FigureSettings) -> list[_Panel]:
 
 
 def _methods(axes: Axes, panel: _Panel, ratios: Sequence[float], settings: FigureSettings) -> None:
-    """Draw a line for each method; range ratios are below each other in it."""
+    """Draw a line for each method, with its range ratios below each other."""
     names = list(dict.fromkeys(method_name(row) for row in panel.rows))
     numbers = set()
     for r, ratio in enumerate(ratios):
@@ -180,7 +180,7 @@ def _methods(axes: Axes, panel: _Panel, ratios: Sequence[float], settings: Figur
 
 
 def _policies(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw how far policies let the pole lean; a thin line joins those of one robot."""
+    """Draw the pole's mean angle by policy; a thin line joins those of one robot."""
     table = np.array([[row[f"angle_error_{name}"] for name in POLICIES] for row in rows], dtype=float)
     axes.plot(table.T, range(len(POLICIES)), color="0.7", lw=0.8, zorder=0)
     for m, values in enumerate(table.T):
@@ -191,7 +191,7 @@ def _policies(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _spread(axes: Axes, y: float, values: Any, color: str, marker: str, label: str) -> None:
-    """Draw each seed, and their median with a bar from the smallest to the largest."""
+    """Draw each seed, and the median with a bar from the smallest to the largest."""
     axes.plot(values, np.full(len(values), y), marker, ms=4, alpha=0.35, color=color, mec="none")
     middle = float(np.median(values))
     axes.errorbar(
@@ -207,7 +207,7 @@ def _spread(axes: Axes, y: float, values: Any, color: str, marker: str, label: s
 
 
 def _finish(axes: Axes, title: str, numbers: set[int], label: str, upwards: str) -> None:
-    """Name the axes, and say of how many seeds the bars are."""
+    """Label the axes, and give the number of seeds."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axes.dataLim.intervalx

@@ -1,9 +1,9 @@
-"""``deal-hw bench first-answer``: how long until a calibration is nearly as good as it gets?
+"""``deal-hw bench first-answer``: time until a calibration is nearly as good as its final result.
 
-Five robots are calibrated as a user would, from an MJCF and recordings with default settings. Each fit that
-is shown on the way counts from the moment when it is there, with its error on held-out motion. Beside it, in
-the same run and on the same recordings, parameters and ranges, runs mujoco.sysid with the latency as one more
-parameter. Reading files and importing packages is not counted, on either side.
+Five robots are calibrated as a user would, from an MJCF and recordings with default settings. Each
+intermediate fit counts from its time, with its error on held-out motion. mujoco.sysid runs beside it, on the
+same recordings, parameters and ranges, with the latency as one more parameter. Reading files and importing
+packages does not count, on either side.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class FirstAnswerSettings:
     """Settings of the bench.
 
     Attributes:
-        near: A fit whose held-out error is within this factor of the final one is a first answer.
-        window_s: Held-out predictions restart from the measured state this often [s].
+        near: Largest held-out error of a first answer, as a multiple of the final one.
+        window_s: Length of held-out predictions [s].
         sysid_window_s: Windows of mujoco.sysid [s]: on the public SO-101 recordings 2 s did best.
         sysid_iterations: Most iterations of its optimiser: its own default.
-        seconds: Length of each simulated recording; two are fitted, one judges [s].
+        seconds: Length of each simulated recording [s]; two are fitted, one is held out.
     """
 
     near: float = 1.1
@@ -77,11 +77,11 @@ parameters:
 
 @dataclass(frozen=True, slots=True)
 class _Ask:
-    """What a problem is made of.
+    """Inputs of a problem.
 
     Attributes:
         folder: For files.
-        seed: Decides the truth of a simulated robot.
+        seed: Seed of a simulated robot's truth.
         real: Folder of real recordings, or None.
         seconds: Length of each simulated recording [s].
     """
@@ -95,7 +95,7 @@ class _Ask:
         """Return files of a real robot.
 
         Raises:
-            ConfigurationError: There are none; the message says where they come from.
+            ConfigurationError: There are none; the message says how to make them.
         """
         if self.real is None:
             raise ConfigurationError(f"no real recordings: give --real DIR; {example} makes DIR/{name}")
@@ -119,12 +119,12 @@ def _cart_pole(ask: _Ask) -> CalibrateSettings:
 
 
 def _torque_arm(ask: _Ask) -> CalibrateSettings:
-    """Return an arm of two links that is driven by torques, not by servos."""
+    """Return an arm of two links with torque motors instead of servos."""
     robot = make_robot("double-pendulum", ask.seed)
     gains = {name.partition(".")[0]: value for name, value in _stiffness(robot.model).items()}
 
     def driven(mjcf: str) -> str:
-        """Return a model whose motors are as much stronger as its servos are stiffer."""
+        """Return a model whose motors are stronger in the ratio in which its servos are stiffer."""
         for joint, stiffness in _stiffness(mjcf).items():
             gain = stiffness / gains[joint]
             mjcf = re.sub(
@@ -190,15 +190,11 @@ PROBLEMS: Mapping[str, Callable[[_Ask], CalibrateSettings]] = {
 """The robots by name: three in plain MuJoCo with hidden truths, two real ones."""
 
 REAL = frozenset({"so101", "go2-suspended"})
-"""Problems whose recordings are given."""
+"""Problems with real recordings."""
 
 
 def check_problems(names: Sequence[str]) -> None:
-    """Raise where there is no such problem.
-
-    Raises:
-        UnknownNameError: A name is not in `PROBLEMS`.
-    """
+    """Raise `UnknownNameError` if a name is not in `PROBLEMS`."""
     for name in names:
         if name not in PROBLEMS:
             raise UnknownNameError("problem of first-answer", name, PROBLEMS)
@@ -207,7 +203,7 @@ def check_problems(names: Sequence[str]) -> None:
 def cells(
     problems: Sequence[str], seeds: Sequence[int], *, real: Path | None, budget: Budget, threads: int | None
 ) -> Cells:
-    """Return what runs the problems; a real robot has one truth, so it is run for the first seed alone.
+    """Return the cells of the bench; a real robot has one truth, so it runs for the first seed only.
 
     Raises:
         UnknownNameError: There is no such problem.
@@ -230,15 +226,15 @@ def run_cell(
     threads: int | None,
     settings: FirstAnswerSettings = SETTINGS,
 ) -> Row:
-    """CalibrateSettings one robot both ways; an error is kept in the row.
+    """Calibrate one robot with both programs; an error goes into the row.
 
     Args:
         name: A name in `PROBLEMS`.
-        seed: Of the truth, and of everything random in our calibration.
+        seed: Seed of the truth, and of everything random in our calibration.
         real: Folder of real recordings.
-        budget: What a search may use.
+        budget: Limits of a search.
         threads: Simulation threads.
-        settings: How to judge.
+        settings: Settings of the bench.
     """
     row: Row = {"bench": "first-answer", "task": name, "seed": seed, "error": "", "skipped": ""}
     with tempfile.TemporaryDirectory() as folder:
@@ -271,7 +267,7 @@ class _Stopwatch:
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """A fit and when it was there: its stage, wall clock and processor time [s], (K,) values, latency [s]."""
+    """An intermediate fit: stage, wall clock and processor time [s], values (K,), latency [s]."""
 
     stage: str
     wall_s: float

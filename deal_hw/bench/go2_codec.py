@@ -1,4 +1,4 @@
-"""The bench of the Go2's messages: what they cost to write and read."""
+"""The bench of the Go2's messages: time to write and read them."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from deal_hw.drivers.go2.messages.protocol import (
 BATCHES: Final = 200
 BATCH: Final = 200
 TARGETS_US: Final[Mapping[str, float]] = {"encode LowCmd with CRC": 5.0, "decode LowState": 2.0}
-"""What the control loop's budget allows, medians [us]."""
+"""Budget of the control loop, medians [us]."""
 
 
 def bench_codec(out: Path | None = None, *, quiet: bool = False, batches: int = BATCHES) -> int:
-    """Measure the codec; print and, where a file is named, write the figures.
+    """Measure the codec; print the figures, and write them to a file if one is given.
 
     Args:
         out: File of the rows; None: print only.
         quiet: Whether to print nothing.
-        batches: How many batches of :data:`BATCH` calls to time.
+        batches: Number of timed batches of :data:`BATCH` calls.
 
     Returns:
-        0 where every median is within its target, else 1.
+        0 if every median is within its target, else 1.
     """
     rows = [_row(name, call, batches) for name, call in _calls().items()]
     machine = describe_machine()

@@ -1,8 +1,8 @@
-"""The Go2's loop bench: walk, calibrate from the walk, fine-tune, walk again; only it knows the truths.
+"""The Go2's loop bench: walk, calibrate from the walk, fine-tune, walk again; the truths are hidden.
 
-One row a seed, in virtual time: driver, bytes, safety filter, control loop and recorder are those of the
-wire. Four policies walk the same profile with the same robot: the shipped one, that one after more training
-under uniform randomisation, under the calibrated distribution, and under the truth.
+One row per seed, in virtual time: driver, bytes, safety filter, control loop and recorder are those of the
+wire. Four policies walk the same profile with the same robot. They are the shipped one, and that one after
+more training under uniform randomisation, under the calibrated distribution, and under the truth.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from deal_hw.workflows.train import train_policy, udr_distribution
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
 WALKS: Final = 3
 NEXT_NOISE: Final = 100_000
-"""From the seed of one walk's noise to the next one's."""
+"""Distance between the noise seeds of two walks."""
 KINDS: Final = ("stiffness", "damping")
 
 
 def cells(
     profile: str, seeds: Sequence[int], steps: int, *, train: bool, folder: Path, threads: int | None
 ) -> Cells:
-    """Return the cells of the bench, one a seed; see :func:`loop_row`."""
+    """Return the cells of the bench, one per seed; see :func:`loop_row`."""
 
     def make(seed: int) -> Callable[[], Row]:
         return lambda: loop_row(profile, seed, steps, train=train, folder=folder, threads=threads)
@@ -54,14 +54,14 @@ def cells(
 
 
 def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, threads: int | None) -> Row:
-    """Run one cell; an error is kept in the row, so that the other cells still run.
+    """Run one cell; an error goes into the row, so that the other cells still run.
 
     Args:
         profile: Profile of the emulated robot.
         seed: Seed of its truth, of the search and of the training.
-        steps: Of each fine-tune.
+        steps: Steps of each fine-tune.
         train: Whether to fine-tune at all.
-        folder: Where recordings and policies go.
+        folder: Folder of recordings and policies.
         threads: Simulation threads.
     """
     row: Row = {
@@ -100,7 +100,7 @@ def recorded(truth: Go2Truth, out: Path) -> Path:
 
 
 def calibration_part(result: CalibrationResult, truth: Go2Truth) -> Row:
-    """Return the row's part that concerns calibration."""
+    """Return the calibration's part of the row."""
     true = truth.walk_parameters()
     names = result.space.names
     values = np.array([true[name] for name in names])
@@ -153,9 +153,9 @@ def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: P
 
 
 def score(truth: Go2Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
-    """Let a policy walk the profile some times, with other noise each; return its errors by the truth.
+    """Let a policy walk the profile several times, each with other noise; return its errors by the truth.
 
-    Mean errors [m/s, rad/s] of the walks that lasted long enough to be judged, and how often it fell.
+    They are mean errors [m/s, rad/s] of the walks that lasted long enough, and the number of falls.
     """
     source, errors, falls = ScriptVelocity(write_script(out / "profile.csv", PROFILE)), [], 0
     for number in range(WALKS):
@@ -180,7 +180,7 @@ def line(row: Row) -> str:
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
-    """Return what the rows say together: medians, falls, and the paired comparison with as long under UDR."""
+    """Return a summary: medians, falls, and the paired comparison with equal training under UDR."""
     if not rows:
         return []
     lines = [f"held-out ratio: median {np.median([row['heldout_ratio'] for row in rows]):.2f}"]
@@ -200,7 +200,7 @@ def summary(rows: Sequence[Row]) -> list[str]:
     if whole:
         gains = np.array([row["velocity_error_udr_more"] - row["velocity_error_calibrated"] for row in whole])
         lines.append(
-            f"calibrated against as many steps more under UDR, paired: {gains.mean():.4f} m/s better on "
-            f"average, better for {int((gains > 0).sum())} of {len(gains)}"
+            f"calibrated against equal training under UDR, paired: {gains.mean():.4f} m/s better on average, "
+            f"better for {int((gains > 0).sum())} of {len(gains)}"
         )
     return lines

@@ -1,6 +1,6 @@
-"""The loop bench: calibration, training, deployment on emulated cart-poles whose truth only it knows.
+"""The loop bench: calibration, training, deployment on emulated cart-poles whose truth only the bench knows.
 
-One row a seed and method, as the project's benchmark page defines them. Everything runs in virtual time
+One row per seed and method, as the project's benchmark page defines them. Everything runs in virtual time
 through the same driver, bytes, loop and recorder as on the wire.
 """
 
@@ -30,7 +30,7 @@ from deal_hw.workflows.shipped import required_policy
 
 TASK_EPISODES = 5
 SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")
-"""Run without the refinement, beside the default with everything."""
+"""Methods that run without the refinement, beside the default with everything."""
 
 
 def demonstrate(profile: str, seed: int, range_ratio: float) -> Case:
@@ -44,7 +44,7 @@ def calibration_row(
     """Calibrate with one method and score it.
 
     Returns:
-        The row's part that concerns calibration, and the result.
+        The calibration's part of the row, and the result.
     """
     from deal_hw.calib.validation.metrics import HeldOut, error_percent, log_error_x100
 
@@ -94,7 +94,7 @@ def calibration_row(
 
 
 def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tuple[float, float | None]:
-    """Return coverage90 and width90; without noise there is no bound to compare a width with."""
+    """Return coverage90 and width90; without noise there is no bound for a width."""
     from deal_hw.calib.data.problem import Problem, samples_in
     from deal_hw.calib.validation.metrics import fisher_std, interval_score
 
@@ -110,9 +110,9 @@ def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tu
 
 
 def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISODES) -> tuple[float, float]:
-    """Run the frozen task on the emulated robot; return mean |pole angle| [rad] and mean |cart speed| [m/s].
+    """Run the fixed task on the emulated robot; return mean |pole angle| [rad] and mean |cart speed| [m/s].
 
-    A run that the safety filter ended early counts as fallen over the rest: pi rad, and a cart at rest.
+    After an early end by the safety filter, the rest counts as fallen: pi rad, and a cart at rest.
     """
     from deal_hw.control.balance import TASK_SECONDS, balance_result
 
@@ -128,15 +128,15 @@ def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISOD
 
 
 def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[str, Any]:
-    """Train under the calibrated distribution and under the truth, deploy both and the shipped UDR policy.
+    """Train under the calibrated distribution and under the truth; deploy both and the shipped UDR policy.
 
     Args:
         case: The robot.
         result: Its calibration.
-        folder: Where the policies are kept.
+        folder: Folder of the policies.
 
     Returns:
-        The row's part that concerns the policies.
+        The policies' part of the row.
     """
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.workflows.train import train_policy
@@ -198,15 +198,15 @@ def loop_row(
     folder: Path,
     threads: int | None,
 ) -> dict[str, Any]:
-    """Run one cell; an error is kept in the row, so that the other cells still run.
+    """Run one cell; an error goes into the row, so that the other cells still run.
 
     Args:
         profile: Profile of the emulated robot.
         seed: Seed of its truth.
-        method: "default" is refined and, where asked, trained and deployed; the others are not.
+        method: "default" is refined and, with ``train``, trained and deployed; the others are not.
         range_ratio: Ratio of the search range.
         train: Whether the default trains and deploys policies.
-        folder: Where policies go.
+        folder: Folder of the policies.
         threads: Simulation threads.
     """
     folder.mkdir(parents=True, exist_ok=True)

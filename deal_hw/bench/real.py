@@ -1,8 +1,8 @@
-"""The real bench: methods against each other on recordings of a real robot, judged on held-out motion.
+"""The real bench: methods on recordings of a real robot, compared on held-out motion.
 
 There is no truth, so a row has held-out errors instead of parameter errors. All methods get the same
-recordings, parameters, ranges and budget. What the searches may expect of a residual is fitted once, to the
-recordings that are fitted, unless it is given.
+recordings, parameters, ranges and budget. The searches' expected residual, unless given, is fitted once, on
+the fitted recordings.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from deal_hw.workflows.say import aloud, silent
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
-"""Rows where nothing else is asked for."""
+"""Methods that run by default."""
 
 UNTOLD = frozenset({"nominal", "output-error"})
-"""Methods that need not be told what a prediction may be off."""
+"""Methods that need no expected prediction error."""
 
 
 def prepare(
@@ -41,12 +41,12 @@ def prepare(
     """Read and check recordings and parameters once for all cells.
 
     Args:
-        source: Model and recordings, or a dataset, and what is held out; as for ``deal-hw calibrate``.
-        range_ratio: Of the search; None: as the parameters say.
-        quiet: Say nothing of what was found.
+        source: Model and recordings, or a dataset, and the held-out part; as for ``deal-hw calibrate``.
+        range_ratio: Ratio of the search ranges; None: as in the parameters.
+        quiet: Print nothing.
 
     Raises:
-        ConfigurationError: Nothing was named, or a setting cannot be used.
+        ConfigurationError: No source was named, or a setting cannot be used.
         DatasetError: A recording cannot be used.
     """
     if source.recordings.model is None and source.dataset is None:
@@ -60,7 +60,7 @@ def prepare(
 
 
 def split_name(source: CalibrateSettings) -> str:
-    """Return what is held out, in a word or two."""
+    """Return the name of the held-out part."""
     if source.holdout:
         return "+".join(Path(str(one)).stem for one in source.holdout)
     part = source.recordings.holdout_part
@@ -71,7 +71,7 @@ def split_name(source: CalibrateSettings) -> str:
 def expected_std(
     work: CalibrationInputs, given: FloatArray | None, threads: int | None
 ) -> Callable[[str], FloatArray | None]:
-    """Return what tells a method what a prediction may be off, (2 C,): as it is given, or a first fit's."""
+    """Return a method's expected prediction error, (2 C,): the given one, or a first fit's."""
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.fit.output_error import expected_residual
 
@@ -148,19 +148,19 @@ def run_cell(
     window_s: float,
     threads: int | None,
 ) -> dict[str, Any]:
-    """Calibrate with one method and judge on what it has not seen; an error is kept in the row.
+    """Calibrate with one method and judge it on held-out motion; an error goes into the row.
 
     Args:
-        work: What was prepared.
+        work: The prepared inputs.
         task: Name of the robot in the row.
-        split: What is held out.
+        split: Name of the held-out part.
         method: Name of the method.
-        seed: Of everything random.
+        seed: Seed of everything random.
         range_ratio: Ratio of the search range, for the row.
         refine: Whether the refinement follows.
-        budget: What the search may use.
-        std: What a prediction may be off, (2 C,); None: the sensor noise, or what the method finds itself.
-        window_s: Held-out predictions restart this often [s].
+        budget: Limits of the search.
+        std: Expected prediction error, (2 C,); None: the sensor noise, or the method's own estimate.
+        window_s: Length of held-out predictions [s].
         threads: Simulation threads.
     """
     row: dict[str, Any] = {
@@ -186,7 +186,7 @@ def run_cell(
             threads=threads,
             heldout_window_s=window_s,
             known_std=std,
-            # A model that nobody calibrated has no latency.
+            # An uncalibrated model has no latency.
             latency_s=0.0 if method == "nominal" else None,
         )
     except DealHwError as err:

@@ -1,4 +1,4 @@
-"""Rows of a bench: cells that are not done yet are run, and each row is kept at once, with the machine."""
+"""Rows of a bench: missing cells are run, and each row is stored at once, with the machine."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cells:
-    """What a bench runs.
+    """The cells of a bench.
 
     Attributes:
-        names: Fields of a row that tell it apart from all others.
-        runs: For each cell the values of these fields, and what runs it.
+        names: Fields of a row that identify it.
+        runs: For each cell the values of these fields, and the function that runs it.
     """
 
     names: Sequence[str]
@@ -38,12 +38,12 @@ class Cells:
 
 
 def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], None]) -> list[Row]:
-    """Run the cells that a file has no sound row of, writing the file after each; return all rows.
+    """Run the cells without a valid row in a file, writing the file after each; return all rows.
 
     Args:
-        cells: What to run.
-        out: File of the rows; the CSV lies beside it.
-        after: Called after each cell with its place, such as "2/10", its row and all rows.
+        cells: The cells.
+        out: File of the rows; the CSV is beside it.
+        after: Called after each cell with its number, such as "2/10", its row and all rows.
 
     Raises:
         DatasetError: The file holds something else.
@@ -65,22 +65,22 @@ def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], No
 
 
 FORMER_FIELDS = {"xi": "range_ratio"}
-"""Fields by the names that older files have."""
+"""Names of fields in older files."""
 
 FORMER_BENCHES = {"honest": "fixed-range"}
-"""Benches, likewise."""
+"""Names of benches in older files."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """What the file of a bench holds."""
+    """The content of a bench's file."""
 
     format: str
     rows: tuple[dict[str, Any], ...]
 
 
 def load_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a file; none where there is no file.
+    """Return the rows of a file; none if there is no file.
 
     Raises:
         DatasetError: It holds something else.
@@ -98,7 +98,7 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the machine they came from, as JSON and as CSV."""
+    """Write rows with their machine, as JSON and as CSV."""
     write_rows(path, rows)
     names = sorted({k for row in rows for k, v in row.items() if not isinstance(v, dict | list)})
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
@@ -108,22 +108,19 @@ def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], program: str = "deal-hw") -> None:
-    """Write rows with the machine and the command they came from, as JSON."""
+    """Write rows with their machine and command, as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"format": FORMAT, **describe_call(program), "rows": list(rows)})
 
 
 def describe_call(program: str) -> dict[str, Any]:
-    """Return what made measurements: the machine, and the command with names of files only.
-
-    Where the files lay on that machine is nobody's business.
-    """
+    """Return the machine and the command of measurements; file names without folders, which are private."""
     words = (re.sub(r"[^\s=,]*/", "", word) for word in sys.argv[1:])
     return {"machine": describe_machine(), "argv": [program, *words]}
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what a reader of measurements must know of the machine."""
+    """Return the facts about the machine that a reader of measurements needs."""
     return {
         "platform": platform.platform(),
         "processors": len(os.sched_getaffinity(0)),

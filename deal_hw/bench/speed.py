@@ -1,8 +1,8 @@
-"""The bench of speed: what a search costs, beside bare physics in the same run and the paper's Table 3.
+"""The bench of speed: the cost of a search, beside bare physics in the same run and the paper's Table 3.
 
 Bare physics is the engine alone: as many members with the same parameters advance on the same threads, with
-constant commands and one record at the end of each rollout. What a search takes beyond that is policy calls,
-records, critic and its own arithmetic.
+constant commands and one record at the end of each rollout. The rest of a search's time goes into policy
+calls, records, critic and its own arithmetic.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
 
 METHODS: Final = ("deal-paper",)
-"""Measured where no method is named."""
+"""Measured if no method is named."""
 
 PAPER_SECONDS: Final = {"allegro": 3245.0, "ant": 98.0, "cartpole": 75.0, "go2": 303.0, "humanoid": 103.0}
 """DEAL on an i5-14600KF and an RTX 4060 Ti, 50 generations of 200 members (Table 3) [s]."""
 
 REPETITIONS: Final = 5
-"""Rollouts of bare physics, of which the median counts."""
+"""Number of rollouts of bare physics; the median counts."""
 
 KEY: Final = ("task", "space", "method", "population", "generations", "seed")
 
@@ -48,7 +48,7 @@ def cells(
     space: str,
     threads: int | None,
 ) -> Cells:
-    """Return what the bench runs; robots are moved by their policies, as the paper's are.
+    """Return the cells of the bench; policies move the robots, as in the paper.
 
     Raises:
         UnknownNameError: There is no such task or method.
@@ -84,8 +84,8 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
     """Search once without refinement, then step the engine alone.
 
     Returns:
-        The row's figures: seconds on the clock and of the processors, physics steps, what the engine alone
-        takes for as many, and the ratio.
+        The row's figures: wall-clock and processor seconds, physics steps, the engine's own seconds for as
+        many steps, and the ratio.
     """
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.methods import usual_budget

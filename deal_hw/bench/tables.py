@@ -1,4 +1,4 @@
-"""Tables and lines of benches whose truth is known, and of the bench on real recordings."""
+"""Tables and lines of benches with a known truth, and of the bench on real recordings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def line(row: Mapping[str, Any]) -> str:
 
 
 def print_real(rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print held-out errors, a line a row."""
+    """Print held-out errors, one line per row."""
     from rich.console import Console
     from rich.table import Table
 
@@ -99,11 +99,11 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def method_name(row: Mapping[str, Any]) -> str:
-    """Return a row's method, and whether a refinement followed where that is a choice."""
+    """Return a row's method, and whether a refinement followed, if that is a choice."""
     method = str(row["method"])
     return f"{method} + refinement" if row.get("refined") and method != "default" else method
 
 
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a line of the summary stands for."""
+    """Return the key of a line in the summary."""
     return row.get("task", "cartpole"), row["profile"], f"{row['range_ratio']:g}", method_name(row)

@@ -1,4 +1,4 @@
-"""The benches' robots: for each task, profile and seed a hidden truth, its recordings, and what really was.
+"""The benches' robots: for each task, profile and seed a hidden truth, its recordings, and the true states.
 
 The cart-pole is the emulated one, over its bytes in virtual time; the others are simulated targets.
 """
@@ -28,7 +28,7 @@ from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy
 
 DEMONSTRATION_S = 4.0
-"""Length of a demonstration where nobody says, and of every held-out motion [s]."""
+"""Default length of a demonstration, and length of every held-out motion [s]."""
 
 TRUTH_PART = (0.1, 0.9)
 """Truths are drawn from this part of the range."""
@@ -37,32 +37,32 @@ LATENCY_S = (0.006, 0.024)
 """Range of a target's hidden latency in profile ``sensor`` [s]."""
 
 SETTLE_S = 1.0
-"""How long a target holds its start pose before it is recorded [s]."""
+"""Time for which a target holds its start pose before its recording [s]."""
 
 MOST_REDRAWS = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """What a seed's robot gave, and what only the bench knows.
+    """A seed's recordings, and the truth that only the bench knows.
 
     Attributes:
         task: Name of the task.
         profile: Name of the profile.
-        seed: Decides everything.
+        seed: Seed of everything.
         robot: The nominal model.
-        space: What is searched.
+        space: The searched parameters.
         theta: True values of the free parameters, (K,).
         latency_s: True total latency [s].
         fit: The demonstration.
-        heldout: Another motion family.
+        heldout: A recording of another motion family.
         fit_truth: Noise-free positions and velocities at the demonstration's samples, (T, C) each.
         heldout_truth: Noise-free positions at the held-out samples, (T, C).
-        channel_std: True standard deviation of the measured channels, (M,); None where nothing is noisy.
-        refused: Truths that were drawn and could not demonstrate.
-        truth: The emulated robot's truth, where there is an emulator.
-        policy: What moved the robot all through the demonstration; None where that was no policy alone.
-        excitation_levels: How strong each attempt at a demonstration was; the one in use moves best.
+        channel_std: True standard deviation of the measured channels, (M,); None without noise.
+        refused: Number of drawn truths that could not demonstrate.
+        truth: The emulated robot's truth, if there is an emulator.
+        policy: The policy that produced all commands of the demonstration; None for other commands.
+        excitation_levels: Level of each attempt at a demonstration; the best one is used.
     """
 
     task: str
@@ -119,13 +119,13 @@ def make_case(
     Args:
         task: A name in `TASKS`.
         profile: "ideal", "sensor" or, for the cart-pole, "realistic".
-        seed: Decides everything.
+        seed: Seed of everything.
         range_ratio: Ratio of the search range.
         space: Name of the parameter set; the task's default.
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
-        by_policy: The robot is demonstrated by its shipped policy, as in the paper, instead of by motions
-            that excite more. The cart-pole's demonstration always begins with its policy.
-        seconds: Length of the demonstration [s]; a held-out motion is always as long.
+        by_policy: The shipped policy demonstrates the robot, as in the paper, instead of motions that excite
+            more. The cart-pole's demonstration always begins with its policy.
+        seconds: Length of the demonstration [s]; a held-out motion has `DEMONSTRATION_S`.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
@@ -151,12 +151,12 @@ def _cartpole(ask: _Ask) -> Case:
         seed=seed,
         policy=str(shipped_policy("cartpole") or ""),
     )
-    # A balanced pole is no stronger the second time.
+    # A second balancing attempt would be no stronger.
     shown, search = demonstrate(virtual, plan, 1 if ask.by_policy else ATTEMPTS)
     chirp = replace(plan, motion="chirp")
     recordings = (shown, virtual.run(make_behaviour(chirp, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
-    # The truth is of K9; what else may be searched has its nominal value.
+    # The truth has the parameters of K9; other searched ones have their nominal values.
     values = space.known | {p.name: p.nominal for p in space} | dict(truth.parameters)
     return Case(
         task="cartpole",
@@ -179,7 +179,7 @@ def _cartpole(ask: _Ask) -> Case:
 
 
 def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
-    """Return a case of a robot that exists in simulators only, which reports its whole state."""
+    """Return a case of a robot that exists only in simulators and reports its whole state."""
     from deal_hw.drivers import parameter_spaces, robot_description
     from deal_hw.drivers.simulated_motions import FAST_HZ, flail
 
@@ -204,7 +204,7 @@ def _ant(ask: _Ask) -> Case:
 
 
 def _humanoid(ask: _Ask) -> Case:
-    # Without torque it falls within a second; a demonstration begins upright.
+    # Without torque it falls within a second, so a demonstration begins upright.
     return _simulated(ask, "humanoid", 0.0)
 
 
@@ -234,7 +234,7 @@ def _go2(ask: _Ask) -> Case:
 
 
 FORWARD_M_S = 0.4
-"""Speed that a demonstration policy is asked for, where it observes one [m/s]."""
+"""Commanded speed of a demonstration policy, if it observes one [m/s]."""
 
 
 WANTED = (FORWARD_M_S, 0.0, 0.0)
@@ -290,10 +290,9 @@ def _target(
         if all(_stands(task, r) for r in (fit, heldout)):
             break
     else:
-        what = "the preset's robot falls" if ask.centred else f"all of {draws} robots that were drawn fall"
+        what = "the preset's robot falls" if ask.centred else f"all {draws} drawn robots fall"
         raise CalibrationError(
-            f"{task}, seed {seed}: {what}, so that there is no demonstration; use another --space "
-            "or --range-ratio"
+            f"{task}, seed {seed}: {what}, so there is no demonstration; use another --space or --range-ratio"
         )
     std = None if sensing is None else _channel_std(robot, sensing)
     return Case(
@@ -315,8 +314,8 @@ def _target(
 
 
 LOWEST_M = {"allegro": 0.0, "ant": 0.0, "go2": 0.12, "humanoid": 0.0}
-"""A base below this has fallen [m]: a demonstration of a Go2 that lies on its trunk says little, as of a hand
-that has lost its cube. Ant and humanoid may lie."""
+"""Height of a base below which it has fallen [m]. A demonstration of a Go2 on its trunk, or of a hand without
+its cube, has little information. Ant and humanoid may lie."""
 
 
 def _stands(task: str, recording: TargetRecording) -> bool:

@@ -1,9 +1,9 @@
 """``deal-hw bench verdict``: is a right model called right, and a wrong one wrong, for the right reason?
 
-Robots in plain MuJoCo, each with a truth of its own, are calibrated as a user would: from CSV files and an
-MJCF, with default settings. Without a fault the model can explain all; each fault is something it lacks.
-Faults of the recordings, which commands and measurements share, are chosen by name: a calibration ends there
-when it has said which.
+Robots in plain MuJoCo, each with its own truth, are calibrated as a user would: from CSV files and an MJCF,
+with default settings. Without a fault the model can explain everything; each fault is an effect that the
+model lacks. Faults of the recordings, which commands and measurements share, are chosen by name: their
+calibration ends once the fault is named.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare, u
 
 KEY = ("task", "fault", "seed")
 RIGHT = ""
-"""The fault of a model that lacks nothing."""
+"""The fault of a right model."""
 NONE = "none"
-"""What it is called where faults are chosen."""
+"""The name of that among chosen faults."""
 
 
 def cells(
     seeds: Sequence[int], kinds: Sequence[str] = (), faults: Sequence[str] = ()
 ) -> list[tuple[str, str, int]]:
-    """Return the robots by (kind, fault, seed): without a fault first.
+    """Return the robots by (kind, fault, seed), first without a fault.
 
     Args:
-        seeds: Of the truths.
+        seeds: Seeds of the truths.
         kinds: Names in `KINDS`; all by default.
-        faults: "none", names in `FAULTS` (these are all by default) and in `SHARED`.
+        faults: "none", names in `FAULTS` (all of these by default) and in `SHARED`.
 
     Raises:
         UnknownNameError: There is no such robot or fault.
@@ -73,7 +73,7 @@ def cells(
 
 
 def table(cells: Sequence[tuple[str, str, int]], *, budget: Budget, threads: int | None) -> Cells:
-    """Return what runs the robots; see :func:`run_cell`."""
+    """Return the cells with the function that runs each; see :func:`run_cell`."""
 
     def make(kind: str, fault: str, seed: int) -> Callable[[], Row]:
         return lambda: run_cell(kind, fault, seed, budget=budget, threads=threads)
@@ -82,13 +82,13 @@ def table(cells: Sequence[tuple[str, str, int]], *, budget: Budget, threads: int
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:
-    """CalibrateSettings one robot; an error is kept in the row.
+    """Calibrate one robot; an error goes into the row.
 
     Args:
         kind: A name in `KINDS`.
         fault: A name in `FAULTS` or `SHARED`, or "".
-        seed: Of the truth, and of everything random in the calibration.
-        budget: What a search may use.
+        seed: Seed of the truth, and of everything random in the calibration.
+        budget: Limits of a search.
         threads: Simulation threads.
     """
     robot = make_robot(kind, seed, _fault(fault) or _shared(fault))
@@ -116,7 +116,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             row |= {"colour": "said", "named": names(kind, fault, [], said), "said": said}
             return row
         except DealHwError as err:
-            # Refused before any work: as good as red, if it says why.
+            # Refused before any work: as good as red, if the message names the fault.
             named = names(kind, fault, [], [str(err)])
             return row | {"colour": "refused", "named": named, "refusal": str(err)}
     causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[: SETTINGS.causes]]
@@ -144,7 +144,7 @@ def _shared(name: str) -> SharedFault | None:
 
 
 class _NamedError(Exception):
-    """A calibration has said what is wrong with the recordings; what it finds after that says no more."""
+    """A calibration has named the fault of the recordings; its further results are not needed."""
 
 
 def _ends_when_named(progress: Progress) -> None:
@@ -153,12 +153,12 @@ def _ends_when_named(progress: Progress) -> None:
 
 
 def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]) -> bool:
-    """Return whether the fault was named; True where there is none.
+    """Return whether the fault was named; True if there is none.
 
     Args:
         kind: A name in `KINDS`.
         fault: A name in `FAULTS` or `SHARED`, or "".
-        causes: The causes that alarms name, the likeliest first.
+        causes: The causes named by alarms, the likeliest first.
         sentences: Refusals, warnings and alarms.
     """
     if (shared := _shared(fault)) is not None:
@@ -172,7 +172,7 @@ def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]
 
 
 def against_truth(robot: PlainRobot, result: CalibrationResult) -> dict[str, Any]:
-    """Return the errors of the parameters that have a value, and how many intervals hold the truth."""
+    """Return the errors of identified parameters, and the share of intervals that hold the truth."""
     told = [
         k
         for k, name in enumerate(result.space.names)
@@ -202,7 +202,7 @@ def line(row: Mapping[str, Any]) -> str:
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line for each fault: colours, how often it was named."""
+    """Return a line for each fault: colours, and how often it was named."""
     found = []
     for fault in (RIGHT, *FAULTS, *SHARED):
         mine = [r for r in rows if r["fault"] == fault and not r["error"]]

@@ -141,7 +141,7 @@ def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> No
     assert rows["nominal"]["error_percent"] == 0.0
     # The centre of a linear range [p / 5, 5 p] is 2.6 p.
     assert rows["midpoint"]["error_percent"] == pytest.approx(160.0)
-    assert "scores 0" in rows["midpoint"]["note"]
+    assert "error of 0" in rows["midpoint"]["note"]
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
         bench(settings)
         (row,) = json.loads(out.read_text())["rows"]
         errors[shown] = row["error"]
-    assert "needs the policy that moved the robot" in errors["excite"] and errors["policy"] == ""
+    assert "needs the policy that produced all commands" in errors["excite"] and errors["policy"] == ""
 
 
 def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:

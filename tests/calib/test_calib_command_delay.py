@@ -55,7 +55,7 @@ def test_refinement_recovers_the_delay() -> None:
 
 def test_delay_of_every_actuator_beside_a_searched_latency_is_refused() -> None:
     """Only their sum can be seen; with the latency given it can be searched."""
-    with pytest.raises(ConfigurationError, match=r"cart.delay: .*only their sum can be seen.*--latency"):
+    with pytest.raises(ConfigurationError, match=r"cart.delay: .*show only their sum.*--latency"):
         check_delays(problem(space_with(DELAY), None))
     check_delays(problem(space_with(DELAY), 0.003))
     check_delays(problem(space_with(), None))

@@ -249,7 +249,7 @@ def test_faults_of_a_simulated_robot_are_named(tmp_path: Path) -> None:
     assert friction[0].cause == "friction" and friction[0].joints == ("pivot",)
     _, problem, fit = _truth("pendulum", "jitter", tmp_path / "jitter")
     jitter = name_causes(evidence(problem, fit))
-    assert jitter[0].cause == "delay" and "late by another time" in jitter[0].alarm.seen
+    assert jitter[0].cause == "delay" and "its own delay" in jitter[0].alarm.seen
 
 
 def test_a_mass_is_named_with_its_size(tmp_path: Path) -> None:

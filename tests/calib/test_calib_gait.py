@@ -10,7 +10,7 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
-from deal_hw.calib.output_error_fits import FORCES, GAIT, _holding, _scaled_together
+from deal_hw.calib.output_error_fits import FORCES, GAIT, _including, _scaled_together
 from deal_hw.calib.uncertainty.intervals import PosteriorShape, Uncertainty
 from deal_hw.calibration import Z90
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -75,7 +75,7 @@ def test_intervals_hold_what_other_windows_found(problem: Problem) -> None:
     other = theta.copy()
     other[0], other[1] = 1.5 * theta[0], 1.001 * theta[1]
     before = known_at(theta)
-    after = _holding(problem, before, theta, other)
+    after = _including(problem, before, theta, other)
     assert after.interval[0, 1] == pytest.approx(other[0])
     np.testing.assert_allclose(after.interval[1:], before.interval[1:])
     assert after.covariance[0, 0] == pytest.approx(SHARE**2 + np.log(1.5) ** 2)

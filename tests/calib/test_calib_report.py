@@ -251,7 +251,7 @@ def test_a_half_that_tells_nothing_has_no_value() -> None:
         "c": {"first": [2, 1, 3], "second": [7, 6, 8], "agree": False},
     }
     text = Tags(render(inputs(result(space(), provenance={"split_half": {"parameters": rows}})))).text()
-    assert "a first half 2 (1 … 3) second half no value (5 … 95) a half cannot tell it" in text
+    assert "a first half 2 (1 … 3) second half no value (5 … 95) not identified by a half" in text
     assert "second half 2.5 (2 … 3) agree" in text
     assert "second half 7 (6 … 8) disagree: intervals do not overlap" in text
 
@@ -276,9 +276,9 @@ HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
         ({"heldout_nrmse": {**HELD, "calibrated": float("nan")}}, "red", "model is worse"),
         ({"heldout_nrmse": {**HELD, "calibrated": 0.07}, "chi2": 4.0}, "red", "model is worse"),
         ({"chi2": 4.0}, "amber", "2.0 times the sensor's noise"),
-        ({"chi2": 4.0, "heldout_nrmse": {}}, "red", "no held-out recording says"),
-        ({"chi2": float("nan")}, "amber", "No test"),
-        ({"null_directions": ("a and b",)}, "amber", "do not tell all parameters"),
+        ({"chi2": 4.0, "heldout_nrmse": {}}, "red", "no held-out recording shows"),
+        ({"chi2": float("nan")}, "amber", "does not test"),
+        ({"null_directions": ("a and b",)}, "amber", "do not identify all parameters"),
         ({"alarms": (Alarm("x", "y", "z"),)}, "amber", "There is 1 alarm."),
         ({"heldout_nrmse": {}}, "amber", "no held-out recording"),
     ],
@@ -326,8 +326,8 @@ def test_a_bare_result_makes_a_page_too() -> None:
     text = render(ReportInputs(robot="r", result=found))
     assert (
         "No recording was given" in text
-        and "The method gives none" in text
-        and "Nothing says how well" in text
+        and "The method does not compute them" in text
+        and "It is not known how well" in text
         and text.count("--holdout") == 1
     )
 

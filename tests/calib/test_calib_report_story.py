@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.calib.report.story import compared, percent, tell
+from deal_hw.calib.report.story import compared, make_story, percent
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import Parameter, ParameterSpace
 
@@ -50,7 +50,7 @@ def test_errors_are_compared_in_plain_words(nominal: float, calibrated: float, w
 
 def test_the_sentence_tells_the_held_out_gain() -> None:
     """26.4 % against 1.1 % is 24 times; the bars are 100 % and 1.1 / 26.4 = 4.17 % long."""
-    story = tell(result({"nominal": 0.264, "calibrated": 0.011, "null": 0.5}))
+    story = make_story(result({"nominal": 0.264, "calibrated": 0.011, "null": 0.5}))
     assert story.sentence.replace("\u00a0", " ") == (
         "The calibrated simulator predicts motion that it was not given 24 times better than the nominal "
         "model: its error is 1.1 % of the motion's range against 26 %."
@@ -65,26 +65,26 @@ def test_the_sentence_tells_the_held_out_gain() -> None:
 
 def test_a_model_that_got_worse_is_said_to_be_worse() -> None:
     """The longest bar is then the calibrated one."""
-    story = tell(result({"nominal": 0.05, "calibrated": 0.06, "null": 0.5}))
+    story = make_story(result({"nominal": 0.05, "calibrated": 0.06, "null": 0.5}))
     assert "worse than the nominal model, with 1.2 times its error" in story.sentence
     assert [bar.share for bar in story.bars] == pytest.approx([83.33, 100], abs=0.01)
 
 
 def test_a_model_that_diverges_has_no_number() -> None:
     """Its bar is full and says so."""
-    story = tell(result({"nominal": 0.05, "calibrated": NAN}))
+    story = make_story(result({"nominal": 0.05, "calibrated": NAN}))
     assert story.sentence.endswith("worse than the nominal model: it diverges.")
     assert (story.bars[1].words, story.bars[1].share) == ("diverged", 100.0)
 
 
 def test_without_held_out_recordings_nothing_is_claimed() -> None:
     """No gain and no bars; what is known of the fit is said. chi2 of 4 is twice the noise."""
-    story = tell(result({}, chi2=4.0))
+    story = make_story(result({}, chi2=4.0))
     assert (
-        story.sentence.startswith("Nothing says how well")
+        story.sentence.startswith("It is not known how well")
         and "2.0 times the sensor's noise" in story.sentence
     )
-    assert story.bars == () and "noise" not in tell(result({})).sentence
+    assert story.bars == () and "noise" not in make_story(result({})).sentence
 
 
 def test_units_and_noise_stand_beside_the_gain() -> None:
@@ -95,14 +95,14 @@ def test_units_and_noise_stand_beside_the_gain() -> None:
         "noise": {"nrmse": 0.005, "mean": 0.0004, "by_coordinate": {"hip": 0.0004, "knee": 0.0004}},
     }
     heldout = {"nominal": 0.264, "calibrated": 0.011}
-    story = tell(result(heldout, provenance={"heldout_rmse": rmse}))
+    story = make_story(result(heldout, provenance={"heldout_rmse": rmse}))
     assert story.in_units == "In rad, mean over the joints: nominal 0.027, calibrated 0.0011."
     assert story.floor == pytest.approx(1.894, abs=1e-3) and story.floor_words == "0.5\u00a0%"
     rmse["unit"]["hip"], rmse["noise"]["nrmse"] = "m", None
-    story = tell(result(heldout, provenance={"heldout_rmse": rmse}))
+    story = make_story(result(heldout, provenance={"heldout_rmse": rmse}))
     assert story.in_units == "" and story.floor is None
     rmse["unit"]["hip"], rmse["mean"]["nominal"] = "rad", None
-    assert tell(result(heldout, provenance={"heldout_rmse": rmse})).in_units == ""
+    assert make_story(result(heldout, provenance={"heldout_rmse": rmse})).in_units == ""
 
 
 def test_percent_has_two_digits() -> None:

@@ -34,9 +34,9 @@ def test_kept_predictions_are_those_of_the_point(
     assert cost == fresh.cost(point)
     for a, b in zip(residuals, Shooting(problem, 20).residuals(point), strict=True):
         np.testing.assert_array_equal(a, b)
-    a, b = (s.normal(point, central=central) for s in (kept, Shooting(problem, 20)))
-    np.testing.assert_array_equal(a.hessian, b.hessian)
-    np.testing.assert_array_equal(a.gradient, b.gradient)
+    one, other = (s.normal(point, central=central) for s in (kept, Shooting(problem, 20)))
+    np.testing.assert_array_equal(one.hessian, other.hessian)
+    np.testing.assert_array_equal(one.gradient, other.gradient)
 
 
 def test_kept_predictions_are_not_used_at_another_point(small_problem: Callable[..., Problem]) -> None:

@@ -10,7 +10,7 @@ import pytest
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
-from deal_hw.calib.pipeline import foretell
+from deal_hw.calib.pipeline import report_unidentifiable
 from deal_hw.calib.uncertainty.intervals import uncertainty_at, with_rows
 from deal_hw.calib.validation.split_half import (
     SplitHalf,
@@ -116,7 +116,7 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     assert len(known.null_directions) == 2
     # The same is said before a search begins.
     said: list[Progress] = []
-    foretell(problem, found, said.append)
+    report_unidentifiable(problem, found, said.append)
     assert [p.stage for p in said] == [BEFORE_SEARCH]
     assert said[0].message.count("measure one of them") == 2
     named = [n for n in space.names if any(n in words for words in known.null_directions)]

@@ -259,7 +259,7 @@ ENTRIES: Lines = [
     ("{kind: geom_restitution, elements: box}", "geom 'box' gives stiffness and damping directly"),
     (
         "{kind: body_mass, elements: tip, nominal: 1, range: [0.5, 2]}",
-        "body 'tip' has no mass in the model: there is nothing to scale",
+        "body 'tip' has no mass in the model, so there is nothing to scale",
     ),
     ("{kind: body_scale, elements: 'z*'}", "unknown MuJoCo body 'z*'; known: upper, tip, cart"),
     ("{kind: servo_effort_limit, elements: '*'}", "'*' matches nothing that can have servo_effort_limit"),

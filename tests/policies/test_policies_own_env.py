@@ -170,8 +170,8 @@ def test_an_environment_may_say_itself_what_it_observes(robot: Path) -> None:
 
 
 WRONG: list[tuple[str, str]] = [
-    ("Swingobservation-v0", "observes something else than the 1 joint positions"),
-    ("Swingaction-v0", "does something else with actions than to write them into the actuators' ctrl"),
+    ("Swingobservation-v0", "does not observe the 1 joint positions"),
+    ("Swingaction-v0", "does not write its actions unchanged into the actuators' ctrl"),
     ("Swingrate-v0", "makes 33.3333 steps a second, robot 'swing' takes 50 commands; correct frame_skip"),
     ("Swingscalar-v0", "must each be a Box of one dimension"),
     ("Swingmodel-v0", "is no MuJoCo environment"),
@@ -216,7 +216,7 @@ def test_what_no_model_holds_is_refused() -> None:
         high=1,
         scale="linear",
     )
-    with pytest.raises(ConfigurationError, match="parameters b act on what is sent and sensed"):
+    with pytest.raises(ConfigurationError, match="parameters b act on commands and measurements"):
         ModelInPlace(model, ParameterSpace([bias]))
     other = Parameter.around("d", "dof_damping", ("knee",), "", 0.1)
     with pytest.raises(UnknownNameError, match="knee"):

@@ -43,7 +43,7 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(tmp_path: Path)
     assert record["training"]["config"]["steps"] == STEPS
     assert record["training"]["members"] == 8
     assert record["seed"] == 4
-    assert record["reward"].endswith("alive bonus by another name.")
+    assert record["reward"].endswith("which has the effect of an alive bonus.")
 
 
 def test_udr_covers_a_factor_of_five_and_30_ms() -> None:

@@ -313,7 +313,7 @@ def test_elements_that_a_macro_makes_are_refused(tmp_path: Path) -> None:
     def change(model: Any) -> None:
         model.dof_damping[1] = 0.3
 
-    with pytest.raises(ConfigurationError, match=r"joint 'j1' is to be changed.*<replicate>"):
+    with pytest.raises(ConfigurationError, match=r"joint 'j1' must change.*<replicate>"):
         write(path, tmp_path / "c.xml", change)
 
 

@@ -285,7 +285,7 @@ def test_creep_falls_in_proportion_to_the_parameter(model: mujoco.MjModel) -> No
         ("motor_gain", "arm", "no motor.*servo_stiffness"),
         ("servo_effort_limit", "cart", "no symmetric effort limit"),
         ("geom_friction", "box", "touches nothing"),
-        ("geom_friction", "ball", "overruled by geom 'floor'"),
+        ("geom_friction", "ball", "overridden by geom 'floor'"),
         ("rod_length", "cart", "not a thin uniform rod"),
         ("body_mass", "world", "fixed to the world"),
     ],
@@ -311,7 +311,7 @@ def test_two_parameters_of_one_thing_are_refused(model: mujoco.MjModel) -> None:
 def test_range_that_the_kind_does_not_allow_is_refused(model: mujoco.MjModel) -> None:
     """A restitution above 1 gains energy."""
     p = Parameter.around("bounce", "geom_restitution", ["floor"], "-", 0.5)
-    with pytest.raises(ConfigurationError, match=r"leaves what geom_restitution allows, \[0, 0.99\]"):
+    with pytest.raises(ConfigurationError, match=r"exceeds what geom_restitution allows, \[0, 0.99\]"):
         check_space(model, ParameterSpace([p]))
 
 

@@ -195,7 +195,7 @@ CHANGES: list[tuple[str, str, str]] = [
         "_rate_hz: 2000.0",
         "is faster than the MJCF's timestep of 0.002 s; write at most 500",
     ),
-    ("mjcf: arm.xml", "mjcf: leg.xml", "its model leg.xml is not there"),
+    ("mjcf: arm.xml", "mjcf: leg.xml", "its model leg.xml does not exist"),
     ("stiffness: 12.0", "stifness: 12.0", "field joints[0].actuator.stifness is 12.0; Unexpected keyword"),
     ("name: arm ", "#", "field name is missing"),
     ("control_rate_hz: 50.0", "control_rate_hz: 30.0", "allowed: whole multiples of control_rate_hz 30"),
@@ -224,7 +224,7 @@ def test_joints_and_actuators_that_are_left_out(model: Path) -> None:
     path = written(model)
     text = path.read_text(encoding="utf-8")
     path.write_text(text[: text.index("  - name: elbow")], encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="the MJCF's elbow are not among `joints`; add them"):
+    with pytest.raises(ConfigurationError, match="the MJCF's joints elbow are not among `joints`; add them"):
         read_robot(path)
     cut = text[: text.rindex("    actuator:")] + "    actuator: null\n"
     path.write_text(cut, encoding="utf-8")
@@ -316,7 +316,7 @@ SPOILT: list[tuple[Callable[[Path], object], str]] = [
     (lambda folder: folder.rename(folder.parent / "away"), "there is no .*robot/files.json"),
     (lambda folder: (folder / "mjcf" / "arm.xml").unlink(), "mjcf/arm.xml is missing"),
     (lambda folder: (folder / "meshes" / "lump.obj").write_text("v 0 0 0"), "lump.obj was changed after"),
-    (lambda folder: (folder / "files.json").write_text("{}"), "holds another robot's model"),
+    (lambda folder: (folder / "files.json").write_text("{}"), "holds another model"),
 ]
 
 
@@ -337,7 +337,7 @@ def test_another_robot_is_not_put_over_it(model: Path, tmp_path: Path) -> None:
     """A dataset has one robot."""
     carry(read_robot(written(model)), tmp_path)
     other = derive_robot(model, control_rate_hz=60.0)
-    with pytest.raises(DatasetError, match=r"carries another robot: robot.yaml differ; name another folder"):
+    with pytest.raises(DatasetError, match=r"holds another robot: robot.yaml differ; name another folder"):
         carry(other, tmp_path)
 
 
@@ -348,7 +348,7 @@ def test_an_absolute_path_is_refused(spread: Path, tmp_path: Path) -> None:
     model.write_text(model.read_text(encoding="utf-8").replace("../meshes", away), encoding="utf-8")
     dataset = tmp_path / "dataset"
     dataset.mkdir()
-    with pytest.raises(ConfigurationError, match="by an absolute path, so no copy of it can be kept"):
+    with pytest.raises(ConfigurationError, match="by an absolute path, so the dataset cannot hold a copy"):
         carry(read_robot(spread), dataset)
     assert not list(dataset.iterdir())
 

@@ -201,7 +201,7 @@ def test_a_dataset_without_its_robot(made: Path, tmp_path: Path, capsys: pytest.
     dataset = tmp_path / "dataset"
     shutil.copytree(made / "run" / "dataset", dataset)
     (dataset / "robot" / "robot.xml").write_text("<mujoco/>", encoding="utf-8")
-    with pytest.raises(DatasetError, match=r"robot.xml was changed after the recordings were taken in"):
+    with pytest.raises(DatasetError, match=r"robot.xml was changed after the recordings were imported"):
         deal_hw.inspect(dataset / "episodes" / "000000.mcap")
     assert main(["data", "verify", str(dataset)]) == 1
     assert "robot.xml was changed" in capsys.readouterr().out

@@ -1,9 +1,9 @@
 """Batched simulation of one robot: N members with their own parameters on one thread pool.
 
-States are tangent coordinates (module of this name), (N, C): for a floating base position, rotation vector
-and then the joints, for a fixed base the joints alone; velocities are MuJoCo's, in the same order. Joint
-positions are as the robot reports them: each member's encoder bias is added to what comes out and taken from
-what goes in.
+States are tangent coordinates (see the module of this name), (N, C): for a floating base its position,
+rotation vector and then the joints, for a fixed base the joints alone. Velocities are MuJoCo's, in the same
+order. Joint positions are as the robot reports them: each member's encoder bias is added to outputs and
+subtracted from inputs.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from deal_hw.sim.parameters.fields import BatchFields
 from deal_hw.types import FloatArray
 
 ENCODER_BIAS = "encoder_bias"
-"""Kind of parameter that no MuJoCo field holds: reported minus true joint position."""
+"""Kind of parameter without a MuJoCo field: reported minus true joint position."""
 
 COMMAND_DELAY = "command_delay"
-"""Kind that no MuJoCo field holds: what an actuator is sent acts later by it, on top of the latency."""
+"""Kind of parameter without a MuJoCo field: delay of an actuator's commands, in addition to the latency."""
 
 SERVO_PLAY = "servo_play"
-"""Kind that no MuJoCo field holds: width of the play in the gear between an actuator and its joint."""
+"""Kind of parameter without a MuJoCo field: width of the gear play between an actuator and its joint."""
 
 SIZES_KEPT = 6
-"""Simulators of so many sizes are kept: one iteration of a search or refinement needs up to four."""
+"""Number of simulator sizes that are kept: one iteration of a search or refinement needs up to four."""
 
 
 def _note(warning: str) -> None:
@@ -43,8 +43,8 @@ def _note(warning: str) -> None:
 
 
 if mujoco.get_mju_user_warning() is None:
-    # A search tries parameters that diverge, thousands of times. They come back as NaN and are counted; by
-    # itself MuJoCo would print a line for each, and write MUJOCO_LOG.TXT where the user stands.
+    # A search tries thousands of parameters that diverge. They become NaN and are counted. By default MuJoCo
+    # would print a line for each, and write MUJOCO_LOG.TXT into the working directory.
     mujoco.set_mju_user_warning(_note)
 
 
@@ -54,16 +54,16 @@ def default_threads() -> int:
 
 
 class ServoBatch:
-    """N simulations of one robot; the one place where the calibrator and the trainer meet the engine.
+    """N simulations of one robot; calibrator and trainer use the engine only through this class.
 
     Args:
         robot: The robot's model.
-        space: The parameters that members differ in.
+        space: The parameters in which members differ.
         count: Members N.
         threads: Threads; None for all CPUs.
 
     Attributes:
-        play: Width of the play before each joint, (N, A) [rad or m]; None where no parameter is a play.
+        play: Width of the play before each joint, (N, A) [rad or m]; None if no parameter is a play.
     """
 
     def __init__(
@@ -131,21 +131,21 @@ class ServoBatch:
         )
 
     def servo_factor(self, kind: str) -> FloatArray:
-        """Return what the device makes of a sent gain or limit: acting value = factor * sent, (N, A)."""
+        """Return the device's factor on a sent gain or limit: acting value = factor * sent, (N, A)."""
         default = self._default[kind]
-        # A gain of zero or a limit of infinity has no factor; what is sent then acts as it is.
+        # A gain of zero or an infinite limit has no factor; the sent value then acts unchanged.
         scalable = np.isfinite(default) & (default != 0)
         factor = self._acting[kind] / np.where(scalable, default, 1.0)
         return np.where(scalable, factor, 1.0)
 
     def lag_s(self, latency_s: FloatArray) -> FloatArray:
-        """Return by how much what is sent acts late: the latency, and each actuator's command delay on top.
+        """Return the delay of commands: the latency, plus each actuator's command delay.
 
         Args:
             latency_s: Total latency of each member, (N,) [s].
 
         Returns:
-            (N,) where no parameter is a command delay, else (N, A) [s].
+            (N,) if no parameter is a command delay, else (N, A) [s].
         """
         latency = np.asarray(latency_s, dtype=float)
         return latency if self._delay_s is None else latency[:, None] + self._delay_s
@@ -157,7 +157,7 @@ class ServoBatch:
         return np.asarray(self._acting[kind] * ratio)
 
     def set_sent(self, stiffness: FloatArray, damping: FloatArray, effort_limit: FloatArray) -> None:
-        """Set the gains and limits that the host sends from now on, (A,) each; motors take none."""
+        """Set the gains and limits that the host sends from now on, (A,) each; without effect on motors."""
         if self.robot.description.actuation != "position":
             return
         gain, bias = self._fields.get("actuator_gainprm"), self._fields.get("actuator_biasprm")
@@ -182,10 +182,10 @@ class ServoBatch:
         """Set the state, (N, C) or (C,) each, of the members in ``where``.
 
         Args:
-            position: Chart coordinates.
+            position: Tangent coordinates.
             velocity: Their velocities: linear in the world, angular in the base's frame, joints.
             where: The members.
-            reference: Reference orientation of the chart, (4,) or (N, 4); the identity by default.
+            reference: Reference orientation, (4,) or (N, 4); the identity by default.
         """
         rows = np.arange(self.count)[where][:, None]
         joints = position[..., self.robot.joints]
@@ -196,17 +196,17 @@ class ServoBatch:
             orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
             self._qpos[rows, [at + 3, at + 4, at + 5, at + 6]] = orientation
         self._qvel[rows, self._dof] = velocity
-        # A warm start left by another episode would make results depend on history in the last digits.
+        # A warm start from another episode would make results depend on history in the last digits.
         self._warmstart[rows[:, 0]] = 0.0
 
     @property
     def position(self) -> FloatArray:
-        """Chart coordinates now, (N, C), around the identity."""
+        """Present tangent coordinates, (N, C), around the identity."""
         return self._chart(self._qpos, None)
 
     @property
     def velocity(self) -> FloatArray:
-        """Velocities now, (N, C)."""
+        """Present velocities, (N, C)."""
         return np.asarray(self._qvel[:, self._dof])
 
     def _chart(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
@@ -232,13 +232,12 @@ class ServoBatch:
         Args:
             setpoint: Set-point (or motor command) in force at each step, (N, S, A).
             every: Record each ``every``-th step; 0 records only the last.
-            reference: Reference orientations of the charts at the recorded steps, (S // every, 4); the
-                identity by default.
+            reference: Reference orientations at the recorded steps, (S // every, 4); the identity by default.
             force: Forces and torques on the coordinates at each step, (N, S, C) [N or N·m]; none by default.
 
         Returns:
             Positions and velocities after steps every, 2 every, ..., (N, S // every, C) each. A member that
-            diverged (MuJoCo's warning counters rose) is NaN from there on.
+            diverged (MuJoCo's warning counters increased) is NaN.
         """
         if self._biased and self.robot.description.actuation == "position":
             # The servo compares the set-point with the biased reading.
@@ -259,7 +258,7 @@ class ServoBatch:
         before = self._warnings()
         self.steps += count * steps
         if not every:
-            # Stepping by rollout with a record of one field costs nothing over bare stepping.
+            # Stepping by rollout with a record of one field costs no more than bare stepping.
             every = steps
         try:
             record = self.batch.rollout(
@@ -269,7 +268,7 @@ class ServoBatch:
             raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
         finally:
             if force is not None:
-                # The engine would keep the last ones.
+                # The engine would keep the last forces.
                 self._applied[:] = 0.0
         position = self._chart(record["qpos"][:, every - 1 :: every], reference)
         velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
@@ -280,20 +279,20 @@ class ServoBatch:
         return position, velocity
 
     def _warnings(self) -> npt.NDArray[np.int64]:
-        # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): a rise is a divergence, which MuJoCo answers
-        # by a reset.
+        # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): an increase is a divergence, after which
+        # MuJoCo resets the state.
         return np.asarray(self.batch.warning[..., 1].sum(axis=-1), dtype=np.int64)
 
 
 class BatchPool:
-    """Simulators of one robot and space by their number of members, the last used ones.
+    """The last used simulators of one robot and space, by number of members.
 
-    A simulator holds an MjData a thread, of tens of megabytes of addresses and up to some megabytes in use.
-    Searches whose stages differ in size would keep one for every size that they ever had.
+    A simulator holds one MjData per thread: tens of megabytes of address space, up to some megabytes in use.
+    Without a limit, searches with stages of different sizes would keep one for every size.
 
     Args:
-        make: Makes a simulator of so many members.
-        most: Simulators that are kept.
+        make: Makes a simulator with a given number of members.
+        most: Most simulators that are kept.
     """
 
     def __init__(self, make: Callable[[int], ServoBatch], most: int = SIZES_KEPT) -> None:
@@ -306,11 +305,11 @@ class BatchPool:
 
     @property
     def steps(self) -> int:
-        """Physics steps of all simulators so far, of those that were given up too."""
+        """Physics steps of all simulators so far, including dropped ones."""
         return self._steps + sum(batch.steps for batch in self._kept.values())
 
     def get(self, count: int) -> ServoBatch:
-        """Return the simulator of ``count`` members; parameters and state are whatever its last user left."""
+        """Return the simulator of ``count`` members; parameters and state are those of its last user."""
         batch = self._kept.pop(count, None) or self._make(count)
         # Last in order is last used.
         self._kept[count] = batch
@@ -320,7 +319,7 @@ class BatchPool:
 
 
 def bare_steps_per_second(robot: RobotModel, count: int, steps: int, threads: int | None = None) -> float:
-    """Measure the engine alone: physics steps a second of ``count`` members, open loop."""
+    """Measure the engine alone: physics steps per second of ``count`` members, open loop."""
     import time
 
     batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())

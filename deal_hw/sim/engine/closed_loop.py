@@ -1,7 +1,7 @@
-"""N simulated robots in a closed loop: a target each control period, late and slewed set-points, the engine.
+"""N simulated robots in a closed loop: targets, delayed and slewed set-points, the engine.
 
-Training, fitness, planned excitations and simulated targets run this one loop. They differ in who decides the
-targets and in what of the state is seen.
+Training, fitness, planned excitations and simulated targets use this loop. They differ in the source of the
+targets and in the observed part of the state.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from deal_hw.types import FloatArray
 
 
 class ClosedLoop:
-    """The way from the targets that a host sends to the states of N members.
+    """The path from the targets that a host sends to the states of N members.
 
     Args:
-        batch: The members; their command delays and plays count.
+        batch: The members; their command delays and plays apply.
         steps: Device periods in a control period.
         step_s: Length of a device period [s]; the physics step by default.
-        whole: Round latencies to device periods, as a device does; otherwise set-points are linear between.
+        whole: Round latencies to device periods, as a device does; otherwise set-points are interpolated.
     """
 
     def __init__(
@@ -41,11 +41,11 @@ class ClosedLoop:
         latency_s: FloatArray,
         where: npt.NDArray[np.intp] | slice = slice(None),
     ) -> None:
-        """Start M of the members anew, their parameters set: until now they were sent one set-point.
+        """Restart M of the members, with parameters set, from a constant past set-point.
 
         Args:
-            setpoint: It, (M, A).
-            latency_s: Their total latencies, (M,) [s]; what would be negative counts as none.
+            setpoint: The past set-point, (M, A).
+            latency_s: Their total latencies, (M,) [s]; negative ones count as zero.
             where: The members.
         """
         late = np.zeros(self.batch.count)
@@ -66,11 +66,10 @@ class ClosedLoop:
         """Send targets and advance by one control period.
 
         Args:
-            target: Position targets [m or rad] or motor commands, (N, A), or those in force at each step,
-                (N, S, A).
+            target: Position targets [m or rad] or motor commands, (N, A), or those at each step, (N, S, A).
             rate: Largest change of a set-point in a device period, (N, A) or at each of its steps (N, S, A);
                 None for motors, whose commands are not slewed.
-            every: Record after each ``every``-th device period; 0 records the end alone.
+            every: Record after each ``every``-th device period; 0 records only the end.
 
         Returns:
             Positions and velocities there, (N, S // every, C) each; NaN where a member diverged.
@@ -89,15 +88,10 @@ class ClosedLoop:
 
 
 def on_physics_steps(batch: ServoBatch, path: FloatArray, step_s: float) -> FloatArray:
-    """Return set-points of device periods, (N, S, A), at the engine's steps.
+    """Return set-points of device periods of ``step_s``, (N, S, A), at the engine's steps.
 
     A physics step may be several device periods (the DEAL paper's 5 ms): then set-points are sampled. Or it
     is a part of one.
-
-    Args:
-        batch: The members.
-        path: The set-points.
-        step_s: Length of a device period [s].
     """
     ratio = batch.robot.step_s / step_s
     if ratio >= 1:
@@ -108,12 +102,12 @@ def on_physics_steps(batch: ServoBatch, path: FloatArray, step_s: float) -> Floa
 def reported(
     joints: FloatArray, noise: Sequence[float], resolution: Sequence[float], rng: np.random.Generator
 ) -> FloatArray:
-    """Return joint positions, (..., J), as an encoder reports them: noisy, then rounded.
+    """Return joint positions, (..., J), as an encoder reports them: with noise, then rounded.
 
     Args:
-        joints: The true ones [m or rad].
+        joints: The true positions [m or rad].
         noise: Standard deviations, (J,).
-        resolution: Steps of the encoder, (J,); 0 or nothing for none.
+        resolution: Steps of the encoder, (J,); 0 or empty for none.
         rng: Draws the noise.
     """
     noisy = joints + rng.standard_normal(joints.shape) * np.array(noise)

@@ -1,4 +1,4 @@
-"""Compiles a user's MJCF: whatever is in it ends in a model that moves, or in one line."""
+"""Compiles a user's MJCF: the result is a model that can be simulated, or a one-line error."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from deal_hw.errors import ConfigurationError, short
 from deal_hw.reading import MIB, check_size, reading
 
 MJCF_BYTES: Final = 64 * MIB
-"""Largest top file of a model; what it includes counts as memory."""
+"""Largest main file of a model; included files count as memory."""
 MEMORY_BYTES: Final = 4096 * MIB
-"""Memory that compiling a model and its first steps may take."""
+"""Memory limit of compiling a model and its first steps."""
 SECONDS: Final = 60.0
-"""Processor time of the same."""
+"""Processor time limit of the same [s]."""
 STEPS: Final = 10
-"""So many steps are simulated before a model is used."""
+"""Number of test steps before a model is used."""
 _DIVERGED: Final = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 _ROOM: Final = "keep bodies apart (contype, exclude), or write a larger <size memory=.../>"
 _OVERFULL: Final = ("mjWARN_CONTACTFULL", "mjWARN_CNSTRFULL")
 
 
 def compile_mjcf(mjcf: Path) -> mujoco.MjModel:
-    """Compile the MJCF of a user.
+    """Compile a user's MJCF.
 
-    A process of its own tries it first, with bounded memory and time: a texture of a million pixels a side, a
-    body replicated a milliard times or a mistake in MuJoCo's own code would otherwise cost this one.
+    A separate process tries it first, with limited memory and time. A texture of a million pixels per side, a
+    body replicated a billion times or an error in MuJoCo's own code would otherwise end this process.
 
     Raises:
-        ConfigurationError: It does not exist, does not compile, takes too much, or does not stand ten steps.
+        ConfigurationError: It does not exist, does not compile, takes too much, or fails in the test steps.
     """
     path = Path(mjcf)
     if not path.exists():
@@ -50,7 +50,7 @@ def compile_mjcf(mjcf: Path) -> mujoco.MjModel:
 
 
 def load_mjcf(mjcf: Path) -> mujoco.MjModel:
-    """Compile an MJCF that is trusted.
+    """Compile a trusted MJCF.
 
     Raises:
         ConfigurationError: It does not compile.
@@ -62,13 +62,13 @@ def load_mjcf(mjcf: Path) -> mujoco.MjModel:
 
 
 def _try(path: Path) -> None:
-    """Compile and step in a process of its own.
+    """Compile and step in a separate process.
 
     Raises:
-        ConfigurationError: It did not go well.
+        ConfigurationError: That failed.
     """
     words = [sys.executable, "-m", "deal_hw.sim.engine.compiling", os.path.abspath(path)]
-    # MuJoCo leaves its log where it works; that shall not be the user's folder.
+    # MuJoCo writes its log into the working directory, which must not be the user's.
     with tempfile.TemporaryDirectory(prefix="deal-hw-") as folder:
         try:
             done = subprocess.run(
@@ -89,8 +89,8 @@ def _try(path: Path) -> None:
         return
     raise ConfigurationError(
         f"model {path} cannot be compiled in {MEMORY_BYTES / MIB:g} MiB and {SECONDS:g} s (status "
-        f"{done.returncode}: {short(done.stderr.decode(errors='replace')[-80:]) or 'no word'}); is there a "
-        "size or a count with too many digits?"
+        f"{done.returncode}: {short(done.stderr.decode(errors='replace')[-80:]) or 'no message'}); look for "
+        "a size or a count with too many digits"
     )
 
 
@@ -117,7 +117,7 @@ def problem_of(path: str) -> str:
     if warned & set(_OVERFULL):
         return f"has more contacts than its memory holds; {_ROOM}"
     if warned:
-        return f"diverges in its first {STEPS} steps; reduce the timestep, or mend masses and gains"
+        return f"diverges in its first {STEPS} steps; reduce the timestep, or correct masses and gains"
     return ""
 
 
@@ -128,7 +128,7 @@ def _main() -> None:
     _limit(resource.RLIMIT_CORE, 0)
     answer: dict[str, Any] = {"problem": problem_of(sys.argv[1])}
     print("\n" + json.dumps(answer), end="", flush=True)
-    # Whatever was damaged on the way shall not speak at the end.
+    # Damaged memory must not be touched by the interpreter's exit.
     os._exit(0)
 
 

@@ -1,4 +1,4 @@
-"""Parameters in a model that somebody else simulates, such as a Gymnasium environment of a user."""
+"""Parameters in a model that other code simulates, such as a user's Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from deal_hw.sim.parameters.fields import ModelFields, element_id
 from deal_hw.types import FloatArray
 
 _SERVO: Final = ("servo_stiffness", "servo_damping", "servo_effort_limit")
-"""Gains and limits that the model itself holds where nobody sends others."""
+"""Gains and limits that the model holds if no host sends others."""
 
 
 class ModelInPlace:
-    """Writes parameters into a model, again and again from its first values.
+    """Writes parameters into a model, each time from its first values.
 
     Args:
-        model: An MjModel; what it holds now is nominal.
+        model: An MjModel; its present values are nominal.
         space: The parameters.
 
     Raises:
-        ConfigurationError: A parameter acts where no model can, such as an encoder's bias.
+        ConfigurationError: A parameter acts outside the model, such as an encoder's bias.
         UnknownNameError: The model lacks an element.
     """
 
@@ -34,7 +34,7 @@ class ModelInPlace:
         outside = [p.name for p in space.parameters if p.kind not in KINDS and p.kind not in _SERVO]
         if outside:
             raise ConfigurationError(
-                f"parameters {', '.join(outside)} act on what is sent and sensed, not in the model of an "
+                f"parameters {', '.join(outside)} act on commands and measurements, not in the model of an "
                 "environment; calibrate without them (--parameters), or train with --nominal"
             )
         check_space(model, space)
@@ -42,7 +42,7 @@ class ModelInPlace:
         self._fields = ModelFields(model, copy.copy(model))
 
     def apply(self, theta: FloatArray) -> None:
-        """Write free parameters, (K,), and the known ones; states of the model's simulations stay."""
+        """Write free parameters, (K,), and the known ones; simulation states stay."""
         apply_parameters(self._fields, self._space, theta[None])
         values = {**self._space.known, **dict(zip(self._space.names, map(float, theta), strict=True))}
         model = self._model
@@ -55,5 +55,5 @@ class ModelInPlace:
                     model.actuator_biasprm[index, 2] = -value
                 else:
                     model.actuator_forcerange[index] = np.array([-value, value])
-        # Derives the constants that depend on masses; the environment's own data stay as they are.
+        # Derives constants that depend on masses; the environment's own data stay.
         mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -60,12 +60,12 @@ class RobotModel:
 
     @property
     def rotation(self) -> slice:
-        """Which coordinates are the base's rotation vector; none of them for a fixed base."""
+        """Coordinates of the base's rotation vector; empty for a fixed base."""
         return slice(3, 6) if self.base is not None else slice(0, 0)
 
     @property
     def joints(self) -> slice:
-        """Which coordinates are joints."""
+        """Coordinates of the joints."""
         return slice(0 if self.base is None else 6, None)
 
     @property
@@ -79,7 +79,7 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
 
     Args:
         description: The robot.
-        step_s: Physics step [s]; None for the MJCF's, or for the device period where that is no multiple.
+        step_s: Physics step [s]; None for the MJCF's, or for the device period if that is no multiple of it.
 
     Raises:
         ConfigurationError: The MJCF does not compile, or the device period is no multiple of the step.

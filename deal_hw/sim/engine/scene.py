@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes of its model and where its bodies are, as plain arrays for a viewer."""
+"""A robot's appearance: the shapes of its model and the poses of its bodies, as plain arrays for a viewer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _KINDS: dict[int, ShapeKind] = {
     int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
 }
 _VISIBLE_GROUPS = range(3)
-"""MuJoCo's viewer shows groups 0 to 2; collision shapes are kept in the others by custom."""
+"""MuJoCo's viewer shows groups 0 to 2; by convention, collision shapes are in the others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Shape:
     Attributes:
         name: Unique name.
         body: Index of the body it is fixed to; 0 is the world.
-        kind: What it is.
+        kind: Kind of shape.
         size: Half extents (box, ellipsoid), or radius and half length along z (sphere, capsule, cylinder),
             (3,) [m].
         position: Of the centre, in the body's frame, (3,) [m].
@@ -103,13 +103,13 @@ def read_scene(robot: RobotModel) -> Scene:
 def body_poses(
     robot: RobotModel, position: FloatArray, base: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where the bodies are at each of T joint positions.
+    """Return the poses of the bodies at each of T joint positions.
 
     Args:
         robot: The robot's model.
         position: Joint positions, (T, J) [m or rad].
-        base: Position and quaternion wxyz of a floating base in the world, (T, 7); None: where the model has
-            it.
+        base: Position and quaternion wxyz of a floating base in the world, (T, 7); None for its place in the
+            model.
 
     Returns:
         Positions (T, B, 3) [m] and quaternions w x y z (T, B, 4) of the B bodies in the world; NaN where a

@@ -1,8 +1,8 @@
 """The set-point generator in front of a position servo: it moves towards the target at a limited speed.
 
-MuJoCo has no such limit, so it is applied to the control before the engine sees it. The set-point depends on
-targets, limit and time only, never on the state, so whole episodes are computed at once, and a constant
-latency only shifts it.
+MuJoCo has no such limit, so it is applied to the control before the engine. The set-point depends only on
+targets, limit and time, never on the state. So whole episodes are computed at once, and a constant latency
+only shifts it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def slew(start: FloatArray, target: FloatArray, rate: FloatArray) -> FloatArray:
         return np.broadcast_to(targets, (count, steps, start.shape[1]))
     out = np.empty((count, steps, start.shape[1]))
     now = start
-    # Between changes of target and rate the set-point moves on a straight line until it is there.
+    # Between changes of target and rate the set-point moves on a straight line until it arrives.
     for begin, end in itertools.pairwise(_changes(steps, targets, rates)):
         reach = rates[:, min(begin, rates.shape[1] - 1), None] * np.arange(1, end - begin + 1)[:, None]
         gap = (targets[:, begin] - now)[:, None]
@@ -49,15 +49,15 @@ def _never_binds(start: FloatArray, targets: FloatArray, rates: FloatArray) -> b
 
 
 def play(start: FloatArray, setpoint: FloatArray, width: FloatArray) -> FloatArray:
-    """Drive through a gear with play: what comes out moves only where the play is used up.
+    """Return the output of a gear with play: it moves only when the play is used up.
 
     Args:
-        start: What comes out before the first step, (N, A).
-        setpoint: What goes in, (N, S, A).
+        start: Output before the first step, (N, A).
+        setpoint: Input, (N, S, A).
         width: Width of the play, (N, A), at least 0.
 
     Returns:
-        What comes out, (N, S, A).
+        Output, (N, S, A).
     """
     out = np.empty_like(setpoint)
     half, now = width / 2, start

@@ -13,7 +13,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 class SingleSimulation:
     """A MuJoCo model without its actuators: the caller is the controller and holds an effort for one step.
 
-    Only for mechanisms of slide and hinge joints, where positions and velocities have the same length (J).
+    It is only for mechanisms of slide and hinge joints, where positions and velocities have equal length (J).
 
     Args:
         mjcf: The model.
@@ -51,7 +51,7 @@ class SingleSimulation:
         frictionloss: float | None = None,
         armature: float | None = None,
     ) -> None:
-        """Set what resists a joint; SI units of sliding or turning joints."""
+        """Set damping, dry friction and armature of a joint; SI units of sliding or turning joints."""
         index = self._id(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint)
         if damping is not None:
             self._model.dof_damping[index] = damping
@@ -76,7 +76,7 @@ class SingleSimulation:
         return values
 
     def set_state(self, position: Sequence[float], velocity: Sequence[float]) -> None:
-        """Put the mechanism into a state; the solver's memory of earlier steps goes with the old one."""
+        """Set the state, and clear the solver's warm start."""
         self._qpos[:] = position
         self._qvel[:] = velocity
         self._data.qacc_warmstart[:] = 0.0

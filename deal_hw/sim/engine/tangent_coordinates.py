@@ -1,8 +1,9 @@
-"""Charts of orientation: a floating base's state as plain coordinates around a reference orientation.
+"""Tangent coordinates of orientation: a floating base's state as plain coordinates around a reference.
 
-An orientation is given as the rotation vector, in the body's own frame, that leads to it from a reference:
-``q = reference * exp(r)``. Near the reference this is as good as three plain coordinates, so least squares,
-Kalman steps and critics need not know that there is a base. Quaternions are MuJoCo's: unit, (w, x, y, z).
+An orientation is given by the rotation vector, in the body's own frame, that leads to it from a reference
+orientation: ``q = reference * exp(r)``. Near the reference this is as good as three plain coordinates. So
+least squares, Kalman steps and critics need no special case for a base. Quaternions are MuJoCo's: unit, (w,
+x, y, z).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def to_quaternion(rotation_vector: FloatArray, reference: FloatArray) -> FloatAr
 def to_vector(quaternion: FloatArray, reference: FloatArray) -> FloatArray:
     """Return the rotation vectors, (..., 3) [rad], of orientations, (..., 4), from references, (..., 4).
 
-    Orientations that are not finite (a diverged member) come out as NaN.
+    Orientations that are not finite (a diverged member) become NaN.
     """
     shape = np.broadcast_shapes(quaternion.shape[:-1], reference.shape[:-1])
     q = np.broadcast_to(quaternion, (*shape, 4))

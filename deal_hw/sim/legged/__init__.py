@@ -1,1 +1,1 @@
-"""Robots with legs: simulated step by step, and what feet that stand say of the base."""
+"""Legged robots: simulation step by step, and estimates of the base from standing feet."""

@@ -32,7 +32,7 @@ def standing_targets(
         pose: Joint positions at rest, (J,).
 
     Raises:
-        ConfigurationError: A foot cannot stay where it is: the body moves too far.
+        ConfigurationError: A foot cannot stay in place: the body moves too far.
     """
     if robot.base is None:
         raise ConfigurationError(f"{robot.description.name}: its base is fixed, so no foot stands")
@@ -50,7 +50,7 @@ def standing_targets(
         return np.array([data.geom_xpos[g] for g in geoms])
 
     rest = place(pose)
-    # Body moved by (R, d): a foot that stays is seen from the body at R^T (p - d).
+    # Body moved by (R, d): a fixed foot has the position R^T (p - d) in the body's frame.
     wanted = Rotation.from_rotvec(turn).inv().as_matrix()[:, None] @ (rest - shift[:, None])[..., None]
     found, joints = np.empty((len(shift), len(pose))), np.array(pose, dtype=float)
     for t in range(len(shift)):
@@ -65,8 +65,8 @@ def standing_targets(
             joints = joints + np.linalg.lstsq(np.concatenate(rows), error, rcond=None)[0]
         else:
             raise ConfigurationError(
-                f"no joint positions keep the feet where they are when the body moves by {shift[t].round(3)} "
-                f"m, {turn[t].round(3)} rad; move it less"
+                f"no joint positions keep the feet in place when the body moves by {shift[t].round(3)} m, "
+                f"{turn[t].round(3)} rad; move it less"
             )
         found[t] = joints
     return found

@@ -1,4 +1,4 @@
-"""Base velocity and height of a legged robot from its joints and its IMU: feet that stand do not move."""
+"""Base velocity and height of a legged robot from its joints and its IMU: standing feet do not move."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ VELOCITY_STD = 0.04
 """Standard deviation of a base velocity from the legs [m/s]: joint noise, soft contacts, a little slip."""
 
 HEIGHT_STD = 0.004
-"""Standard deviation of a base height from the legs [m]: how far contacts give way."""
+"""Standard deviation of a base height from the legs [m]: compression of the contacts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Felt:
-    """What tells more of a base that walks: which feet bear it, and how it is pushed.
+    """Further measurements of a walking robot, which show the feet's loads and the base's acceleration.
 
     Attributes:
         time_s: Of each sample, (T,) [s].
@@ -41,7 +41,7 @@ class Felt:
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """What the legs say of the base.
+    """Estimate of the base from the legs.
 
     Attributes:
         velocity: Of the base's origin in the world, (T, 3) [m/s].
@@ -63,9 +63,9 @@ def leg_odometry(
 ) -> Odometry:
     """Estimate base velocity and height on a level floor at height 0.
 
-    A foot that stands rolls about its contact point: the velocity of the sphere's lowest point is zero. Where
-    the lowest feet are all that says which feet stand, their answers are combined by their median; a walking
-    robot's joint efforts and accelerometer say more, see :mod:`deal_hw.sim.legged.velocity_filter`.
+    A standing foot rolls about its contact point: the velocity of the sphere's lowest point is zero. Without
+    ``felt``, the lowest feet count as standing, and the estimate is the median over them. A walking robot's
+    joint efforts and accelerometer give more, see :mod:`deal_hw.sim.legged.velocity_filter`.
 
     Args:
         robot: A robot with a floating base.
@@ -74,7 +74,7 @@ def leg_odometry(
         angular_velocity: In the base's frame, (T, 3) [rad/s].
         joint_position: (T, J).
         joint_velocity: (T, J).
-        felt: Accelerometer and efforts; None where nothing reports them.
+        felt: Accelerometer and efforts; None if nothing reports them.
 
     Raises:
         ConfigurationError: The robot's base is fixed.
@@ -116,7 +116,7 @@ def leg_odometry(
 
 
 def smooth_orientation(orientation: FloatArray, weights: FloatArray) -> FloatArray:
-    """Smooth orientations, (T, 4), by a moving polynomial; the ends stay as they are reported.
+    """Smooth orientations, (T, 4), by a moving polynomial; the ends stay unsmoothed.
 
     Args:
         orientation: Reported orientations.

@@ -12,21 +12,21 @@ from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
 _TOUCH = 1.5
-"""Reach of a foot's touch sensor over the foot's own radius."""
+"""Radius of a foot's touch sensor over the foot's own radius [-]."""
 
 
 class LeggedSimulation:
-    """A MuJoCo model without its actuators: the caller is the drives and holds an effort for one step.
+    """A MuJoCo model without its actuators: the caller is the motors and holds an effort for one step.
 
-    What the body senses belongs to the state before the last step: MuJoCo finds accelerations and contact
+    Measurements belong to the state before the last step, because MuJoCo computes accelerations and contact
     forces there. Arrays follow ``joints`` (J) and ``feet`` (F).
 
     Args:
-        mjcf: The model; its base is a body of this name, with a free joint of the same name or none.
+        mjcf: The model.
         joints: The hinge joints, in the caller's order.
-        feet: Spheres that bear the robot.
+        feet: Sphere geoms of the feet.
         timestep_s: Length of one step [s].
-        base: The body that carries the legs.
+        base: The body that carries the legs, with a free joint of the same name or none.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class LeggedSimulation:
         return np.asarray(self._data.qacc[self._v])
 
     def base_position(self) -> FloatArray:
-        """Return where the base's frame is in the world, (3,) [m]."""
+        """Return the position of the base's frame in the world, (3,) [m]."""
         at = self._base_q
         return np.array(self._data.qpos[at : at + 3] if self._free else self._data.xpos[self._body])
 
@@ -86,7 +86,7 @@ class LeggedSimulation:
         return np.array(self._data.qvel[self._base_v + 3 : self._base_v + 6]) if self._free else np.zeros(3)
 
     def specific_force(self) -> FloatArray:
-        """Return what an ideal accelerometer at the base's origin reads, in its frame, (3,) [m/s²]."""
+        """Return the reading of an ideal accelerometer at the base's origin, in its frame, (3,) [m/s²]."""
         felt = -self._gravity
         if self._free:
             felt = felt + self._data.qacc[self._base_v : self._base_v + 3]
@@ -101,7 +101,7 @@ class LeggedSimulation:
         return np.array(self._data.sensordata)
 
     def foot_position(self) -> FloatArray:
-        """Return where the feet's centres are in the base's frame, (F, 3) [m]."""
+        """Return the positions of the feet's centres in the base's frame, (F, 3) [m]."""
         rotation = self._data.xmat[self._body].reshape(3, 3)
         return np.asarray((self._data.geom_xpos[self._feet] - self._data.xpos[self._body]) @ rotation)
 
@@ -112,7 +112,7 @@ class LeggedSimulation:
         frictionloss: FloatArray | None = None,
         armature: FloatArray | None = None,
     ) -> None:
-        """Set what resists the joints, (J,) each [N·m·s/rad, N·m, kg·m²]."""
+        """Set damping, dry friction and armature of the joints, (J,) each [N·m·s/rad, N·m, kg·m²]."""
         if damping is not None:
             self._model.dof_damping[self._v] = damping
         if frictionloss is not None:
@@ -122,20 +122,20 @@ class LeggedSimulation:
             self._derive()
 
     def add_payload(self, mass_kg: float) -> None:
-        """Make the base heavier; its inertia grows along, as for the same shape and more density."""
+        """Add mass to the base; its inertia scales, as for the same shape and more density."""
         mass = self._model.body_mass[self._body]
         self._model.body_inertia[self._body] *= 1.0 + mass_kg / mass
         self._model.body_mass[self._body] = mass + mass_kg
         self._derive()
 
     def set_floor_friction(self, friction: float, floor: str = "floor") -> None:
-        """Set the sliding friction of the geom that is the floor; a model may have none."""
+        """Set the sliding friction of the floor geom, if the model has one."""
         index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, floor)
         if index >= 0:
             self._model.geom_friction[index, 0] = friction
 
     def _derive(self) -> None:
-        """Derive what depends on masses and armatures; positions stay."""
+        """Derive constants of masses and armatures; positions stay."""
         # Constraint regularisation depends on inverse weights that only mj_setConst derives; it overwrites
         # qpos.
         before = np.array(self._data.qpos)
@@ -151,11 +151,11 @@ class LeggedSimulation:
         self._model.dof_damping[self._v] = damping
 
     def set_pose(self, position: FloatArray, height_m: float | None = None) -> None:
-        """Put the robot into a pose at rest, upright; the solver forgets its earlier steps.
+        """Set an upright pose at rest, and clear the solver's warm start.
 
         Args:
             position: Of the joints, (J,) [rad].
-            height_m: Of the base's frame [m]; None leaves it. A held base stays where it is.
+            height_m: Of the base's frame [m]; None keeps it. A held base does not move.
         """
         self._data.qpos[self._q] = position
         self._data.qvel[:] = 0.0
@@ -164,7 +164,7 @@ class LeggedSimulation:
             self._data.qpos[self._base_q : self._base_q + 7] = (0.0, 0.0, height_m, 1.0, 0.0, 0.0, 0.0)
 
     def push(self, force: Sequence[float]) -> None:
-        """Push at the base from now on, (3,) [N] in the world; zeros end it."""
+        """Push at the base from now on, (3,) [N] in the world; zeros end the push."""
         self._data.xfrc_applied[self._body, :3] = force
 
     def step(self, effort: FloatArray) -> None:

@@ -1,7 +1,7 @@
-"""Velocity of a base from its accelerometer and the feet that stand; numpy only.
+"""Velocity of a base from its accelerometer and its standing feet; numpy only.
 
-A foot that stands says how fast the base moves. Feet of a trot slide when they land and leave the floor,
-accelerometers drift: each mends the other.
+A standing foot gives the velocity of the base. Feet of a trot slide when they land and take off, and
+accelerometers drift: the filter combines both.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import numpy.typing as npt
 from deal_hw.types import FloatArray
 
 GRAVITY: Final = np.array([0.0, 0.0, 9.81])
-"""What an accelerometer reads at rest, in the world [m/s²]."""
+"""Reading of an accelerometer at rest, in the world [m/s²]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterSettings:
-    """How far feet and accelerometer are trusted; chosen on six emulated Go2 of profile `realistic`.
+    """Weights of feet and accelerometer; chosen on six emulated Go2 of profile `realistic`.
 
     Attributes:
         drift: Standard deviation that integrated accelerations gain in a second [m/s].
-        foot_m_s: Standard deviation of what a standing foot says [m/s].
-        gate: A foot that is off by more standard deviations slides or just lands; it weighs less.
-        start_m_s: Standard deviation of the velocity at the beginning [m/s].
-        share: A foot that bears less than this share of what the most loaded one bears swings.
-        borne: Where all feet together bear less than this share of the weight, none stands: the swing of legs
-            looks like a third of it.
+        foot_m_s: Standard deviation of a standing foot's velocity [m/s].
+        gate: Deviation above which a foot slides or lands and weighs less [standard deviations].
+        start_m_s: Standard deviation of the first velocity [m/s].
+        share: Load below which a foot swings, as a share of the largest load.
+        borne: Total load below which no foot stands, as a share of the weight: the swing of legs looks like a
+            third of it.
     """
 
     drift: float = 0.5
@@ -44,12 +44,7 @@ FILTER: Final = FilterSettings()
 
 
 def rotated(orientation: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return vectors of a base's frame, (T, 3), in the world.
-
-    Args:
-        orientation: Of the base, wxyz, (T, 4).
-        vectors: They.
-    """
+    """Return vectors of a base's frame, (T, 3), in the world, for orientations wxyz, (T, 4)."""
     axis = orientation[:, 1:]
     turned = np.cross(axis, vectors)
     return np.asarray(vectors + 2.0 * (orientation[:, :1] * turned + np.cross(axis, turned)))
@@ -61,9 +56,9 @@ def standing_feet(
     """Return which feet stand, (T, F).
 
     Args:
-        load: What each foot bears, upwards, (T, F) [N].
-        weight_n: Of the robot [N].
-        settings: How it is judged.
+        load: Vertical load on each foot, (T, F) [N].
+        weight_n: Weight of the robot [N].
+        settings: Limits.
     """
     enough = load.sum(axis=1, keepdims=True) > settings.borne * weight_n
     return np.asarray((load > settings.share * load.max(axis=1, keepdims=True)) & enough)
@@ -81,9 +76,9 @@ def filtered_velocity(
     Args:
         time_s: (T,) [s].
         acceleration: Specific force in the world, (T, 3) [m/s²].
-        answers: Velocity of the base by each foot, were it to stand, (T, F, 3) [m/s].
+        answers: Velocity of the base by each foot, if it stands, (T, F, 3) [m/s].
         stands: Which feet stand, (T, F).
-        settings: How far each is trusted.
+        settings: Weights.
     """
     pushed = acceleration - GRAVITY
     forward = _passed(np.diff(time_s, prepend=time_s[0]), pushed, answers, stands, settings)

@@ -1,4 +1,4 @@
-"""What a robot with legs weighs, by what its motors bear while it stands."""
+"""Mass of a legged robot from its motors' efforts while it stands."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def standing_mass(
 ) -> float:
     """Return the mass of the whole robot [kg].
 
-    The floor's forces are those at which motors and the weight of the legs are in balance. Dry friction hides
-    a part of each joint's effort, and a motor's estimate of its effort is as good as its maker says: no
-    motion of a robot on its feet tells masses and gains apart, though, as all forces scale together.
+    The floor's forces balance the motors' efforts and the weight of the legs. Dry friction hides a part of
+    each joint's effort, and a motor's estimate of its effort is only as good as its maker states. But no
+    motion of a robot on its feet separates masses from gains, because all forces scale together.
 
     Args:
         robot: A robot with a floating base and feet, on a level floor, at rest.
@@ -30,7 +30,9 @@ def standing_mass(
         ConfigurationError: The robot's base is fixed, or the description names no feet.
     """
     if robot.base is None or not robot.description.feet:
-        raise ConfigurationError(f"{robot.description.name}: only a robot on feet weighs itself")
+        raise ConfigurationError(
+            f"{robot.description.name}: weighing needs a floating base and feet in the description"
+        )
     model, data = robot.model, mujoco.MjData(robot.model)
     feet = [element_id(model, "geom", name) for name in robot.description.feet]
     at, dofs, jacobian = robot.base[0], list(robot.qvel), np.empty((3, model.nv))

@@ -1,6 +1,6 @@
-"""The calibrated model as a change of the user's own MJCF: his text, includes and meshes are kept.
+"""The calibrated model as a change of the user's own MJCF, with the user's text, includes and meshes.
 
-Only attributes that hold a changed value are touched; :mod:`deal_hw.sim.mjcf.text` says how.
+Only attributes with a changed value are edited; see :mod:`deal_hw.sim.mjcf.text`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ LATENCY_NUMERIC = "deal_hw.latency_s"
 WITHOUT_VALUE_TEXT = "deal_hw.without_value"
 
 ROUNDS = 4
-"""Writing one value may take another out of the compiler's hands (``dampratio``, ``settotalmass``): what then
-differs is written in the next round."""
+"""Most rounds of writing. Writing one value may disable another one of the compiler (``dampratio``,
+``settotalmass``); the next round writes the resulting difference."""
 
 _CHECK = 1e-9
 _CHECK_DERIVED = 1e-5
@@ -46,20 +46,20 @@ def write_calibrated_mjcf(
 ) -> tuple[Path, ...]:
     """Write the robot's MJCF with calibrated values.
 
-    Parameters of which the recordings say nothing are marked: the comment at the top names them with the
-    values that stand in the file, and ``<custom>`` lists them in the ``<text>`` :data:`WITHOUT_VALUE_TEXT`.
-    What MuJoCo has no field for goes into ``<custom>``, too: the latency as ``deal_hw.latency_s``, and for
-    each kind of parameter outside MuJoCo (speed limit, encoder bias) one number an element, beside a
-    ``<text>`` of the same name that lists the elements.
+    Unidentified parameters are marked. The comment at the top names them with the values in the file, and
+    ``<custom>`` lists them in the ``<text>`` :data:`WITHOUT_VALUE_TEXT`. Values without a MuJoCo field go
+    into ``<custom>``, too. The latency is ``deal_hw.latency_s``. Each kind of parameter outside MuJoCo (speed
+    limit, encoder bias) has one number per element, beside a ``<text>`` of the same name that lists the
+    elements.
 
     Args:
         robot: The robot's model.
         space: The parameters.
         theta: Calibrated values, (K,).
-        path: File to write; included files that change are written beside it.
+        path: File to write; changed included files are written beside it.
         latency_s: Total latency [s].
-        source: What found the values, for the comment at the top.
-        without_value: Names of the parameters without a value.
+        source: Source of the values, for the comment at the top.
+        without_value: Names of the unidentified parameters.
 
     Returns:
         The files written, ``path`` first.
@@ -79,14 +79,14 @@ def write_calibrated_mjcf(
         model_with(robot, space, theta),
         device_values(space, theta) | {LATENCY_NUMERIC: ([latency_s], [])},
         source,
-        # A file that was calibrated before may have a list: it is replaced, also by none.
+        # A file that was calibrated before may have a list: it is replaced, also by "none".
         {WITHOUT_VALUE_TEXT: " ".join(without_value) or "none"},
         remarks,
     )
 
 
 def device_values(space: ParameterSpace, theta: FloatArray) -> dict[str, tuple[list[float], list[str]]]:
-    """Return what no MuJoCo field holds by its name in ``<custom>``: values and elements."""
+    """Return values without a MuJoCo field, by their name in ``<custom>``: values and elements."""
     values = dict(zip(space.names, np.asarray(theta, dtype=float), strict=True)) | space.known
     found: dict[str, tuple[list[float], list[str]]] = {}
     for parameter in space.parameters:
@@ -112,8 +112,8 @@ def change_mjcf(
     Args:
         path: The user's file.
         target: The file to write.
-        want: The MjModel it is to compile to; the same elements as the file's.
-        custom: Numbers for ``<custom>`` and the elements they belong to, by name.
+        want: The wanted MjModel; it has the same elements as the file's.
+        custom: Numbers for ``<custom>`` and their elements, by name.
         source: For the comment at the top.
         texts: Texts for ``<custom>``, by name.
         remarks: More lines for that comment.
@@ -163,7 +163,7 @@ def require_other(target: Path, path: Path) -> None:
 
 def _compile(path: Path) -> Any:
     try:
-        # Where MuJoCo finds what included files refer to depends on whether this path is absolute.
+        # MuJoCo finds files of included files differently for absolute and relative paths.
         return mujoco.MjModel.from_xml_path(os.path.abspath(path))
     except (ValueError, mujoco.FatalError) as err:
         raise ConfigurationError(
@@ -174,7 +174,7 @@ def _compile(path: Path) -> Any:
 
 def _check(path: Path, written: Any, want: Any) -> None:
     wrong = differences(written, want, _CHECK)
-    # Values near zero after a rotation or a scaling are rounding.
+    # Values near zero after a rotation or a scaling are rounding errors.
     wrong = {
         k: v
         for k, v in wrong.items()

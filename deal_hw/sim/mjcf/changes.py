@@ -1,4 +1,4 @@
-"""From differences of compiled models to changes of MJCF elements."""
+"""Changes of MJCF elements from differences of compiled models."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _OBJECTS = {
     "pair": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
 }
 _MACROS = ("replicate", "composite", "flexcomp", "attach")
-"""Elements that make others which are not written in the file."""
+"""Elements that make others without a text of their own in the file."""
 
 _DOFS = {0: 6, 1: 3, 2: 1, 3: 1}
 """Degrees of freedom by joint type: free, ball, slide, hinge."""
@@ -45,7 +45,7 @@ def arrays(model: Any) -> Iterator[tuple[str, Any]]:
 
 
 def differences(have: Any, want: Any, tolerance: float = SAME) -> dict[str, Mask]:
-    """Return where two compiled models differ, by field, without what MuJoCo derives from other fields.
+    """Return where two compiled models differ, by field, without fields that MuJoCo derives from others.
 
     Raises:
         ConfigurationError: The models have different elements.
@@ -67,13 +67,13 @@ def differences(have: Any, want: Any, tolerance: float = SAME) -> dict[str, Mask
 
 
 def number(value: float) -> str:
-    """Return a number that reads back to the same double."""
+    """Format a number that reads back to the same double."""
     # MuJoCo's reader refuses numbers below the smallest normal one.
     return repr(float(value)).removesuffix(".0") if abs(value) >= np.finfo(float).tiny else "0"
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Return numbers as an attribute has them."""
+    """Format numbers as an attribute's value."""
     return " ".join(number(v) for v in values)
 
 
@@ -81,7 +81,7 @@ class MjcfChanges:
     """Writes differences of compiled models into the elements of a file.
 
     Args:
-        root: Root element of the top file, included files spliced in.
+        root: Root element of the main file, included files spliced in.
         model: The compiled file: it names the elements.
         degrees: The compiler reads angles in degrees.
     """
@@ -127,8 +127,8 @@ class MjcfChanges:
         element = self._elements[kind][index]
         if element is None:
             raise ConfigurationError(
-                f"{self._name(kind, index)} is to be changed, but is not to be found in the MJCF's text (it "
-                "has no name, or <replicate>, <composite> or <attach> makes it): name it or write it out"
+                f"{self._name(kind, index)} must change, but it is not in the MJCF's text (it has no name, "
+                "or <replicate>, <composite> or <attach> makes it): give it a name or write it out"
             )
         return element
 
@@ -156,7 +156,7 @@ class MjcfChanges:
                 self._unfold_freejoint(i, element, want)
             self._write(target, kind, i, element, attribute, have, want)
             if attribute.name in ("damping", "stiffness") and self._springdamper(element):
-                # It would set both again when the file is compiled.
+                # It would overwrite both when the file is compiled.
                 element.set("springdamper", "0 0")
             placed = attribute.name in ("pos", "quat", "size") and "fromto" in attribute.drop
             if kind == "geom" and placed and int(have.geom_type[i]) == mujoco.mjtGeom.mjGEOM_MESH:
@@ -192,7 +192,7 @@ class MjcfChanges:
         return any(e.get("springdamper") is not None for e in (element, *classes))
 
     def _unfold_freejoint(self, i: int, element: Element, want: Any) -> None:
-        # Defaults of joints reach <joint type="free"> but not <freejoint>: all is written out.
+        # Joint defaults apply to <joint type="free"> but not to <freejoint>: everything is written out.
         element.rename = "joint"
         element.set("type", "free")
         element.set("align", None)
@@ -203,7 +203,7 @@ class MjcfChanges:
 
     def _inertia(self, i: int, have: Any, want: Any) -> None:
         for compiler in (e for e in self.root.spliced() if e.tag == "compiler"):
-            # Both would override what is written; what else they did is written out in the next round.
+            # Both would override the written values; their other effects are written in the next round.
             compiler.set("settotalmass", None)
             if compiler.get("inertiafromgeom") == "true":
                 compiler.set("inertiafromgeom", "auto")
@@ -346,7 +346,7 @@ def _values(kind: str, i: int, attribute: Attribute, model: Any) -> npt.NDArray[
 
 
 def _index(root: Element, model: Any) -> dict[str, list[Element | None]]:
-    """Return the element of each compiled object: by name, or by order where all are written in the file."""
+    """Return the element of each compiled object: by name, or by order if all are written in the file."""
     written: dict[str, list[Element]] = {kind: [] for kind in _OBJECTS}
     for section in root.spliced():
         if section.tag == "worldbody":
@@ -360,7 +360,7 @@ def _index(root: Element, model: Any) -> dict[str, list[Element | None]]:
     for kind, (number_of, count) in _OBJECTS.items():
         size = int(getattr(model, count))
         names = [mujoco.mj_id2name(model, number_of, i) for i in range(size)]
-        # The world is a body without an element of that name.
+        # The world is a body without an element of that kind.
         elements: list[Element | None] = [*([None] if kind == "body" else []), *written[kind]]
         own = [e.given.get("name") if e is not None else "world" for e in elements]
         ordered = (

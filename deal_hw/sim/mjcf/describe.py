@@ -1,4 +1,4 @@
-"""A robot description of any MJCF: what calibration needs to know of a robot that has no driver here."""
+"""A robot description from any MJCF: the facts that calibration needs of a robot without a driver."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import HINGE, SLIDE, joint_of
 
 WINDOW_TICKS = 20
-"""Control periods in the longest window of a search: it is what ``--window`` divides into."""
+"""Control periods in a search's longest window, whose length is ``--window``."""
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -28,10 +28,10 @@ _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """How a recording's samples lie on the physics grid.
+    """Position of a recording's samples on the physics grid.
 
     Attributes:
-        period_s: From one sample to the next [s].
+        period_s: Sampling period [s].
         substeps: Physics steps in it.
         samples_per_tick: Samples in one control period, the unit of window lengths.
     """
@@ -47,7 +47,7 @@ class Sampling:
 
 
 def sampling(period_s: float, timestep_s: float, window_s: float) -> Sampling:
-    """Fit the physics grid to a sampling period: a whole number of steps, each near the wanted one.
+    """Fit the physics grid to a sampling period: a whole number of steps near the wanted one.
 
     Args:
         period_s: Sampling period of the recordings [s].
@@ -71,18 +71,18 @@ def sampling(period_s: float, timestep_s: float, window_s: float) -> Sampling:
 def describe(
     mjcf: Path, model: Any, joints: Sequence[str], actuated: Sequence[str], rates: Sampling
 ) -> RobotDescription:
-    """Describe the robot of a model as its recordings show it.
+    """Describe the robot of a model by its recordings.
 
     Args:
         mjcf: The model's file.
-        model: The same, compiled.
-        joints: The joints that were recorded, in the recording's order.
-        actuated: Those of them that took commands, in command order.
-        rates: Of the recordings.
+        model: The compiled model.
+        joints: The recorded joints, in the recording's order.
+        actuated: Those with commands, in command order.
+        rates: Sampling of the recordings.
 
     Raises:
-        ConfigurationError: A joint or actuator of the model was not recorded, an actuator is of a kind that
-            is not known here, or servos and motors are mixed.
+        ConfigurationError: A joint or actuator of the model was not recorded, an actuator is of an unknown
+            kind, or servos and motors are mixed.
         UnknownNameError: The model lacks a joint.
     """
     index = [element_id(model, "joint", name) for name in joints]
@@ -130,14 +130,9 @@ def describe(
 
 
 def with_speed_limits(description: RobotDescription, model: Any, space: ParameterSpace) -> RobotDescription:
-    """Return the description with a speed limit of the set-point where a parameter says one.
+    """Return the description with set-point speed limits from the parameters' nominal values.
 
-    An MJCF has none, so it is the parameter's nominal value that the servo counts as told; members scale it.
-
-    Args:
-        description: Of a model's robot.
-        model: The MjModel.
-        space: The parameters.
+    An MJCF has no such limits; members scale these.
     """
     limits = list(description.speed_limit)
     for p in space.parameters:
@@ -148,7 +143,7 @@ def with_speed_limits(description: RobotDescription, model: Any, space: Paramete
 
 
 def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
-    """Check that every joint was recorded; return the name of the free joint that carries the robot."""
+    """Check that every joint was recorded; return the name of the base's free joint, if any."""
     free: str | None = None
     missing = []
     for index in range(model.njnt):
@@ -182,7 +177,7 @@ def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[st
 
 
 def _actuation(model: Any, actuator: int, joint: str) -> str:
-    """Return how an actuator takes commands, as :class:`RobotDescription` names it."""
+    """Return an actuator's kind of command, as in :class:`RobotDescription`."""
     name = model.actuator(actuator).name or f"of joint {joint}"
     gain, bias = model.actuator_gainprm[actuator], model.actuator_biasprm[actuator]
     plain = (
@@ -207,7 +202,7 @@ def _actuation(model: Any, actuator: int, joint: str) -> str:
 
 
 def _effort_limit(model: Any, actuator: int, servo: bool) -> float:
-    """Return a servo's symmetric force limit, infinite where it has none; a motor's torque at control 1."""
+    """Return a servo's symmetric force limit, infinite for none; a motor's torque at control 1."""
     if not servo:
         return float(abs(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0]))
     low, high = model.actuator_forcerange[actuator]

@@ -1,8 +1,8 @@
 """Calibrated values for other simulators: actuator tables, URDF-side values and plain YAML.
 
-Each file lists what its format cannot hold, and which values the recordings say nothing about. Field names
-are those of Isaac Lab's ``ActuatorBaseCfg`` and ``DelayedPDActuatorCfg``, of mjlab's
-``BuiltinPositionActuatorCfg`` (1.6), and of URDF.
+Each file lists the values that its format cannot hold, and the unidentified ones. Field names are those of
+Isaac Lab's ``ActuatorBaseCfg`` and ``DelayedPDActuatorCfg``, of mjlab's ``BuiltinPositionActuatorCfg`` (1.6),
+and of URDF.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ACTUATOR_KINDS: Mapping[str, str] = {
 }
 """Kind of parameter -> column of the actuator table."""
 _URDF_KINDS = ("dof_damping", "dof_frictionloss", "servo_effort_limit", "rod_length")
-"""Kinds that URDF has a place for, beside those of bodies' masses and inertias."""
+"""Kinds with a field in URDF, beside those of bodies' masses and inertias."""
 _BODY_KINDS = ("body_mass", "body_inertia", "body_ipos_x", "body_ipos_y", "body_ipos_z", "rod_length")
 
 _ISAAC_LAB = (
@@ -62,13 +62,7 @@ _URDF = (
 
 
 def write_exports(folder: Path, robot: RobotModel, result: CalibrationResult) -> list[str]:
-    """Write the values for other programs; return the files' names.
-
-    Args:
-        folder: Where to write.
-        robot: The nominal model.
-        result: What was found.
-    """
+    """Write the values for other programs into a folder; return the files' names."""
     tables = {
         ACTUATORS: actuator_tables(robot, result),
         URDF: urdf_values(robot, result),
@@ -81,10 +75,10 @@ def write_exports(folder: Path, robot: RobotModel, result: CalibrationResult) ->
 
 
 def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
-    """Return the actuators of the calibrated model as Isaac Lab and mjlab take them.
+    """Return the actuators of the calibrated model in the formats of Isaac Lab and mjlab.
 
-    A motor that takes efforts has no gains: Isaac Lab's columns do not name it, mjlab's fields are None.
-    Values are at the joint: gears are in.
+    A motor that takes efforts has no gains: it is not in Isaac Lab's columns, and mjlab's fields are None.
+    Values are at the joint, gears included.
     """
     model = model_with(robot, result.space, result.estimate)
     rows = {
@@ -94,7 +88,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
     columns = ("stiffness", "damping", "armature", "friction", "effort_limit", "velocity_limit")
     low, high = result.latency_interval_s
     steps = {"min": math.floor(max(low, 0.0) / robot.step_s), "max": math.ceil(max(high, 0.0) / robot.step_s)}
-    # A joint that is not named keeps what its USD says.
+    # A joint that is not named keeps the values of its USD.
     isaac = {
         column: {joint: row[column] for joint, row in rows.items() if row[column] is not None}
         for column in columns
@@ -102,7 +96,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
     for joint in isaac["damping"]:
         isaac["damping"][joint] += rows[joint]["joint_damping"]
     blind = [result.space[name] for name in result.without_value]
-    untold = {
+    unidentified = {
         joint: [
             _ACTUATOR_KINDS[p.kind] for p in blind if p.kind in _ACTUATOR_KINDS and _drives(robot, p, number)
         ]
@@ -112,7 +106,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
         "format": "deal_hw.actuators/1",
         "physics_step_s": robot.step_s,
         "delay_s": {joint: row["delay_s"] for joint, row in rows.items()},
-        "without_value": {joint: names for joint, names in untold.items() if names},
+        "without_value": {joint: names for joint, names in unidentified.items() if names},
         "isaac_lab": {
             "class": "DelayedPDActuatorCfg",
             "joint_names_expr": list(rows),
@@ -142,7 +136,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
 
 
 def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
-    """Return what a URDF holds of the calibrated model: joints, and links whose masses were calibrated."""
+    """Return the calibrated model's values for a URDF: joints, and links with calibrated masses."""
     model = model_with(robot, result.space, result.estimate)
     description = robot.description
     joints: dict[str, Any] = {}
@@ -168,7 +162,7 @@ def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
 
 
 def plain_values(result: CalibrationResult) -> dict[str, Any]:
-    """Return each value with its unit and 90 % interval; None where the recordings say nothing about it."""
+    """Return each value with its unit and 90 % interval; None for an unidentified value."""
     values: dict[str, Any] = {}
     for parameter, estimate, (low, high) in zip(result.space, result.estimate, result.interval, strict=True):
         has = parameter.name not in result.without_value
@@ -216,7 +210,7 @@ def _actuator(robot: RobotModel, model: Any, result: CalibrationResult, number: 
 
 
 def _device_value(robot: RobotModel, result: CalibrationResult, kind: str, number: int) -> float | None:
-    """Return what no MuJoCo field holds of an actuator; None where nothing is known of it."""
+    """Return an actuator's value without a MuJoCo field; None if unknown."""
     values = dict(zip(result.space.names, result.estimate, strict=True)) | result.space.known
     for parameter in result.space.parameters:
         if parameter.kind == kind and _drives(robot, parameter, number):
@@ -249,7 +243,7 @@ def _inertial(model: Any, body: int) -> dict[str, Any]:
 
 
 def _left_out(result: CalibrationResult, kinds: Sequence[str] | Mapping[str, str]) -> list[str]:
-    """Return the calibrated parameters that a format has no place for, with their values."""
+    """Return the calibrated parameters without a field in a format, with their values."""
     values = dict(zip(result.space.names, result.estimate, strict=True)) | result.space.known
     return [
         f"{p.name} = {float(values[p.name]):.5g} {p.unit} ({p.kind})"

@@ -1,4 +1,4 @@
-"""Names, units and limits of the joints of any MJCF: what a recording is compared with before it is used."""
+"""Names, units and limits of the joints of any MJCF, for checks of a recording."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointFacts:
-    """The joints of a model that have one coordinate each, in the model's order.
+    """The joints of a model with one coordinate each, in the model's order.
 
     Attributes:
         names: (J,).
         units: "rad" or "m", (J,).
-        limits: Lowest and highest position, (J, 2) [rad or m]; infinite where free.
-        left_out: Free and ball joints, which a recording gives no single position of.
+        limits: Lowest and highest position, (J, 2) [rad or m]; infinite for none.
+        left_out: Free and ball joints, which have no single position.
         servo: Whether an actuator of each joint takes positions, (J,).
         motor: Whether one takes efforts, (J,).
-        command: Lowest and highest command that the actuator takes by its ctrlrange, as recordings hold it
-            (positions, or efforts at the joint), (J, 2); infinite where free.
+        command: Lowest and highest command by the actuator's ctrlrange, as in recordings (positions, or
+            efforts at the joint), (J, 2); infinite for none.
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
 
     Args:
         mjcf: Its file.
-        model: The same, compiled; None to compile it.
+        model: The compiled model; None to compile it.
 
     Raises:
         ConfigurationError: The file does not exist or does not compile, or has no hinge or slide.
@@ -79,7 +79,7 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
 def _actuation(
     model: mujoco.MjModel, column: Mapping[int, int]
 ) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], np.ndarray[Any, np.dtype[np.bool_]], FloatArray]:
-    """Return which joints have servos and motors, and what these take; columns are those of the joints."""
+    """Return which joints have servos and motors, and their command ranges, by column of the joints."""
     servo, motor = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
     command = np.tile([-np.inf, np.inf], (len(column), 1))
     for actuator in range(model.nu):

@@ -1,4 +1,4 @@
-"""The MJCF of a model that is in memory, as a file: a calibration edits text."""
+"""The MJCF file of a model in memory; a calibration edits text."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from deal_hw.errors import ConfigurationError
 
 
 def mjcf_file(model: Any, folder: Path) -> Path:
-    """Return the path of a model, or write what is in memory into a folder.
+    """Return the path of a model; a model in memory is written into a folder.
 
     Args:
-        model: A path, an ``mujoco.MjSpec``, or the ``mujoco.MjModel`` that was compiled last: a compiled
-            model has lost its text, and MuJoCo can only write that of the last one.
-        folder: Where to write.
+        model: A path, an ``mujoco.MjSpec``, or the ``mujoco.MjModel`` that was compiled last. A compiled
+            model has lost its text, and MuJoCo can write only that of the last one.
+        folder: Output folder.
 
     Raises:
-        ConfigurationError: It is something else, or another model than the last one.
+        ConfigurationError: It has another type, or is not the last compiled model.
     """
     if isinstance(model, str | Path):
         return Path(model)
@@ -47,7 +47,7 @@ _INSTEAD = "give the path of its MJCF, or its mujoco.MjSpec"
 
 
 def _same(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
-    """Return whether two models have the same joints and actuators, and masses to what XML rounds."""
+    """Return whether two models have the same joints and actuators, and equal masses (rounded)."""
     sizes = ("nq", "nv", "nu", "nbody", "njnt", "ngeom")
     if any(getattr(one, name) != getattr(other, name) for name in sizes) or one.names != other.names:
         return False

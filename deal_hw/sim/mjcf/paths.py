@@ -12,14 +12,14 @@ _MESH_DIR = ("mesh", "hfield", "skin", "flexcomp")
 
 
 class Relocation:
-    """Keeps a model's references right when its text is written elsewhere.
+    """Keeps a model's references valid when its text is written to another folder.
 
-    Included files that need no change stay where they are and are referred to there; changed ones are written
-    beside the output.
+    Unchanged included files stay in place and are referred to there; changed ones are written beside the
+    output.
 
     Args:
         top: The model's files.
-        target: The top file to write.
+        target: The main file to write.
     """
 
     def __init__(self, top: SourceFile, target: Path) -> None:
@@ -47,7 +47,7 @@ class Relocation:
                 element.set("file", self._moved(element.given["file"]))
 
     def files(self) -> dict[Path, SourceFile]:
-        """Return which file is to be written where, included ones first, and point the includes to them."""
+        """Return the files to write by path, included ones first, and point the includes to them."""
         found: dict[Path, SourceFile] = {}
         self._settle(self.top, found)
         found[self.target] = self.top
@@ -87,7 +87,7 @@ class Relocation:
         return compilers[-1]
 
     def _directory(self, element: Element) -> Path:
-        """Return the folder that a file of an asset is relative to."""
+        """Return the folder of an asset's relative file names."""
         own = "texturedir" if element.tag == "texture" else "meshdir"
         found = ""
         for compiler in self.top.root.spliced():
@@ -96,8 +96,8 @@ class Relocation:
         return self.source / found
 
     def _beside_include(self, file: SourceFile, element: Element) -> None:
-        # MuJoCo looks in the asset folder first, then beside the file that the element stands in (tried out
-        # on 3.17). The second place is lost when that file is copied, so it is written out.
+        # MuJoCo looks in the asset folder first, then beside the file of the element (tested on 3.17). The
+        # second place is lost when that file is copied, so it is written out.
         folder = self._directory(element)
         for name in _files(element):
             beside = file.path.parent / element.given[name]

@@ -1,4 +1,4 @@
-"""Which MJCF attribute holds which compiled field of an MjModel, and which fields follow from others."""
+"""The MJCF attribute of each compiled field of an MjModel, and the fields that follow from others."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
 
 @dataclass(frozen=True, slots=True)
 class Attribute:
-    """How compiled fields become one attribute.
+    """One attribute and its compiled fields.
 
     Attributes:
         name: The attribute.
-        fields: Compiled fields whose values stand in it one after the other.
+        fields: Compiled fields whose values it holds, in this order.
         trim: Trailing zeros may be left out: the attribute has a varying number of values.
-        angle: The values are angles where the joint turns: in degrees where the compiler says so.
+        angle: The values are angles of turning joints, in degrees if the compiler says so.
         flag: The value is a truth value.
-        drop: Attributes that say the same in another way; they are removed.
+        drop: Other attributes with the same meaning; they are removed.
     """
 
     name: str
@@ -76,7 +76,7 @@ ACTUATOR = (
     Attribute("delay", ("actuator_delay",)),
 )
 GAIN_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_dynprm")
-"""Written as kp and kv where the element is a shortcut that has them."""
+"""Written as kp and kv in elements that have these."""
 
 TYPE_FIELDS = ("actuator_gaintype", "actuator_biastype", "actuator_dyntype")
 
@@ -118,7 +118,7 @@ TABLES: Mapping[str, tuple[Attribute, ...]] = {
         Attribute("solimp", ("pair_solimp",)),
     ),
 }
-"""What can be written, by kind of element."""
+"""Attributes that can be written, by kind of element."""
 
 OPTION_WORDS: Mapping[str, tuple[str, ...]] = {
     "integrator": ("Euler", "RK4", "implicit", "implicitfast"),
@@ -148,7 +148,7 @@ OPTIONS = (
     "o_friction",
     *OPTION_WORDS,
 )
-"""Options that can be written, named alike in MJCF and in ``MjModel.opt``."""
+"""Options that can be written; names are equal in MJCF and ``MjModel.opt``."""
 
 ACTUATOR_WORDS: Mapping[str, tuple[str, ...]] = {
     "gaintype": ("fixed", "affine", "muscle"),
@@ -191,11 +191,11 @@ COMPILED = frozenset(
         "light_dir0",
     }
 )
-"""Computed by the compiler alone: a model that was changed after compiling may hold the older value."""
+"""Computed only by the compiler: a model that was changed after compiling may hold the older value."""
 
 COMPILED_PREFIXES = ("bvh_", "body_bvh", "oct_", "efm0_", "efmC_", "flexedge_", "B_", "D_", "M_", "map")
 TEXT_PREFIXES = ("name_", "names_", "numeric_", "text_")
-"""Tables of names and of custom elements, which the written file has more of."""
+"""Tables of names and of custom elements, of which the written file has more."""
 
 
 def is_text(field: str) -> bool:

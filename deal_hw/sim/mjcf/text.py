@@ -1,9 +1,9 @@
 """MJCF files as text: attributes are changed in place, and every other byte stays as the user wrote it.
 
-expat says at which byte each tag stands, so an edit replaces bytes inside one start tag. Comments, attribute
-order, quotes and indentation of everything else come out as they went in. Included files are read with the
-file that includes them; where MuJoCo looks for them was tried out on 3.17: first beside the top file, then
-beside the file that includes them.
+expat gives the byte position of each tag, so an edit replaces bytes inside one start tag. Comments, attribute
+order, quotes and indentation of everything else stay. Included files are read with the file that includes
+them. MuJoCo looks for them beside the main file first, then beside the file that includes them (tested on
+3.17).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ _ATTRIBUTE = re.compile(rb"""\s+([^\s=<>/]+)\s*=\s*("[^"]*"|'[^']*')""")
 
 @dataclass(slots=True, eq=False)
 class Element:
-    """One element of an MJCF file, with the changes to make to it.
+    """One element of an MJCF file, with its changes.
 
     Attributes:
         tag: Its name.
-        given: Attributes as the file has them.
-        start: Byte at which its start tag begins; -1 for a new element.
-        end: Byte at which its end tag begins.
-        children: Elements inside; an ``<include>`` holds what the included file's root holds.
+        given: Attributes in the file.
+        start: Byte position of its start tag; -1 for a new element.
+        end: Byte position of its end tag.
+        children: Elements inside; those of an ``<include>`` are those of the included file's root.
         changes: Attributes to set; None to remove.
-        rename: Another tag to give it.
-        inside: New elements to insert before its first child.
-        last: New elements to insert before its end tag.
+        rename: A new tag.
+        inside: New elements before its first child.
+        last: New elements before its end tag.
     """
 
     tag: str
@@ -48,7 +48,7 @@ class Element:
     last: list[Element] = field(default_factory=list)
 
     def get(self, name: str) -> str | None:
-        """Return an attribute as it will be written."""
+        """Return an attribute with its change."""
         return self.changes[name] if name in self.changes else self.given.get(name)
 
     def set(self, name: str, value: str | None) -> None:
@@ -57,12 +57,12 @@ class Element:
 
     @property
     def name(self) -> str:
-        """The tag as it will be written."""
+        """The tag with its change."""
         return self.rename or self.tag
 
     @property
     def changed(self) -> bool:
-        """Whether anything of the element itself is to be changed."""
+        """Whether the element itself changes."""
         return (
             any(self.given.get(k) != v for k, v in self.changes.items())
             or bool(self.rename)
@@ -76,7 +76,7 @@ class Element:
             yield from child.walk()
 
     def text(self, indent: bytes) -> bytes:
-        """Return a new element as text; ``indent`` is the white space that its line begins with."""
+        """Return a new element as text; ``indent`` is the white space at the beginning of its line."""
         attributes = b"".join(
             b" %s=%s" % (k.encode(), quoted(v)) for k, v in self.changes.items() if v is not None
         )
@@ -101,10 +101,10 @@ class SourceFile:
     """One file of a model.
 
     Attributes:
-        path: Where it is.
+        path: The file.
         text: Its bytes.
         elements: Its own elements in document order, the root first.
-        includes: The files it includes, with the element that includes each.
+        includes: Its included files, with the element that includes each.
         header: Comment to put before the root element.
     """
 
@@ -120,14 +120,14 @@ class SourceFile:
         return self.elements[0]
 
     def every(self) -> Iterator[SourceFile]:
-        """Yield this file and all that it includes."""
+        """Yield this file and all its included files."""
         yield self
         for _, included in self.includes:
             yield from included.every()
 
     @property
     def changed(self) -> bool:
-        """Whether any of its own elements is to be changed."""
+        """Whether any of its own elements changes."""
         return any(element.changed for element in self.elements)
 
     def render(self) -> bytes:
@@ -137,7 +137,7 @@ class SourceFile:
             if element.changed:
                 pieces.extend(self._edits(element))
         if self.header:
-            # Two hyphens end a comment, and names are the user's.
+            # Two hyphens end a comment, and the text holds the user's names.
             words = self.header.replace("--", "- -").encode()
             pieces.append((self.root.start, self.root.start, b"<!-- " + words + b" -->\n"))
         text = self.text
@@ -172,20 +172,20 @@ class SourceFile:
         if added:
             yield at, at, added
         if element.inside and own:
-            # In front of the first child: a remark behind the start tag stays where it is.
+            # Before the first child: a comment after the start tag stays in place.
             first = own[0].start
             yield first, first, b"".join(new.text(deeper) + deeper for new in element.inside)
         elif element.inside:
             yield close + 1, close + 1, b"".join(deeper + new.text(deeper) for new in element.inside)
         if element.last:
-            # Behind the last child, before the white space in front of the end tag.
+            # After the last child, before the white space of the end tag.
             last = len(self.text[: element.end].rstrip())
             yield last, last, b"".join(deeper + new.text(deeper) for new in element.last)
         if element.rename and not alone:
             yield element.end + 2, element.end + 2 + len(element.tag.encode()), tag
 
     def _indent(self, element: Element) -> bytes:
-        """Return line break and white space in front of an element; empty where it stands within a line."""
+        """Return line break and white space before an element; empty within a line."""
         at = element.start
         while at > 0 and self.text[at - 1 : at] in (b" ", b"\t"):
             at -= 1
@@ -196,17 +196,17 @@ class SourceFile:
 
 
 def quoted(value: str) -> bytes:
-    """Return an attribute's value between quotes."""
+    """Return an attribute's value in quotes."""
     return b'"' + escape(value, {'"': "&quot;"}).encode() + b'"'
 
 
 def read_files(path: Path) -> SourceFile:
-    """Read a model's file and all that it includes.
+    """Read a model's file and all its included files.
 
     Raises:
         ConfigurationError: A file is missing or not well-formed.
     """
-    # Not resolved: MuJoCo looks beside a link, not beside what it points to.
+    # Not resolved: MuJoCo looks beside a link, not beside its target.
     absolute = Path(os.path.abspath(path))
     return _read(absolute, absolute.parent)
 
@@ -251,7 +251,7 @@ def _parse(path: Path, text: bytes) -> list[Element]:
         parser.Parse(text, True)
     except expat.ExpatError as err:
         raise ConfigurationError(
-            f"{path} is not well-formed XML ({err}), so it cannot be changed in place; MuJoCo's reader is "
-            "more lenient: mend that line"
+            f"{path} is not well-formed XML ({err}), so it cannot be changed in place; MuJoCo's reader "
+            "accepts more: correct that line"
         ) from err
     return elements

@@ -1,4 +1,4 @@
-"""Parameter kinds: how a physical parameter changes a MuJoCo model, one small function each.
+"""Parameter kinds: the effect of a physical parameter on a MuJoCo model, one small function each.
 
 A kind's ``apply(fields, elements, values)`` writes ``values`` (N,) for the named elements into the fields of
 N simulations. The table :data:`KIND_TABLE` is explicit; new kinds go into the tuple of their element's file.
@@ -35,20 +35,20 @@ KIND_TABLE: Mapping[str, Kind] = MappingProxyType(
 KINDS: Mapping[str, Apply] = MappingProxyType(
     {name: kind.apply for name, kind in KIND_TABLE.items() if kind.apply is not None}
 )
-"""Kinds that MuJoCo fields hold."""
+"""Kinds with MuJoCo fields."""
 
 DEVICE_KINDS = tuple(name for name, kind in KIND_TABLE.items() if kind.apply is None)
-"""Kinds that no MuJoCo field holds: what stands between simulator, commands and recording applies them."""
+"""Kinds without a MuJoCo field: code between simulator, commands and recording applies them."""
 
 SENSOR_NOISE = "sensor_noise"
-"""The one kind that cannot be searched: what recordings are weighed by."""
+"""The only kind that cannot be searched: it weights the recordings."""
 
 SERVO_KINDS = ("servo_stiffness", "servo_damping", "servo_effort_limit", "servo_speed_limit")
-"""Kinds that scale with what the robot was sent."""
+"""Kinds that scale with the sent command."""
 
 
 def find_kind(name: str) -> Kind:
-    """Return the kind of that name.
+    """Return the kind with a name.
 
     Raises:
         UnknownNameError: There is none; the message lists the kinds, and the nearest one if any is near.
@@ -63,17 +63,13 @@ def find_kind(name: str) -> Kind:
 
 
 def check_kinds(space: ParameterSpace) -> None:
-    """Check that every parameter is of a known kind.
-
-    Raises:
-        UnknownNameError: One is not; the message lists the kinds.
-    """
+    """Raise `UnknownNameError`, which lists the kinds, for a parameter of an unknown kind."""
     for parameter in space.parameters:
         find_kind(parameter.kind)
 
 
 def check_space(model: Any, space: ParameterSpace) -> None:
-    """Check that a model has what the parameters name, and that their values can act there.
+    """Check that a model has the parameters' elements, and that their values can act there.
 
     Args:
         model: The MjModel.
@@ -82,7 +78,7 @@ def check_space(model: Any, space: ParameterSpace) -> None:
     Raises:
         UnknownNameError: A kind or an element is not known; the message lists the names.
         ConfigurationError: A value is outside what the kind allows, an element cannot have the parameter, two
-            parameters write the same thing, or another geom overrules a contact parameter.
+            parameters write the same field, or another geom overrides a contact parameter.
     """
     owner: dict[tuple[str, str], str] = {}
     for p in space.parameters:
@@ -117,11 +113,11 @@ def _check_searchable(p: Parameter) -> None:
 def _check_bounds(p: Parameter, kind: Kind) -> None:
     if p.low < kind.least or p.high > kind.most:
         raise ConfigurationError(
-            f"parameter {p.name!r}: range [{p.low:g}, {p.high:g}] {p.unit} leaves what {p.kind} allows, "
+            f"parameter {p.name!r}: range [{p.low:g}, {p.high:g}] {p.unit} exceeds what {p.kind} allows, "
             f"[{kind.least:g}, {kind.most:g}]; narrow the range"
         )
     if not p.elements:
-        raise ConfigurationError(f"parameter {p.name!r} names no {kind.element}")
+        raise ConfigurationError(f"parameter {p.name!r} names no {kind.element}; list its `elements`")
 
 
 def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> None:
@@ -136,7 +132,7 @@ def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> Non
     count = theta.shape[0]
     columns = {name: theta[:, k] for k, name in enumerate(space.names)}
     used = [(KIND_TABLE[p.kind], p) for p in space.parameters if p.kind in KINDS]
-    # Kinds that scale or shift what they find start from the model each time, or they would pile up.
+    # Kinds that scale or shift a field start from the model each time, or changes would accumulate.
     for field in sorted({field for kind, _ in used if kind.relative for field in kind.writes}):
         fields.get(field)[:] = getattr(fields.model, field)
     for _, parameter in sorted(used, key=lambda pair: pair[0].order):

@@ -28,9 +28,9 @@ _GEOMETRY = (
 
 
 def body_mass(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set body masses [kg]; the inertia scales along, as for a body of the same shape and another density.
+    """Set body masses [kg]; the inertia scales too, as for a body of the same shape and another density.
 
-    The inertia that scales is the one at hand: apply lengths first.
+    The present inertia scales: apply lengths first.
     """
     mass, inertia = fields.get("body_mass"), fields.get("body_inertia")
     for name in elements:
@@ -42,7 +42,7 @@ def body_mass(fields: Fields, elements: Sequence[str], values: Array) -> None:
 def body_inertia(fields: Fields, elements: Sequence[str], values: Array) -> None:
     """Scale the inertia about the centre of mass by a factor; mass and centre stay.
 
-    The inertia that scales is the one at hand, after mass and length.
+    The present inertia scales: apply mass and length first.
     """
     inertia = fields.get("body_inertia")
     for name in elements:
@@ -56,7 +56,7 @@ def _move_centre(axis: int) -> Apply:
             body = element_id(fields.model, "body", name)
             ipos[:, body, axis] += values
             if fields.model.body_sameframe[body]:
-                # Where centre and origin coincide the compiler says so, and the engine then never looks at
+                # If centre and origin coincide, the compiler marks this, and the engine then ignores
                 # body_ipos.
                 fields.get("body_sameframe")[:, body] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
 
@@ -67,10 +67,10 @@ body_ipos_x, body_ipos_y, body_ipos_z = _move_centre(0), _move_centre(1), _move_
 
 
 def rod_length(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set the length of thin uniform rods along their body's z axis [m]; centre and inertia move along.
+    """Set the length of thin uniform rods along their body's z axis [m]; centre and inertia change, too.
 
     For a rod of mass m and length l with one end at the body's origin: centre of mass l / 2, inertia m l^2 /
-    12. Drawn geoms keep their size; they have no mass and no contact.
+    12. Geoms keep their size; they have no mass and no contact.
     """
     mass, inertia, ipos = fields.get("body_mass"), fields.get("body_inertia"), fields.get("body_ipos")
     for name in elements:
@@ -82,9 +82,9 @@ def rod_length(fields: Fields, elements: Sequence[str], values: Array) -> None:
 
 
 def body_scale(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Scale a body's geometry by a factor: everything fixed to it, and where its child bodies begin.
+    """Scale a body's geometry by a factor: everything fixed to it, and the origins of its child bodies.
 
-    Positions and sizes scale, the centre of mass too; the inertia scales with the square, the mass stays.
+    Positions, sizes and the centre of mass scale; the inertia scales with the square, the mass stays.
     """
     model = fields.model
     for name in elements:
@@ -116,8 +116,8 @@ def _scalable(model: Any, body: int, name: str) -> None:
         touches = model.geom_contype[geom] or model.geom_conaffinity[geom]
         if int(model.geom_type[geom]) in _SHARED_SHAPES and touches:
             raise ConfigurationError(
-                f"body {name!r} touches with a mesh, whose vertices all simulations share: it cannot have "
-                "another size in each; give it primitives for contact, or use rod_length for a rod"
+                f"body {name!r} has a contact mesh, whose vertices all simulations share, so its size cannot "
+                "differ between them; give it primitives for contact, or use rod_length for a rod"
             )
 
 
@@ -126,7 +126,7 @@ def _movable_centre(model: Any, body: int, name: str) -> None:
     if model.body_simple[body]:
         raise ConfigurationError(
             f"body {name!r} has its centre of mass in its origin and was compiled to a diagonal inertia, so "
-            f'no offset fits; write <body name="{name}" simple="false"> in the MJCF'
+            f'no offset is possible; write <body name="{name}" simple="false"> in the MJCF'
         )
 
 

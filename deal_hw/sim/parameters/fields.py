@@ -1,7 +1,7 @@
-"""One view on model fields for a batch of simulations and for a single model.
+"""One interface to model fields for a batch of simulations and for a single model.
 
-The functions in ``deal_hw.sim.parameters`` write through this view, so that the calibrator's batch, the
-emulator's hidden model and the model written for the user are all changed by the same code.
+The functions in ``deal_hw.sim.parameters`` write through it. So the same code changes the calibrator's batch,
+the emulator's hidden model and the model written for the user.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Fields(Protocol):
 
     @property
     def model(self) -> Any:
-        """The MjModel that gives names and nominal values; never written."""
+        """The MjModel of names and nominal values; never written."""
         ...
 
     def get(self, name: str) -> Array:

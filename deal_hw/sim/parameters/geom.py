@@ -1,8 +1,8 @@
 """Parameter kinds of contacts: sliding friction and restitution of a geom.
 
-A contact has two geoms, and MuJoCo mixes their values: the geom of higher ``priority`` rules alone; at equal
-priority the larger friction counts, and solref is a weighted mean. So a geom's value acts as it is written
-only where no partner of equal or higher priority overrules it; :func:`check_partners` looks at that.
+A contact has two geoms, and MuJoCo mixes their values. The geom of higher ``priority`` decides alone. At
+equal priority the larger friction counts, and solref is a weighted mean. So a geom's value acts unchanged
+only if no partner of equal or higher priority overrides it; :func:`check_partners` checks that.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ def geom_friction(fields: Fields, elements: Sequence[str], values: Array) -> Non
 
 
 def damping_ratio(restitution: Array) -> Array:
-    """Return the damping ratio whose spring-damper bounces with these coefficients of restitution, (N,).
+    """Return the damping ratio of a spring-damper with these coefficients of restitution, (N,).
 
-    A linear spring-damper of damping ratio z comes back after half a period with the share e = exp(-pi z /
-    sqrt(1 - z^2)) of its speed; solved for z. It falls as e rises, from 1 at e = 0 to 0 at e = 1. That is the
-    usual textbook map, for a spring that can also pull; :func:`bounce` has what a contact really does.
+    A linear spring-damper of damping ratio z returns after half a period with the share e = exp(-pi z /
+    sqrt(1 - z^2)) of its speed; solved for z. It falls from 1 at e = 0 to 0 at e = 1. That is the usual
+    textbook formula, for a spring that can also pull; see :func:`bounce` for a real contact.
     """
     log = np.log(np.clip(restitution, 1e-9, MOST_RESTITUTION))
     return np.asarray(-log / np.hypot(np.pi, log))
 
 
 def bounce(ratio: float) -> float:
-    """Return the share of its approach speed with which a body really leaves a contact of this damping ratio.
+    """Return the share of its approach speed with which a body leaves a contact of this damping ratio.
 
-    A contact cannot pull, so it ends where its force does, before the half period is over: exp(-2 z acos(z) /
+    A contact cannot pull, so it ends when its force does, before the half period is over: exp(-2 z acos(z) /
     sqrt(1 - z^2)), and with hyperbolic functions above z = 1 (Schwager and Pöschel, Granular Matter 9, 2007,
     written with z). A restitution of 0.9, 0.6, 0.3, 0.1, 0 bounces with 0.90, 0.63, 0.40, 0.25, 0.14.
     """
@@ -61,10 +61,10 @@ def geom_restitution(fields: Fields, elements: Sequence[str], values: Array) -> 
     """Set the coefficient of restitution, through solref, as MuJoCo has none.
 
     Contacts are spring-dampers ``solref = (timeconst, dampratio)``. The damping ratio follows from the
-    restitution (:func:`damping_ratio`); the time constant moves along, so that the contact's frequency
+    restitution (:func:`damping_ratio`). The time constant changes with it, so that the contact's frequency
     1 / (timeconst dampratio), and with it its stiffness, stays the model's. Low values bounce higher than
-    they say (:func:`bounce`): a contact that hardly bounced would need a damping that the integrator's step
-    cannot carry.
+    they state (:func:`bounce`): a contact that hardly bounces needs more damping than the integrator's step
+    allows.
     """
     solref = fields.get("geom_solref")
     ratio = damping_ratio(values)
@@ -76,7 +76,7 @@ def geom_restitution(fields: Fields, elements: Sequence[str], values: Array) -> 
 
 
 def check_partners(model: Any, kind: str, elements: Sequence[str], low: float) -> None:
-    """Check that what is written for these geoms rules the contacts they make.
+    """Check that the values of these geoms decide their contacts.
 
     Args:
         model: The MjModel.
@@ -85,7 +85,7 @@ def check_partners(model: Any, kind: str, elements: Sequence[str], low: float) -
         low: Lowest value of the range.
 
     Raises:
-        ConfigurationError: A partner overrules; the message names it.
+        ConfigurationError: A partner overrides them; the message names it.
     """
     names = element_names(model, "geom")
     chosen = {element_id(model, "geom", name) for name in elements}
@@ -96,7 +96,7 @@ def check_partners(model: Any, kind: str, elements: Sequence[str], low: float) -
             higher = model.geom_priority[b] > model.geom_priority[a]
             if higher or kind == "geom_restitution" or model.geom_friction[b, 0] > low:
                 raise ConfigurationError(
-                    f"{kind} of geom {names[a]!r} is overruled by geom {names[b] or b!r}, which it touches "
+                    f"{kind} of geom {names[a]!r} is overridden by geom {names[b] or b!r}, which it touches "
                     "(MuJoCo takes the larger friction, mixes solref, and prefers the higher priority); name "
                     f"both geoms together, or give {names[a]!r} the higher priority in the MJCF"
                 )
@@ -115,7 +115,7 @@ def _standard_solref(model: Any, geom: int, name: str) -> None:
     if np.any(model.geom_solref[geom] <= 0):
         raise ConfigurationError(
             f"geom {name!r} gives stiffness and damping directly (negative solref); restitution needs "
-            "solref as time constant and damping ratio"
+            "solref as time constant and damping ratio: write it that way in the MJCF"
         )
 
 

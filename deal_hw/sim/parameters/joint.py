@@ -12,7 +12,7 @@ from deal_hw.sim.parameters.kind import FRICTION_RATIO, Kind, one_dof_joint
 
 
 def _set(fields: Fields, field: str, index: int, values: Array) -> None:
-    # Fields may be (N, n) or, for polynomial coefficients, (N, n, k): the first is the linear one.
+    # Fields may be (N, n) or, for polynomial coefficients, (N, n, k), whose first one is linear.
     column = fields.get(field)[:, index]
     if column.ndim == 1:
         column[:] = values
@@ -37,12 +37,12 @@ def dof_damping(fields: Fields, elements: Sequence[str], values: Array) -> None:
 
 
 def dof_dampingpoly_square(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set the damping that grows with speed [N·m·s²/rad² or N·s²/m²]: torque against the motion c v²."""
+    """Set the coefficient c of damping quadratic in speed [N·m·s²/rad² or N·s²/m²]: opposing torque c v²."""
     _set_poly(fields, elements, values, 0)
 
 
 def dof_dampingpoly_cube(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set the damping that grows with the square of speed [N·m·s³/rad³ or N·s³/m³]: torque c |v|³."""
+    """Set the coefficient c of damping cubic in speed [N·m·s³/rad³ or N·s³/m³]: opposing torque c |v|³."""
     _set_poly(fields, elements, values, 1)
 
 
@@ -58,18 +58,18 @@ def dof_frictionloss(fields: Fields, elements: Sequence[str], values: Array) -> 
 
 
 def dof_friction_creep(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set how much a joint that dry friction holds creeps under load: 1 minus the constraint's impedance.
+    """Set the creep under load of a joint held by dry friction: 1 minus the constraint's impedance.
 
-    MuJoCo's friction is a soft constraint of impedance d, ``solimpfriction`` in the MJCF, 0.9 by default. At
-    rest under a load f the constraint's law (MuJoCo documentation, Computation: Constraint model) leaves the
-    speed ``f A (1 - d) / d / b`` with A the inverse inertia at the joint and b = 2 / (dmax timeconst) of its
-    solref: it falls in proportion to the value set here. MuJoCo keeps d between 0.0001 and 0.9999.
+    MuJoCo's friction is a soft constraint of impedance d, ``solimpfriction`` in the MJCF, 0.9 by default.
+    Under a load f the joint creeps with the speed ``f A (1 - d) / d / b`` (MuJoCo documentation, Computation:
+    Constraint model). A is the inverse inertia at the joint and b = 2 / (dmax timeconst) of its solref. So
+    the speed falls in proportion to the value set here. MuJoCo keeps d between 0.0001 and 0.9999.
     """
     solimp = fields.get("dof_solimp")
     for name in elements:
         dof = int(fields.model.jnt_dofadr[element_id(fields.model, "joint", name)])
         solimp[:, dof, 0] = 1 - values
-        # Friction has no depth, so dmin alone is its impedance; dmax must not lie below it.
+        # Friction has no depth, so dmin alone is its impedance; dmax must not be smaller.
         solimp[:, dof, 1] = np.maximum(1 - values, fields.model.dof_solimp[dof, 1])
 
 

@@ -1,4 +1,4 @@
-"""What a parameter kind is: a name, the elements it is for, and the function that writes its values."""
+"""A parameter kind: a name, the elements it is for, and the function that writes its values."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE
 _OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 RATIO = 5.0
-"""What a published model is usually right to: a factor to either side."""
+"""Usual accuracy of a published model: a factor on either side."""
 FRICTION_RATIO = 20.0
-"""The same of dry friction, which few models have measured: a real SO-101 has 8 to 9 times the model's."""
+"""The same for dry friction, which few models have measured: a real SO-101 has 8 to 9 times the model's."""
 
 Apply = Callable[[Fields, Sequence[str], Array], None]
 Element = Literal["body", "joint", "geom", "actuator", "tendon"]
@@ -30,23 +30,23 @@ class Kind:
 
     Attributes:
         name: Name in ``Parameter.kind`` and in params.yaml.
-        element: What its elements are.
+        element: Type of its elements.
         quantity: Last part of a parameter's name, ``<element>.<quantity>``.
         unit: SI unit; for joints and actuators that of a hinge.
-        unit_slide: SI unit for a slide joint where that differs.
-        writes: MjModel fields that it changes; empty for a kind that no field holds.
-        along: What moves along, in words.
+        unit_slide: SI unit for a slide joint, if it differs.
+        writes: MjModel fields that it changes; empty for a kind without a field.
+        along: Other changes that it makes, in words.
         apply: Writes values (N,) for the named elements into the fields of N simulations; None for a kind
-            that the simulator's surroundings apply.
-        baseline: Value that a model has for an element; None: it has none, so params.yaml must say.
-        usable: Raises where the element cannot have this parameter.
-        scale: Usual scale.
-        ratio: Usual half width of the range on a log scale: a factor to either side.
-        spread: Usual half width of the range on a linear scale, in the unit.
-        least: No value may lie below.
-        most: No value may lie above.
+            that code outside MuJoCo applies.
+        baseline: Returns a model's value for an element; None: there is none, so params.yaml must give it.
+        usable: Raises if the element cannot have this parameter.
+        scale: Default scale.
+        ratio: Default half width of the range on a log scale: a factor on either side.
+        spread: Default half width of the range on a linear scale, in the unit.
+        least: Lowest allowed value.
+        most: Highest allowed value.
         order: Kinds of lower order are applied first.
-        relative: Writes what it finds in the fields times or plus something, so that they are reset before.
+        relative: Multiplies or adds to the fields, which are therefore reset before.
     """
 
     name: str
@@ -84,24 +84,27 @@ def joint_of(model: Any, actuator: int) -> int:
 
 
 def one_dof_joint(model: Any, joint: int, name: str) -> None:
-    """Refuse ball and free joints, whose degrees of freedom have no names of their own."""
+    """Refuse ball and free joints, whose degrees of freedom have no own names."""
     if int(model.jnt_type[joint]) not in (HINGE, SLIDE):
         raise ConfigurationError(f"joint {name!r} is a ball or free joint; name hinges and slides")
 
 
 def moving_body(model: Any, body: int, name: str) -> None:
-    """Refuse bodies whose mass no motion shows: fixed to the world, or without mass."""
+    """Refuse bodies whose mass has no effect on motion: fixed to the world, or without mass."""
     if model.body_weldid[body] == 0:
         raise ConfigurationError(
-            f"body {name!r} is fixed to the world: no motion shows its mass; leave it out or give it a joint"
+            f"body {name!r} is fixed to the world, so its mass has no effect; leave it out or give it a joint"
         )
     if model.body_mass[body] <= 0:
-        raise ConfigurationError(f"body {name!r} has no mass in the model: there is nothing to scale")
+        raise ConfigurationError(
+            f"body {name!r} has no mass in the model, so there is nothing to scale; leave it out"
+        )
 
 
 def touching_geom(model: Any, geom: int, name: str) -> None:
     """Refuse geoms that touch nothing."""
     if not model.geom_contype[geom] and not model.geom_conaffinity[geom]:
         raise ConfigurationError(
-            f"geom {name!r} touches nothing (contype and conaffinity are 0): no contact shows this parameter"
+            f"geom {name!r} touches nothing (contype and conaffinity are 0), so this parameter has no "
+            "effect; leave it out"
         )

@@ -1,7 +1,7 @@
-"""Parameter kinds of sensors: no MuJoCo field holds them.
+"""Parameter kinds of sensors: they have no MuJoCo field.
 
-A bias moves what the simulator reports. Noise moves no prediction, so no search can find it: a known value is
-what the recording is weighed by, and where none is given it is estimated from the recording itself.
+A bias shifts what the simulator reports. Noise changes no prediction, so no search can find it: a known value
+weights the recording, and without one the noise is estimated from the recording itself.
 """
 
 from __future__ import annotations

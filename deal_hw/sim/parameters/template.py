@@ -33,12 +33,12 @@ _OFF = ("servo_effort_limit", "encoder_bias", "body_mass")
 def template(model: Any, title: str = "this model") -> str:
     """Return a params.yaml with friction, damping and armature of every joint and gains of every actuator.
 
-    Masses, effort limits and encoder biases follow as comments: without a measured mass or a known torque
-    the common scale of masses, frictions and gains cannot be seen in any motion.
+    Masses, effort limits and encoder biases follow as comments. Without a measured mass or a known torque, no
+    motion shows the common scale of masses, frictions and gains.
 
     Args:
         model: The MjModel.
-        title: What the head of the file calls the model.
+        title: Name of the model in the head of the file.
     """
     lines = [_HEAD.format(title=title)]
     for name in _ON:
@@ -61,13 +61,13 @@ def _section(model: Any, kind: Kind, *, active: bool) -> list[str]:
     for element, value, unit in rows:
         searchable = active and (kind.scale == "linear" or value > 0) and not _doubled(model, kind, element)
         text = f"- {{kind: {kind.name}, elements: {_quoted(element)}}}"
-        # A sum with 0, so that a value of -0.0 is written as 0.
+        # The sum with 0 makes -0.0 a 0.
         lines.append(f"  {'' if searchable else '# '}{text}  # {value + 0.0:.6g} {unit}\n")
     return lines
 
 
 def _doubled(model: Any, kind: Kind, actuator: str) -> bool:
-    """Return whether a servo's damping adds to a joint damping that is searched: one is enough."""
+    """Return whether a servo's damping adds to a searched joint damping: one of them is enough."""
     if kind.name != "servo_damping":
         return False
     joint = joint_of(model, element_id(model, "actuator", actuator))
@@ -87,5 +87,5 @@ def _rows(model: Any, kind: Kind) -> Iterable[tuple[str, float, str]]:
 
 
 def _quoted(name: str) -> str:
-    """Return a name that YAML reads as text whatever it looks like."""
+    """Quote a name, so that YAML always reads it as text."""
     return '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'

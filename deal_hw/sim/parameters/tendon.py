@@ -1,8 +1,7 @@
 """Parameter kinds of tendons: friction that changes with position, by the tendon's moment arm.
 
-A rod or belt that drives a joint through a linkage has a moment arm that depends on the joint's position, and
-so has its friction at the joint. MuJoCo's own dry friction of a joint is the same everywhere; that of a
-spatial tendon is force times moment arm.
+The moment arm of a rod or belt in a linkage depends on the joint's position, and so does its friction at the
+joint. MuJoCo's own dry friction of a joint is constant; that of a spatial tendon is force times moment arm.
 """
 
 from __future__ import annotations

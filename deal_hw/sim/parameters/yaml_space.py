@@ -1,7 +1,7 @@
-"""A user's params.yaml: which parameters of an MJCF are searched, in which range, and what is known of them.
+"""A user's params.yaml: the searched parameters of an MJCF, their ranges, and known values.
 
-Its format: page 'Parameters' of the documentation. Nominal values come from the MJCF, so that the file holds
-only what the user changes.
+Page 'Parameters' of the documentation describes the format. Nominal values come from the MJCF, so the file
+holds only the user's changes.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _SCALES: Final[Mapping[str, Scale]] = {"log": "log", "linear": "linear"}
 
 
 def read_space(path: Path, model: Any) -> ParameterSpace:
-    """Return the parameter space that a YAML file describes for a model.
+    """Return the parameter space of a YAML file for a model.
 
     Args:
         path: The file.
-        model: The MjModel that gives names and nominal values.
+        model: The MjModel of names and nominal values.
 
     Raises:
-        ConfigurationError: The file cannot be used; the message says which entry, and what to write instead.
+        ConfigurationError: The file cannot be used; the message names the entry and what to write instead.
         UnknownNameError: A kind or an element is not known; the message lists the names.
     """
     described = "page 'Parameters' of the documentation describes them"
@@ -56,12 +56,12 @@ def read_space(path: Path, model: Any) -> ParameterSpace:
 
 
 def parse_space(text: str, model: Any, source: str = "params.yaml") -> ParameterSpace:
-    """Return the parameter space that YAML text describes; see :func:`read_space`.
+    """Return the parameter space of YAML text; see :func:`read_space`.
 
     Args:
         text: The YAML text.
         model: The MjModel.
-        source: What messages call the text.
+        source: Name of the text in messages.
     """
     with reading(source, "YAML", error=ConfigurationError):
         content = parse_yaml(text)
@@ -93,7 +93,7 @@ def parse_space(text: str, model: Any, source: str = "params.yaml") -> Parameter
 
 def write_space(space: ParameterSpace) -> str:
     """Return YAML text that :func:`parse_space` reads back to the same space."""
-    # ASCII only: with allow_unicode PyYAML writes a next-line character as it is and reads it as a space.
+    # ASCII only: with allow_unicode PyYAML writes a next-line character unquoted and reads it as a space.
     return yaml.safe_dump({"parameters": [_entry(p) for p in space.parameters]}, sort_keys=False)
 
 
@@ -156,7 +156,7 @@ def _elements(value: Any, kind: Kind, model: Any) -> list[str]:
 
 
 def _usable_ones(names: list[str], kind: Kind, model: Any, pattern: str) -> list[str]:
-    """Return what a pattern means: the elements that can have the parameter; a name is taken at its word."""
+    """Return the matches of a pattern that can have the parameter; literal names are not filtered."""
     if kind.usable is None:
         return names
     kept, reason = [], ""
@@ -176,7 +176,7 @@ def _parameter(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], 
     name = _text(entry, "name") if "name" in entry else f"{elements[0]}.{kind.quantity}"
     scale = _SCALES[_choice(entry, "scale", tuple(_SCALES), kind.scale)]
     if kind.usable is not None:
-        # Before anything is computed from the element: what cannot have the parameter may have no such value.
+        # Before any use of the element: one that cannot have the parameter may have no such value.
         for element in elements:
             kind.usable(model, element_id(model, kind.element, element), element)
     known, value = _known(entry, name)
@@ -239,11 +239,11 @@ def _range(
         raise ConfigurationError(f"parameter {name!r}: `ratio` must be above 1, got {ratio:g}")
     if nominal <= 0:
         if known:
-            # Not searched: any range that holds the value will do.
+            # Not searched: any range around the value will do.
             return nominal - 1.0, nominal + 1.0
         raise ConfigurationError(
-            f"parameter {name!r}: its value in the model is {nominal:g}, and a ratio of that is no range; "
-            "give `nominal` above 0 or `range`"
+            f"parameter {name!r}: its value in the model is {nominal:g}, so a ratio gives no range; give a "
+            "`nominal` above 0 or a `range`"
         )
     return max(nominal / ratio, kind.least), min(nominal * ratio, kind.most)
 
@@ -272,7 +272,7 @@ def _prior(entry: Mapping[str, Any], name: str) -> tuple[float | None, float | N
 
 
 def _number(value: Any, what: str) -> float:
-    # YAML 1.1 reads 1e-3 as text: without a point or a sign it is no number there.
+    # YAML 1.1 reads 1e-3 as text, because it lacks a point.
     if isinstance(value, str):
         try:
             value = float(value)

@@ -1,4 +1,4 @@
-"""A recording on the device's own time grid, as the simulator needs it."""
+"""A recording on the device's own time grid, ready for the simulator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
 SENT = ("target", "stiffness", "damping", "effort_limit", "speed_limit")
-"""Arrays of an episode that have one row a period."""
+"""Arrays of an episode with one row per period."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,26 +25,26 @@ class SampledEpisode:
     Attributes:
         step_s: Device period [s].
         sample: Grid index of each sample, (T,).
-        position: Reported positions, tangent coordinates (T, C): the joints, for a floating base after its
-            six. Coordinates that nobody measured hold an estimate.
+        position: Reported positions, tangent coordinates (T, C): the six of a floating base, if any, then the
+            joints. Unmeasured coordinates hold an estimate.
         velocity: Reported velocities, (T, C), likewise.
-        target: Position target in force at each period, before any latency, (S, A).
-        stiffness: Sent stiffness in force, (S, A).
+        target: Position target in each period, before any latency, (S, A).
+        stiffness: Sent stiffness in each period, (S, A).
         damping: (S, A).
         effort_limit: (S, A).
         speed_limit: (S, A).
         usable: Samples between which the simulator may predict: armed, no watchdog, no gap to the next, (T,).
         start_setpoint: The set-point at the first period, (A,).
-        first_row: Sample of the recording that became the first sample here.
+        first_row: Index in the recording of the first sample here.
         origin: Device period 0 of the grid, counted from the recording's first sample.
-        reported: Samples that the robot reported; the others are filled in, (T,). None: all.
-        reference: Reference orientation of each sample's chart, (T, 4); None for a fixed base.
+        reported: Samples that the robot reported; the others are interpolated, (T,). None: all.
+        reference: Reference orientation of each sample, (T, 4); None for a fixed base.
         measured: Which entries of (position, velocity) were measured and count as observations, (2 C,). None:
             the positions.
-        estimate_std: Standard deviation of the entries that were not measured, (2 C,) or, sample by sample,
-            (T, 2 C); None where all positions were.
-        exact: Whether the whole state is reported without any error: only a simulated target does that.
-        name: What it was cut from, for people: mostly a file's name.
+        estimate_std: Standard deviation of the unmeasured entries, (2 C,) or, sample by sample, (T, 2 C);
+            None if all positions were measured.
+        exact: Whether the whole state is reported without any error, as only a simulated target does.
+        name: Name of its source for messages, mostly a file's.
     """
 
     step_s: float
@@ -80,7 +80,7 @@ class SampledEpisode:
 
     @property
     def stride(self) -> int:
-        """Device periods from one sample to the next, lost ones aside."""
+        """Device periods from one sample to the next, without lost ones."""
         return int(np.median(np.diff(self.sample)))
 
     @property
@@ -94,9 +94,9 @@ class SampledEpisode:
         return np.asarray((self.origin + self.sample) * self.step_s, dtype=np.float64)
 
     def cut(self, rows: slice, periods: slice) -> SampledEpisode:
-        """Return the episode with these samples and periods only; indices and the start stay as they are."""
+        """Return the episode with these samples and periods only; indices and the start stay."""
         each = {name: getattr(self, name)[rows] for name in ("sample", "position", "velocity", "usable")}
-        # What is the same for all samples has no axis of samples.
+        # Values that are equal for all samples have no axis of samples.
         axes = {"reported": 1, "reference": 2, "estimate_std": 2}
         some = {n: v[rows] for n, d in axes.items() if (v := getattr(self, n)) is not None and v.ndim == d}
         sent = {name: getattr(self, name)[periods] for name in SENT}
@@ -106,14 +106,14 @@ class SampledEpisode:
 def align(trajectory: Trajectory, description: RobotDescription, name: str = "") -> SampledEpisode:
     """Put a recording on the device's time grid.
 
-    A state sample says which command was in force and how long ago the device received it, so the reception
-    of each command is known on the device's clock to the microsecond, whatever the wire did in between. A
-    command acts from the first period that starts at or after its reception.
+    A state sample reports the command in force and its age. So the reception of each command is known on the
+    device's clock to the microsecond, whatever the delays on the wire. A command acts from the first period
+    that starts at or after its reception.
 
     Args:
         trajectory: The recording.
         description: The robot.
-        name: What the recording is called.
+        name: Name of the recording.
 
     Returns:
         The episode, from the first armed sample with a command in force to the last armed one.
@@ -132,8 +132,8 @@ def align(trajectory: Trajectory, description: RobotDescription, name: str = "")
     rows = np.arange(int(np.argmax(known)), len(known) - int(np.argmax(known[::-1])))
     device = np.round(trajectory.device_s / step_s).astype(np.int64)
     sequence, age = trajectory.command_sequence[rows], trajectory.command_age_s[rows]
-    # Acts from the next period boundary on; the small part keeps a reception on the boundary on this side of
-    # it.
+    # A command acts from the next period boundary on; the small term keeps a reception exactly on a boundary
+    # there.
     acts = np.ceil((trajectory.device_s[rows] - np.nan_to_num(age)) / step_s - 1e-3).astype(np.int64)
     # The set-point starts to move with the first command, before the first sample that reports it.
     origin = min(int(acts[0]), int(device[rows[0]]))
@@ -167,10 +167,10 @@ def align(trajectory: Trajectory, description: RobotDescription, name: str = "")
 
 
 def _armed_at(trajectory: Trajectory, armed: npt.NDArray[np.bool_], first: int) -> FloatArray:
-    """Return the position where a servo's set-point began, (J,).
+    """Return the position at which a servo's set-point began, (J,): that of its arming.
 
-    That is where it was armed. By the first sample that reports a command the robot has moved some
-    micrometres, which a set-point that slews carries along as a constant error until it is there.
+    By the first sample that reports a command the robot has moved some micrometres. A slewing set-point would
+    carry that as a constant error until it arrives.
     """
     row = first
     while row > 0 and armed[row - 1] and trajectory.command_sequence[row - 1] < 0:
@@ -180,12 +180,12 @@ def _armed_at(trajectory: Trajectory, armed: npt.NDArray[np.bool_], first: int) 
 
 
 def fill_gaps(episode: SampledEpisode, longest_s: float = 0.05) -> SampledEpisode:
-    """Return the episode with samples at regular times, lost ones filled in where the gap is short.
+    """Return the episode with samples at regular times; lost ones are interpolated over short gaps.
 
-    What is filled in only holds the place: ``reported`` marks it, and nothing is fitted to it. Without this a
-    single lost frame would end every window that it falls into. Start states are smoothed over it, so short
-    gaps get a cubic spline: three samples on straight lines moved an estimate of a real arm by an eighth of
-    its interval, on a spline by a third of that. Longer gaps get straight lines, which cannot run away.
+    Interpolated samples are marked in ``reported``, and nothing is fitted to them. Without them a single lost
+    frame would end every window around it. Start states are smoothed over them, so short gaps get a cubic
+    spline: three samples on straight lines moved an estimate of a real arm by an eighth of its interval, on a
+    spline by a third of that. Longer gaps get straight lines, which cannot overshoot.
 
     Args:
         episode: The episode.
@@ -212,8 +212,7 @@ def fill_gaps(episode: SampledEpisode, longest_s: float = 0.05) -> SampledEpisod
     def whole(std: FloatArray) -> FloatArray:
         return np.broadcast_to(std, (len(episode.sample), 2 * episode.position.shape[1]))
 
-    # A sample before a gap was marked as unusable for that alone; what counts now is whether the gap is
-    # bridged.
+    # A sample before a gap was marked as unusable only for that; now it counts whether the gap is bridged.
     sound = both & ((episode.usable) | (np.diff(episode.sample, append=episode.sample[-1]) > stride))
     return dataclasses.replace(
         episode,
@@ -228,14 +227,14 @@ def fill_gaps(episode: SampledEpisode, longest_s: float = 0.05) -> SampledEpisod
 
 
 def thin(episode: SampledEpisode, rate_hz: float) -> SampledEpisode:
-    """Return the episode with about so many samples a second; what was sent stays as it is.
+    """Return the episode with about ``rate_hz`` samples per second; sent values stay.
 
-    States come faster than the motion changes: beyond some samples a control period each costs as much as the
-    others and tells little. Every n-th one is kept on the device's grid, so that lost ones move nothing.
+    States come faster than the motion changes: beyond some samples per control period, more samples cost time
+    and add little information. Every n-th one is kept on the device's grid, so that lost ones shift nothing.
 
     Args:
         episode: The episode.
-        rate_hz: Samples a second to keep; the next whole share above is taken.
+        rate_hz: Samples per second to keep; the next possible rate above is taken.
 
     Raises:
         ConfigurationError: The rate is not above 0.
@@ -265,8 +264,8 @@ def _begins(
 ) -> list[tuple[int, int]]:
     """Return which command acts from which device period on, in order.
 
-    A command that no sample reports was lost, unless no sample came while it would have been reported: then
-    it is placed by the clocks' offset, which the reported commands give.
+    A command that no sample reports was lost, unless no sample came while it would have been reported. Then
+    it is placed by the clocks' offset, which follows from the reported commands.
 
     Args:
         trajectory: The recording.

@@ -1,8 +1,8 @@
-"""What gravity says about a servo: how far a joint hangs under its command, against the torque it carries.
+"""Servo gains from gravity: the deviation of a joint from its command, against the torque it carries.
 
-A proportional servo that holds a load f stands f / kp off its command. Over a recording the mean of that
-tells the gain within a factor of two or so, and its sign: a joint whose sign is wrong in the column map
-(command and measurement alike, so that no correlation shows it) seems to hang upwards.
+A proportional servo that holds a load f is f / kp off its command. The mean of that over a recording gives
+the gain within a factor of about two, and its sign. A joint with a wrong sign in the column map, in command
+and measurement alike, shows no wrong correlation, but it seems to hang upwards.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 BLOCK_S = 1.0
-"""Means over this time: motion and friction cancel, weight stays [s]."""
+"""Time over which means are taken [s]: motion and friction cancel, weight stays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class GravityGain:
     """Static gains of the A servos.
 
     Attributes:
-        gain: Torque carried over deviation from the command, (A,) [N·m/rad or N/m]; negative where the joint
+        gain: Torque carried over deviation from the command, (A,) [N·m/rad or N/m]; negative if the joint
             hangs against gravity.
         explained: Share of the mean square deviation that this gain explains, (A,).
         load: Root mean square torque carried, (A,) [N·m or N].
@@ -39,10 +39,10 @@ class GravityGain:
 
 
 def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGain | None:
-    """Estimate static gains from how far joints hang; None for motors and floating bases.
+    """Estimate static gains from the joints' deviations; None for motors and floating bases.
 
     Args:
-        robot: The nominal model, whose masses and geometry are taken as they are.
+        robot: The nominal model, whose masses and geometry are assumed right.
         episodes: Recordings.
     """
     description = robot.description
@@ -68,7 +68,7 @@ def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGa
     compliance = both / np.where(power > 0, power, 1.0)
     square = np.sum(off**2, axis=0)
     left = np.sum((off - compliance * load) ** 2, axis=0)
-    # A joint that carries nothing does not hang: its gain stays open.
+    # A joint without load does not deviate: its gain stays open.
     with np.errstate(divide="ignore"):
         gain = np.where(compliance != 0, 1.0 / compliance, np.inf)
     explained = np.where(square > 0, 1 - left / np.where(square > 0, square, 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""The state of a floating base from what a legged robot has: an IMU, joint encoders and feet that stand."""
+"""The state of a floating base from a legged robot's IMU, joint encoders and standing feet."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ ORIENTATION_SMOOTHER: Final = (7, 3)
 """Samples and order of the polynomial through reported orientations."""
 
 PLACE_STD: Final = 1e-6
-"""Nobody measures where on the floor a robot stands, and no motion depends on it [m]."""
+"""Standard deviation of the place on the floor [m]: nobody measures it, and no motion depends on it."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class BaseStates:
-    """T states of a floating robot, of which the base's place, height and linear velocity are estimates.
+    """T states of a floating robot; the base's place, height and linear velocity are estimates.
 
     Attributes:
-        position: Chart coordinates, (T, C).
-        velocity: (T, C); joints as they were given.
-        reference: Reference orientation of each sample's chart, (T, 4).
-        estimate_std: Standard deviation of the estimated entries of (position, velocity), infinite for those
-            that are measured or smoothed, (2 C,).
+        position: Tangent coordinates, (T, C).
+        velocity: (T, C); joints as given.
+        reference: Reference orientation of each sample, (T, 4).
+        estimate_std: Standard deviation of the estimated entries of (position, velocity), infinite for
+            measured or smoothed ones, (2 C,).
     """
 
     position: FloatArray
@@ -50,7 +50,7 @@ def base_states(
     period_s: float,
     felt: Felt | None = None,
 ) -> BaseStates:
-    """Put joints, IMU and leg odometry together.
+    """Combine joints, IMU and leg odometry.
 
     Args:
         robot: A robot with a floating base on a level floor at height 0.
@@ -58,9 +58,9 @@ def base_states(
         orientation: Reported orientations of the base, (T, 4).
         gyro: Reported angular velocities in the base's frame, (T, 3) [rad/s].
         joints: Reported joint positions, (T, J).
-        joint_velocity: What is reported of joint velocities, (T, J); NaN for nothing.
-        period_s: From sample to sample [s].
-        felt: Accelerometer and efforts; None where nothing reports them.
+        joint_velocity: Reported joint velocities, (T, J); NaN for none.
+        period_s: Sampling period [s].
+        felt: Accelerometer and efforts; None if nothing reports them.
 
     Raises:
         InsufficientDataError: There are fewer samples than the smoother needs.
@@ -104,7 +104,7 @@ def with_base(
         feet: Sphere geoms of the feet.
         orientation: Reported orientations of the base at all samples of the recording, (>= T, 4).
         gyro: Reported angular velocities there, (>= T, 3) [rad/s].
-        felt: Accelerometer and efforts there; None where nothing reports them.
+        felt: Accelerometer and efforts there; None if nothing reports them.
     """
     rows = slice(episode.first_row, episode.first_row + len(episode.sample))
     unknown = np.full_like(episode.velocity, np.nan)

@@ -1,8 +1,8 @@
-"""Simulation beside a recording: open-loop predictions that restart from the measured state every window.
+"""Simulation beside a recording: predictions that restart from the measured state every window.
 
-A replay of the whole recording says little: an unstable robot's leaves it within a second, whatever the
-model. Over a window of a fraction of a second the error is the model's. It is meant to be looked at, so
-nothing is fitted here: each window starts from measured positions, smoothed over a few samples around it.
+A replay of a whole recording has little information: an unstable robot's replay leaves the recording within a
+second, whatever the model. Over a window of a fraction of a second the error is the model's. The overlay is
+for viewing, so nothing is fitted: each window starts from measured positions, smoothed over a few samples.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
 DEFAULT_WINDOW_S = 0.2
 DEFAULT_SMOOTHING_S = 0.04
-"""Between 0.03 s and 0.06 s the true parameters of simulated noisy cart-poles predict best."""
+"""With 0.03 s to 0.06 s the true parameters of simulated noisy cart-poles predict best."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """What one parameter set predicts in W windows of H samples.
+    """Prediction of W windows of H samples by one parameter set.
 
     Attributes:
         theta: The parameters, (K,).
@@ -59,8 +59,8 @@ class Overlay:
 
     Attributes:
         joint_names: The J joints.
-        sample: Index into the recording of each point, (W, H + 1); a window's last is often the
-            next one's first.
+        sample: Index into the recording of each point, (W, H + 1); a window's last is often the next one's
+            first.
         device_s: Device time of each point, (W, H + 1) [s].
         receive_s: Host time of each point, (W, H + 1) [s].
         position: Measured positions, (W, H + 1, J).
@@ -87,7 +87,7 @@ class Overlay:
         return self.predictions[name].velocity - self.velocity
 
     def worst_moment_s(self, name: str) -> float:
-        """Return the device time at which a set's positions are farthest off [s], joints by their range."""
+        """Return the device time of a set's largest position error [s], joints weighted by their range."""
         spread = np.ptp(self.position.reshape(-1, self.position.shape[2]), axis=0)
         share = np.abs(self.position_error(name)[:, 1:]) / np.where(spread > 0, spread, np.inf)
         far = np.nan_to_num(share).sum(axis=2)
@@ -101,7 +101,7 @@ class Overlay:
 
     @staticmethod
     def broken_time(time_s: FloatArray) -> FloatArray:
-        """Return the times that belong to :meth:`broken`, (W * (H + 2),); breaks stand at windows' ends."""
+        """Return the times of :meth:`broken`, (W * (H + 2),); breaks are at windows' ends."""
         return np.concatenate([time_s, time_s[:, -1:]], axis=1).ravel()
 
 
@@ -138,7 +138,8 @@ def compute_overlay(
     if robot.base is not None:
         if trajectory.body is None or not description.feet:
             raise InsufficientDataError(
-                "the recording says nothing of the floating base; predictions need its IMU and names of feet"
+                "the recording lacks the floating base; predictions need its IMU, and names of feet in the "
+                "robot's description"
             )
         episode = with_sensed_base(episode, robot, trajectory)
     windows = cut_windows(episode, length)
@@ -149,7 +150,7 @@ def compute_overlay(
     batch = ServoBatch(robot, space, len(sets), threads=1)
     batch.set_parameters(np.array([np.asarray(theta, dtype=float) for theta in sets.values()]))
     path = setpoints(batch, episode, np.full(len(sets), latency_s))
-    # Of a floating robot, the base starts where the episode's estimate has it.
+    # The base of a floating robot starts at the episode's estimate.
     start_x, start_v = episode.position[windows.start].copy(), episode.velocity[windows.start].copy()
     start_x[:, robot.joints], start_v[:, robot.joints] = smooth[:, 0], smooth[:, 1]
     x, v = predict_windows(batch, episode, windows, start_x, start_v, path)
@@ -192,9 +193,9 @@ def _base(episode: SampledEpisode, windows: Windows, start: FloatArray, x: Float
 
 
 def reported_velocity_window(trajectory: Trajectory, description: RobotDescription) -> float:
-    """Return over which time the robot differences positions to report velocities [s]; 0 where it does not.
+    """Return the time over which the robot differences positions to report velocities [s]; 0 if it does not.
 
-    Such velocities are late by half that time, so predictions must be reported the same way to be compared.
+    Such velocities are late by half that time, so predictions to compare must be computed alike.
     """
     window_s = description.sensor.velocity_window_s
     lag = round(window_s * description.state_rate_hz)
@@ -237,7 +238,7 @@ def _check(
 
 
 def _first_row(trajectory: Trajectory) -> int:
-    # Where `align` starts: the first armed sample with a command in force that was recorded.
+    # The start of `align`: the first armed sample with a recorded command in force.
     known = (trajectory.status & int(Status.ARMED)) != 0
     known &= trajectory.command_sequence >= 0
     known &= np.isin(trajectory.command_sequence, trajectory.sent_sequence)
@@ -254,7 +255,7 @@ def _smoothed_starts(trajectory: Trajectory, rows: IntArray, half_width_s: float
             trajectory.device_s, (now - half_width_s - 1e-9, now + half_width_s + 1e-9)
         )
         near = low + np.flatnonzero(np.isfinite(trajectory.position[low:high]).all(axis=1))
-        # Four points leave a parabola one degree of freedom to smooth with.
+        # With four points a parabola has one degree of freedom for smoothing.
         if half_width_s > 0 and len(near) >= 4:
             t = trajectory.device_s[near] - now
             out[w] = np.linalg.lstsq(
@@ -266,7 +267,7 @@ def _smoothed_starts(trajectory: Trajectory, rows: IntArray, half_width_s: float
 def _as_reported(
     position: FloatArray, start: FloatArray, windows: Windows, step_s: float, velocity_window_s: float
 ) -> FloatArray:
-    """Return velocities as differences of positions, (W, H + 1, J); a parabola stands in before a start."""
+    """Return velocities as differences of positions, (W, H + 1, J); before a start, those of a parabola."""
     sample_s = windows.stride * step_s
     lag = max(round(velocity_window_s / sample_s), 1)
     before = -sample_s * np.arange(lag, 0, -1)[:, None]
@@ -276,7 +277,7 @@ def _as_reported(
 
 
 def _nrmse(error: FloatArray, measured: FloatArray) -> FloatArray:
-    # The first point of a window is where it was put, not a prediction.
+    # The first point of a window is its start state, not a prediction.
     rmse = np.sqrt(np.mean(np.square(error[:, 1:]), axis=(0, 1)))
     spread = np.ptp(measured.reshape(-1, measured.shape[-1]), axis=0)
     return np.asarray(np.divide(rmse, spread, out=np.full_like(rmse, np.nan), where=spread > 0))

@@ -1,4 +1,4 @@
-"""Parts of an episode: stretches short enough for many members, and a last part to judge by."""
+"""Parts of an episode: stretches short enough for many members, and a last part for evaluation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.sim.recordings.episode import SENT, SampledEpisode
 
 LEAD_S = LONGEST_LATENCY_S
-"""Commands kept before a part's first sample: as long as any latency reaches back [s]."""
+"""Length of commands kept before a part's first sample [s]: the longest latency."""
 
 
 SAMPLED = {
@@ -25,14 +25,14 @@ SAMPLED = {
     "reference": 2,
     "estimate_std": 2,
 }
-"""Axes of what an episode has for each sample; what is the same for all samples has fewer."""
+"""Number of axes of an episode's values per sample; values for all samples have fewer."""
 
 
 def part(episode: SampledEpisode, first: int, last: int) -> SampledEpisode:
     """Return the samples first .. last - 1 of an episode, with the commands that act on them.
 
-    Set-points without a speed limit depend on nothing older than the latency. With a limit the set-point at
-    the part's beginning is taken to have reached its target.
+    Set-points without a speed limit depend on nothing older than the latency. With a limit, the set-point at
+    the part's beginning is assumed to have reached its target.
     """
     lead = round(LEAD_S / episode.step_s)
     origin = max(int(episode.sample[first]) - lead, 0)
@@ -56,7 +56,7 @@ def stretches(episode: SampledEpisode, seconds: float) -> list[SampledEpisode]:
 
 
 def joined(parts: Sequence[SampledEpisode]) -> list[SampledEpisode]:
-    """Return parts with those put together again that follow each other: the reverse of `stretches`."""
+    """Return parts with consecutive ones joined: the inverse of `stretches`."""
     found: list[SampledEpisode] = []
     for after in parts:
         if found and _follows(found[-1], after):
@@ -67,7 +67,7 @@ def joined(parts: Sequence[SampledEpisode]) -> list[SampledEpisode]:
 
 
 def _follows(before: SampledEpisode, after: SampledEpisode) -> bool:
-    """Say whether a part begins with the sample that another ends with."""
+    """Return whether a part begins with the last sample of another."""
     return (
         after.first_row == before.first_row + len(before.sample) - 1
         and after.origin + int(after.sample[0]) == before.origin + int(before.sample[-1])
@@ -102,7 +102,7 @@ def split_last(episode: SampledEpisode, share: float) -> tuple[SampledEpisode, S
 
 
 def spread(parts: Sequence[SampledEpisode], seconds: float) -> list[SampledEpisode]:
-    """Return parts that lie evenly over all and add up to about so many seconds; all where they are fewer."""
+    """Return evenly spread parts that add up to about ``seconds``; all if they are shorter."""
     lengths = np.array([(len(p.sample) - 1) * p.period_s for p in parts])
     if lengths.sum() <= seconds:
         return list(parts)

@@ -1,4 +1,4 @@
-"""Where a robot with legs is drawn, from what it senses: orientation, and a floor under the lowest foot."""
+"""Drawn poses of a legged robot from its sensors: orientation, and a floor under the lowest foot."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from deal_hw.types import FloatArray, Trajectory
 
 
 def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
-    """Return poses of the base, (T, 7), position and quaternion wxyz; None where nothing senses them.
+    """Return poses of the base, (T, 7), position and quaternion wxyz; None if nothing measures them.
 
-    Nobody measures where on the floor the robot is: it stays at the origin, as high as its lowest foot says.
+    The place on the floor is not measured: the robot stays at the origin, with its lowest foot on the floor.
     """
     body = trajectory.body
     if body is None or robot.base is None:
@@ -38,10 +38,10 @@ def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
 
 
 def with_sensed_base(episode: SampledEpisode, robot: RobotModel, trajectory: Trajectory) -> SampledEpisode:
-    """Return an episode of joints with the base from the body's sensors, as ``imu_base`` finds it.
+    """Return an episode of joints with the base from the body's sensors; see ``imu_base``.
 
     Args:
-        episode: What :func:`deal_hw.sim.recordings.episode.align` made of the recording.
+        episode: The recording, from :func:`deal_hw.sim.recordings.episode.align`.
         robot: The robot.
         trajectory: The recording; it has a body.
     """
@@ -49,7 +49,7 @@ def with_sensed_base(episode: SampledEpisode, robot: RobotModel, trajectory: Tra
     if body is None:
         raise ConfigurationError("the recording has no body's sensors")
     felt = Felt(trajectory.device_s, body.acceleration, trajectory.effort)
-    # Efforts that are zero throughout are none: some sources have the column and never fill it.
+    # Efforts that are all zero are missing: some sources have the column and never fill it.
     whole = (
         all(np.isfinite(values).all() for values in (felt.acceleration, felt.effort)) and felt.effort.any()
     )

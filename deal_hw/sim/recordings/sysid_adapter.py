@@ -1,16 +1,16 @@
-"""DeepMind's ``mujoco.sysid`` on our models and recordings: the only place that imports it.
+"""DeepMind's ``mujoco.sysid`` on our models and recordings: the only module that imports it.
 
-What it gets: parameters in physical units with their ranges as bounds, joint positions as measured signals,
-set-points as controls, and each window of a recording as one of its sequences, which starts at a given state.
-What it does is its own: finite differences, optimiser, confidence intervals.
+Its inputs: parameters in physical units with their ranges as bounds, joint positions as measured signals,
+set-points as controls, and each window of a recording as one of its sequences, with a given start state.
+Finite differences, optimiser and confidence intervals are its own.
 
-It has no limit on a set-point's speed, and its delays are those of sensors, which windows that start at
-measured states cannot use: a late sensor would show what was before the start. A latency is given by controls
-that are late already, or is one more parameter of its least squares; then, and with speed limits, its hook
-for rollouts gives each candidate its own controls, linear between commands. Its hook for residuals is used
-for two facts of MuJoCo 3.17: sensors that a rollout returns are those before the step whose time they carry,
-so positions are taken from the state; and the residual is normalised window by window, which divides by zero
-where a joint rests at zero, so it is normalised over the whole recording.
+It has no limit on a set-point's speed. Its delays are those of sensors, which windows from measured states
+cannot use: a late sensor would show values from before the start. So a latency is given by delayed controls,
+or is one more parameter of its least squares. Then, and with speed limits, its rollout hook gives each
+candidate its own controls, linear between commands. Its residual hook is needed for two properties of MuJoCo
+3.17. A rollout returns sensors from before the step whose time they carry, so positions come from the state.
+And the residual is normalised window by window, which divides by zero if a joint rests at zero, so it is
+normalised over the whole recording.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ SENT_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 
 @dataclass(frozen=True, slots=True)
 class SysidRecording:
-    """Windows of one episode, with the states they start from.
+    """Windows of one episode, with their start states.
 
     Attributes:
         episode: The episode.
         windows: W windows.
-        position: Chart coordinates at the starts, (W, C).
+        position: Tangent coordinates at the starts, (W, C).
         velocity: (W, C).
     """
 
@@ -58,13 +58,14 @@ class SysidRecording:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """What ``mujoco.sysid`` found.
+    """Result of ``mujoco.sysid``.
 
     Attributes:
         theta: Physical values, (K,).
-        latency_s: The latency that was given or found [s].
-        half_width: Of its confidence intervals, (K,); infinite where its Jacobian is blind.
-        jacobian: Of its residual by the physical values, (R, K), less what a found latency explains.
+        latency_s: The latency, given or found [s].
+        half_width: Of its confidence intervals, (K,); infinite without information in its Jacobian.
+        jacobian: Of its residual by the physical values, (R, K), without the part that a found latency
+            explains.
         residual: Its normalised residual, (R,).
         iterations: Iterations of its optimiser.
         message: Why that stopped, in its own words.
@@ -85,10 +86,10 @@ def require_sysid() -> Any:
     """Return the ``mujoco.sysid`` package.
 
     Raises:
-        MissingExtraError: What it needs is not installed.
+        MissingExtraError: Its dependencies are not installed.
     """
     try:
-        # By name, or type checkers take the typed subpackage for the whole of mujoco.
+        # By name, or type checkers mistake the typed subpackage for the whole of mujoco.
         sysid = importlib.import_module("mujoco.sysid")
     except ImportError as err:
         raise MissingExtraError("mujoco[sysid]", "bench") from err
@@ -124,16 +125,16 @@ def identify(
     alpha: float = 0.1,
     threads: int | None = None,
 ) -> Identified:
-    """Run ``mujoco.sysid`` from the nominal values on.
+    """Run ``mujoco.sysid`` from the nominal values.
 
     Args:
         robot: The nominal model.
         space: The parameters.
-        recordings: What to fit.
-        latency_s: Latency by which the set-points are late, or at which the search for it starts [s].
-        latency_range_s: Latencies that are searched [s]; None: it is as given.
+        recordings: The recordings.
+        latency_s: Latency of the set-points, or the start of its search [s].
+        latency_range_s: Range of the latency's search [s]; None for no search.
         iterations: Most iterations of its optimiser.
-        alpha: Its intervals hold 1 - alpha.
+        alpha: The level of its intervals is 1 - alpha.
         threads: Threads of its rollouts; None for all CPUs.
 
     Raises:
@@ -160,7 +161,7 @@ def identify(
         optimizer="mujoco",
         verbose=False,
         max_iters=max(iterations, 1),
-        # Its guide's advice where parameters differ by orders of magnitude.
+        # Its guide advises this if parameters differ by orders of magnitude.
         x_scale="jac",
         output=output,
     )
@@ -185,7 +186,7 @@ def identify(
 
 
 def _without(jacobian: FloatArray, nuisance: FloatArray) -> FloatArray:
-    """Return derivatives, (R, K), less what those by other parameters, (R, n), explain of them."""
+    """Return derivatives, (R, K), without the part that those by other parameters, (R, n), explain."""
     if not np.any(nuisance):
         return jacobian
     return np.asarray(jacobian - nuisance @ np.linalg.lstsq(nuisance, jacobian, rcond=None)[0])
@@ -193,16 +194,7 @@ def _without(jacobian: FloatArray, nuisance: FloatArray) -> FloatArray:
 
 @dataclass(slots=True)
 class _Bridge:
-    """Translates between our model, space and recordings and those of ``mujoco.sysid``.
-
-    Args:
-        sysid: The package.
-        robot: The nominal model.
-        space: The parameters.
-        recordings: What to fit.
-        latency_s: Latency by which the set-points are late, or at which the search for it starts [s].
-        latency_range_s: Latencies that are searched [s]; None: it is as given.
-    """
+    """Translates our model, space and recordings to those of ``mujoco.sysid``; see :func:`identify`."""
 
     sysid: Any
     robot: RobotModel
@@ -271,11 +263,11 @@ class _Bridge:
         return np.asarray(parameters.as_vector(), dtype=float)[: len(self.space)]
 
     def latency(self, vector: FloatArray) -> float:
-        """Return the latency among what is searched, (K,) or (K + 1,), or the given one [s]."""
+        """Return the latency in a vector, (K,) or (K + 1,), or the given one [s]."""
         return float(vector[-1]) if self.latency_range_s is not None else self.latency_s
 
     def sequences(self) -> list[Any]:
-        """Return the windows as sequences, those sent the same gains and limits in one group."""
+        """Return the windows as sequences, grouped by sent gains and limits."""
         groups: dict[tuple[bytes, ...], list[tuple[int, int]]] = {}
         for r, recording in enumerate(self.recordings):
             for w in range(len(recording.windows)):
@@ -330,7 +322,7 @@ class _Bridge:
         return self.sysid.TimeSeries.from_names(times, self._measured(self.recordings[r])[w], self._nominal)
 
     def _path(self, r: int, theta: FloatArray, latency_s: float) -> FloatArray:
-        """Return the set-points of an episode, (S, A); made once for each latency and set of speed limits."""
+        """Return the set-points of an episode, (S, A), cached by latency and speed limits."""
         limits = np.array([theta[k] for k, p in enumerate(self.space.free) if p.kind == SPEED_LIMIT])
         key = r, limits.tobytes(), latency_s
         if key not in self._paths:
@@ -341,7 +333,7 @@ class _Bridge:
         return self._paths[key]
 
     def _cut(self, path: FloatArray, r: int, w: int) -> FloatArray:
-        """Return the controls of one window, one for each physics step and one that is never applied."""
+        """Return the controls of one window, one per physics step and one that is never applied."""
         episode, windows = self.recordings[r].episode, self.recordings[r].windows
         at = int(episode.sample[windows.start[w]])
         repeat = round(episode.step_s / self.robot.step_s)
@@ -352,11 +344,11 @@ class _Bridge:
         return control
 
     def build_model(self, parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        """Return the model with parameters and sent gains set: their hook in place of recompiling a spec."""
+        """Return the model with parameters and sent gains set: the hook instead of recompiling a spec."""
         theta = self._values(parameters)
         key = theta.tobytes(), id(spec)
         if key not in self._models:
-            # One iteration asks for the same few models window after window.
+            # One iteration needs the same few models window after window.
             if len(self._models) > 4 * (len(self.space) + 1) * len(self._sent):
                 self._models.clear()
             model = copy.copy(self._nominal)
@@ -372,7 +364,7 @@ class _Bridge:
         return self._models[key]
 
     def rollout(self, *, control_signal: Sequence[Any], param_dicts: Sequence[Any], **given: Any) -> Any:
-        """Roll out with set-points at each candidate's own latency and speed limit: their hook."""
+        """Roll out with set-points at each candidate's own latency and speed limit: the hook."""
         slewed = []
         for signal, parameters in zip(control_signal, param_dicts, strict=True):
             r, w = self._origin[id(signal)]
@@ -391,7 +383,7 @@ class _Bridge:
         *,
         state: FloatArray,
     ) -> tuple[FloatArray, Any, Any]:
-        """Return measured minus predicted joint positions, normalised: their hook.
+        """Return measured minus predicted joint positions, normalised: the hook.
 
         Args:
             parameters: Not used.

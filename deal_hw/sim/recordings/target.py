@@ -1,8 +1,8 @@
-"""Sim-to-sim targets: a robot whose parameters are hidden, recorded as a sensor would see it.
+"""Simulated targets: a robot with hidden parameters, recorded as a sensor would see it.
 
-The stand-in for a real robot in benches of robots that have no emulator on a wire: it gives an
-:class:`~deal_hw.sim.recordings.episode.SampledEpisode` on the device's grid, as aligning a recording
-would, and the truth beside.
+It replaces a real robot in benches of robots without an emulator. It gives an
+:class:`~deal_hw.sim.recordings.episode.SampledEpisode` on the device's grid, like an aligned recording, and
+the truth.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Behaviour = Callable[[FloatArray, FloatArray, float], FloatArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetSensing:
-    """How a target is observed.
+    """Sensors of a target.
 
     Attributes:
         joint_std: Noise of joint positions, (J,) [m or rad]; None: the whole state is reported exactly.
@@ -48,10 +48,10 @@ class TargetSensing:
 
 @dataclass(frozen=True, slots=True)
 class TargetRecording:
-    """A recording of a target, and what really happened.
+    """A recording of a target, and the truth.
 
     Attributes:
-        episode: What the sensors saw.
+        episode: The measurements.
         position: True positions at the samples, in the episode's tangent coordinates, (T, C).
         velocity: True velocities at the samples, (T, C).
     """
@@ -80,14 +80,14 @@ def record_target(
         robot: The nominal model.
         space: The hidden parameters.
         theta: Their true values, (K,).
-        behaviour: What is asked of it.
+        behaviour: Source of the commands.
         seconds: Length of the recording [s].
-        latency_s: Total latency, as command delays a whole number of physics steps [s].
-        sensing: How it is observed; exactly and wholly by default.
+        latency_s: Total latency; like command delays a whole number of physics steps [s].
+        sensing: The sensors; exact and complete by default.
         rng: Draws the noise.
-        start: Joint positions to start at, (J,); the default pose by default. The base starts where the model
-            has it.
-        settle_s: How long the start pose is held before the recording begins [s].
+        start: Start positions of the joints, (J,); the default pose by default. The base starts at its place
+            in the model.
+        settle_s: Time for which the start pose is held before the recording [s].
 
     Raises:
         CalibrationError: The target diverged.
@@ -140,7 +140,7 @@ class _Sensor:
         self._robot, self._sensing, self._rng = robot, sensing, rng
 
     def joints(self, position: FloatArray) -> FloatArray:
-        """Return a state as its joints are reported, (C,)."""
+        """Return a state with its joints as reported, (C,)."""
         noise, joints = self._sensing.joint_std, self._robot.joints
         if noise is None:
             return position
@@ -197,7 +197,7 @@ class _Sensor:
     def _base(
         self, position: FloatArray, velocity: FloatArray, orientation: FloatArray, stride: int
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return position, velocity, reference and spread with the base as an IMU and the legs give it."""
+        """Return position, velocity, reference and spread with the base from IMU and legs."""
         robot, sensing, rng = self._robot, self._sensing, self._rng
         T = len(position)
         reported = to_quaternion(rng.standard_normal((T, 3)) * sensing.orientation_std, orientation)

@@ -1,7 +1,7 @@
-"""Open-loop prediction in short windows that restart from given states.
+"""Prediction in short windows that restart from given states.
 
-An unstable robot's open-loop replay diverges from its own record within a second, whatever the model; windows
-of some ticks do not. All members of a population predict all windows of an episode.
+An unstable robot's replay diverges from its own recording within a second, whatever the model; windows of
+some ticks do not. All members of a population predict all windows of an episode.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
 SENT_MARGIN_S = 0.05
-"""Windows keep at least so clear of a change of gains or limits [s]."""
+"""Least time between a window and a change of gains or limits before it [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +25,8 @@ class Windows:
     """W windows of H samples each.
 
     Attributes:
-        start: Index of the sample each window starts at, (W,).
-        length: Samples H predicted in each window, not counting the start.
+        start: Index of each window's start sample, (W,).
+        length: Samples H predicted in each window, without the start.
         stride: Device periods from one sample to the next.
     """
 
@@ -45,17 +45,17 @@ class Windows:
 def cut_windows(
     episode: SampledEpisode, length: int, hop: int | None = None, first: int = 0, latest_s: float = 0.0
 ) -> Windows:
-    """Cut an episode into windows in which every sample is usable and what is sent stays the same.
+    """Cut an episode into windows with usable samples and constant gains and limits.
 
     Args:
         episode: The episode.
         length: Samples a window predicts, H.
         hop: Samples from one window's start to the next's; H by default, so that no sample is used twice.
         first: First sample that may start a window.
-        latest_s: The longest latency that is simulated [s]: so long a change of what is sent may still act.
+        latest_s: The longest simulated latency [s], for which a change of gains or limits may still act.
 
     Returns:
-        The windows; a window never straddles a gap, a lost frame or a change of gains or effort limit.
+        The windows, without gaps, lost frames or changes of gains or effort limit.
 
     Raises:
         InsufficientDataError: There is none.
@@ -89,7 +89,7 @@ def setpoints(batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray)
     """Return each member's set-point over the whole episode, (N, S, A).
 
     Args:
-        batch: The members; their speed limits, command delays and plays count.
+        batch: The members; their speed limits, command delays and plays apply.
         episode: The episode.
         latency_s: Total latency of each member, (N,) [s].
     """
@@ -127,8 +127,8 @@ def predict_windows(
         force: Forces on the coordinates at the device periods of each window, (N, W, H * stride, C).
 
     Returns:
-        Positions and velocities at the samples after each start, (N, W, H, C) each, in the chart of each
-        sample's reference orientation; NaN where a member diverged.
+        Positions and velocities at the samples after each start, (N, W, H, C) each, around each sample's
+        reference orientation; NaN where a member diverged.
     """
     N, W, H = batch.count, len(windows), windows.length
     C = episode.position.shape[1]

@@ -1,4 +1,4 @@
-"""Does a robot stand still when it is told to: the first thing that wrong gains or a long timestep break."""
+"""Test whether a robot holds its start pose: wrong gains or a long timestep show here first."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoldSettings:
-    """How long a robot holds its start pose, and what counts as unstable."""
+    """Length of the test, and limits of stability."""
 
     seconds: float = 1.0
     """Length [s]."""
     growth: float = 1.5
-    """Driven joints that move so many times faster in the last quarter than in the second are unstable."""
+    """Ratio of the speeds in the last and the second quarter above which a driven joint is unstable."""
     least_speed: float = 0.05
-    """Slower ones never are [rad/s or m/s]."""
+    """Least speed of an unstable joint [rad/s or m/s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Holding:
-    """What happened.
+    """Result of the test.
 
     Attributes:
-        seconds: How long it was simulated [s].
-        diverged: Whether the simulation broke down.
+        seconds: Simulated time [s].
+        diverged: Whether the simulation diverged.
         unstable: Driven joints whose speed grows.
-        sag: How far each driven joint is from its start pose at the end, (A,) [rad or m].
+        sag: Distance of each driven joint from its start pose at the end, (A,) [rad or m].
         speed: Root mean square of each driven joint's speed in the last quarter, (A,) [rad/s or m/s].
     """
 
@@ -46,7 +46,7 @@ class Holding:
 
 
 def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
-    """Simulate a robot that is told to hold its start pose; motors get no effort."""
+    """Simulate a robot that is commanded to hold its start pose; motors get no effort."""
     settings = settings or HoldSettings()
     model: Any = robot.model
     description = robot.description()
@@ -65,7 +65,7 @@ def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
     for step in range(steps):
         mujoco.mj_step(model, data)
         speed[step] = data.qvel[moving]
-    # MuJoCo starts again from the reference pose where it diverged: the warning is what remains.
+    # After a divergence MuJoCo restarts from the reference pose: only the warning remains.
     diverged = any(data.warning[getattr(mujoco.mjtWarning, name)].number for name in _DIVERGED)
     quarter = steps // 4
     second, last = (

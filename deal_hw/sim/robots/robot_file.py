@@ -1,4 +1,4 @@
-"""robot.yaml: what an MJCF does not say of a robot, and what of it the rest of deal-hw goes by.
+"""robot.yaml: the facts about a robot that its MJCF does not have, and those that deal-hw reads from here.
 
 A joint has the names, units and gains of the MJCF. The file may be stricter than the MJCF, never looser:
 :mod:`deal_hw.sim.robots.user_robot` compares both.
@@ -26,12 +26,12 @@ _LONGEST_NAME: Final = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActuatorEntry:
-    """What drives a joint.
+    """The actuator of a joint.
 
     Attributes:
         stiffness: kp of a position servo [N·m/rad or N/m]; 0 for a motor.
         damping: kd of a position servo [N·m·s/rad or N·s/m]; 0 for a motor.
-        effort_limit: Largest effort [N·m or N]; None: no limit. Of a motor, what a command of 1 is.
+        effort_limit: Largest effort [N·m or N]; None for no limit. For a motor, the effort at command 1.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -56,11 +56,12 @@ class JointEntry:
         name: As in the MJCF.
         unit: Of its position: "rad" (hinge) or "m" (slide).
         default_position: Start pose, and the middle of excitations [rad or m].
-        position_range: Lowest and highest position target [rad or m]; None: free.
-        velocity_limit: Faster trips; targets change by no more in a second [rad/s or m/s]. None: free.
+        position_range: Lowest and highest position target [rad or m]; None for no limit.
+        velocity_limit: Speed that trips, and largest change of targets in a second [rad/s or m/s]; None for
+            no limit.
         sensor_noise: Standard deviation of a reported position [rad or m].
         sensor_resolution: Step of a reported position [rad or m]; 0 for none.
-        actuator: None for a joint that nothing drives.
+        actuator: None for a joint without an actuator.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -94,14 +95,14 @@ class RobotFile:
     """A robot.yaml.
 
     Attributes:
-        version: Of this format.
+        version: Version of this format.
         name: The robot's name; datasets, excitations and results carry it.
         mjcf: Its MuJoCo model, relative to this file.
         actuation: "position": commands are set-points [rad, m]; "motor": commands are efforts.
         floating_base: Name of the free joint that carries the robot; None for a fixed base.
         feet: Sphere geoms of the feet of a robot whose base floats.
-        control_rate_hz: Commands a second.
-        state_rate_hz: State samples a second; a whole multiple of ``control_rate_hz``.
+        control_rate_hz: Commands per second.
+        state_rate_hz: State samples per second; a whole multiple of ``control_rate_hz``.
         joints: The joints, in the order that every array follows.
     """
 
@@ -145,7 +146,7 @@ def read_robot_file(path: Path) -> RobotFile:
     """Read a robot.yaml.
 
     Raises:
-        ConfigurationError: It cannot be read, or a field is wrong; names the fields.
+        ConfigurationError: It cannot be read, or a field is wrong; the message names the fields.
     """
     with reading(path, "a robot (YAML)", ADVICE, error=ConfigurationError):
         return from_values(RobotFile, read_yaml(path))
@@ -216,11 +217,11 @@ def _line(name: str, value: Any, comment: str, indent: int = 0) -> str:
 
 
 def _dumped(value: Any) -> str:
-    # The dumper quotes what would not be text again, and writes 1.0e-05, which stays a number.
+    # The dumper quotes ambiguous text, and writes 1.0e-05, which stays a number.
     def dump(style: str | None) -> str:
         # ASCII only: with allow_unicode PyYAML writes a next-line character as it is and reads it as a space.
         return yaml.safe_dump([value], default_style=style, default_flow_style=True, width=math.inf)
 
     text = dump(None)
-    # Text with line breaks: only quotes of this kind keep it on one line.
+    # Only double quotes keep text with line breaks on one line.
     return (dump('"') if text.count("\n") > 1 else text).strip()[1:-1]

@@ -1,4 +1,4 @@
-"""A user's robot in virtual time: its MJCF with hidden parameters, seen through its sensors."""
+"""A user's robot in virtual time: its MJCF with hidden parameters, measured by its sensors."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ SETTLE_S = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedTruth:
-    """What a simulated robot hides.
+    """Hidden values of a simulated robot.
 
     Attributes:
         parameters: Values by name (SI).
-        latency_s: From the reception of a command until it acts [s].
+        latency_s: From the reception of a command to its effect [s].
         seed: Of the sensors' noise.
     """
 
@@ -46,8 +46,8 @@ def draw_truth(space: ParameterSpace, seed: int, range_ratio: float, latency_s: 
 
     Args:
         space: The parameters.
-        seed: Fixes them.
-        range_ratio: The ranges reach this factor to either side of the nominal values.
+        seed: Seeds the draw.
+        range_ratio: Factor of the ranges on either side of the nominal values.
         latency_s: See :class:`SimulatedTruth` [s].
     """
     rng = np.random.default_rng(seed)
@@ -58,13 +58,13 @@ def draw_truth(space: ParameterSpace, seed: int, range_ratio: float, latency_s: 
 
 
 class SimulatedRobot(Robot):
-    """A simulated robot on a fixed base; it moves as the clock does.
+    """A simulated robot on a fixed base; it moves with the clock.
 
     Args:
         robot: The nominal model.
-        space: The parameters that the truth names.
-        truth: What is hidden.
-        clock: Virtual: reading a state moves it.
+        space: The truth's parameters.
+        truth: The hidden values.
+        clock: Virtual clock: reading a state moves it.
 
     Raises:
         ConfigurationError: The base floats.
@@ -74,7 +74,7 @@ class SimulatedRobot(Robot):
         self.description = robot.description  # type: ignore[misc]  # A user's robot is known at run time.
         if robot.base is not None:
             raise ConfigurationError(
-                f"the base of robot {self.description.name!r} floats; only robots on a fixed base can be "
+                f"robot {self.description.name!r} has a floating base; only robots with a fixed base can be "
                 "simulated here. Remove the free joint from a copy of the MJCF"
             )
         self._robot, self._clock, self._truth = robot, clock, truth
@@ -95,13 +95,13 @@ class SimulatedRobot(Robot):
         self._reset()
 
     def connect(self) -> None:
-        """Nothing to open."""
+        """Do nothing: there is no connection."""
 
     def disconnect(self) -> None:
-        """Nothing to close."""
+        """Do nothing: there is no connection."""
 
     def home(self, timeout_s: float) -> None:
-        """Put the robot into its start pose, and let it settle there."""
+        """Set the start pose, and let the robot settle there."""
         self._reset()
         settle = np.repeat(
             self._rest()[None, None], round(SETTLE_S * self.description.device_rate_hz), axis=1
@@ -109,7 +109,7 @@ class SimulatedRobot(Robot):
         self._advance(settle)
 
     def arm(self, timeout_s: float) -> None:
-        """Let the motors follow commands."""
+        """Enable the motors."""
         self._status = Status.ARMED
 
     def read_state(self, timeout_s: float) -> RobotState:
@@ -139,7 +139,7 @@ class SimulatedRobot(Robot):
         )
 
     def send_command(self, command: JointCommand) -> JointCommand:
-        """Take a command, which acts after the latency."""
+        """Accept a command; it acts after the latency."""
         now_ns = self._clock.now_ns()
         self._sequence += 1
         self._received_ns = now_ns
@@ -162,19 +162,19 @@ class SimulatedRobot(Robot):
 
     @property
     def transport_errors(self) -> int:
-        """There is no wire."""
+        """0: there is no wire."""
         return 0
 
     def fileno(self) -> int:
-        """There is no port."""
+        """Return -1: there is no port."""
         return -1
 
     def take_wire(self) -> list[Message]:
-        """There is no wire."""
+        """Return nothing: there is no wire."""
         return []
 
     def _rest(self) -> FloatArray:
-        """Return what an actuator does before its first command: the start pose, or no effort."""
+        """Return the actuators' command before the first one: the start pose, or no effort."""
         if self.description.actuation == "motor":
             return np.zeros(len(self.description.actuated))
         return np.array(self._home[list(self.description.actuated_index)])

@@ -1,4 +1,4 @@
-"""A user's robot: its robot.yaml, its MJCF, and what both say together."""
+"""A user's robot: its robot.yaml, its MJCF, and the description from both."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from deal_hw.sim.parameters.fields import element_names
 from deal_hw.sim.robots.robot_file import ActuatorEntry, JointEntry, RobotFile, read_robot_file
 
 OVERSHOOT = 0.25
-"""Share of the range by which a measured position may leave it before a run trips."""
+"""Share of the range by which a measured position may exceed it before a run trips."""
 LEAST_AGE_S, AGE_PERIODS = 0.1, 5
-"""States and actions older than these [s], and so many control periods, trip."""
+"""Age of states and actions that trips [s], and the same in control periods; the larger one counts."""
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UserRobot:
-    """A robot.yaml and its MJCF, which agree.
+    """A consistent pair of robot.yaml and MJCF.
 
     Attributes:
-        file: What robot.yaml says.
+        file: The content of robot.yaml.
         mjcf: The MJCF.
-        model: The same, compiled; treat as read-only.
+        model: The compiled MJCF; treat as read-only.
     """
 
     file: RobotFile
@@ -58,7 +58,7 @@ class UserRobot:
         """Return the robot's description.
 
         Args:
-            rates: Of recordings that were not made at the robot's own rates.
+            rates: Rates of recordings, if they differ from the robot's own.
         """
         rates = rates or self.rates
         joints = self.file.joints
@@ -86,14 +86,14 @@ def read_robot(path: Path) -> UserRobot:
     """Read a robot.yaml and its MJCF.
 
     Raises:
-        ConfigurationError: One cannot be read, or they contradict each other; names what to write.
+        ConfigurationError: One cannot be read, or they contradict each other; the message says what to write.
     """
     file = read_robot_file(path)
     mjcf = Path(path).parent / file.mjcf
     if not mjcf.is_file():
         raise ConfigurationError(
-            f"{path}: its model {file.mjcf} is not there ({mjcf}); write at `mjcf` where it lies, relative "
-            "to robot.yaml"
+            f"{path}: its model {file.mjcf} does not exist ({mjcf}); write its path at `mjcf`, relative to "
+            "robot.yaml"
         )
     robot = UserRobot(file=file, mjcf=mjcf, model=compile_mjcf(mjcf))
     found = list(contradictions(robot))
@@ -112,19 +112,19 @@ def derive_robot(
     several_trees: bool = False,
     mjcf_entry: str = "",
 ) -> UserRobot:
-    """Return what an MJCF tells of its robot.
+    """Return the robot that an MJCF describes.
 
     Args:
         mjcf: The model.
         name: The robot's name; "" for that of the file.
-        control_rate_hz: Commands a second, which no MJCF says.
-        state_rate_hz: States a second; None: as many as commands.
+        control_rate_hz: Commands per second, which no MJCF has.
+        state_rate_hz: States per second; None for ``control_rate_hz``.
         feet: Sphere geoms of the feet.
         several_trees: Whether driven joints in several trees are one robot, such as two arms.
-        mjcf_entry: What robot.yaml calls the model; "" for its name alone.
+        mjcf_entry: The model's path in robot.yaml; "" for its name alone.
 
     Raises:
-        ConfigurationError: It does not compile, has no actuator that is known here, or has two robots.
+        ConfigurationError: It does not compile, has no known actuator, or has two robots.
     """
     mjcf = Path(mjcf)
     model = compile_mjcf(mjcf)
@@ -143,7 +143,7 @@ def derive_robot(
         if joint in driven:
             a = driven.index(joint)
             actuator = ActuatorEntry(
-                # A sum with 0, so that no gain is written as -0.0.
+                # The sum with 0 makes -0.0 a 0.
                 stiffness=base.stiffness[a] + 0.0,
                 damping=base.damping[a] + 0.0,
                 effort_limit=_finite(base.effort_limit[a]),
@@ -178,7 +178,7 @@ def derive_robot(
 
 
 def contradictions(robot: UserRobot) -> Iterator[str]:
-    """Yield what robot.yaml says against its MJCF, each with what to write instead."""
+    """Yield the contradictions of robot.yaml and its MJCF, each with what to write instead."""
     file, model = robot.file, robot.model
     facts = joint_facts(robot.mjcf, model)
     strange = [name for name in robot.joint_names if name not in facts.names]
@@ -188,8 +188,8 @@ def contradictions(robot: UserRobot) -> Iterator[str]:
             yield f"the MJCF has no joint {', '.join(strange)}; its joints are {', '.join(facts.names)}"
         if absent:
             yield (
-                f"the MJCF's {', '.join(absent)} are not among `joints`; add them, or where they are another "
-                "robot's, name an MJCF with one robot"
+                f"the MJCF's joints {', '.join(absent)} are not among `joints`; add them, or if they belong "
+                "to another robot, name an MJCF with one robot"
             )
         return
     driven = [joint.name for joint in file.joints if joint.actuator is not None]
@@ -251,11 +251,7 @@ def _differs(name: str, joint: str, given: float, own: float) -> str:
 
 
 def _check_one_tree(mjcf: Path, model: Any) -> None:
-    """Check that the driven joints lie in one tree of bodies.
-
-    Raises:
-        ConfigurationError: They lie in several trees of bodies.
-    """
+    """Raise `ConfigurationError` if the driven joints lie in several trees of bodies."""
     roots: dict[int, list[str]] = {}
     for actuator in range(model.nu):
         joint = int(model.actuator_trnid[actuator, 0])
