@@ -17,9 +17,9 @@ from deal_hw.schema import from_values
 from deal_hw.types import FloatArray
 
 LATENCY_RANGE_S = (0.0, 0.04)
-"""Total latencies that are searched where nothing else is said [s]."""
+"""Default range of the latency search [s]."""
 SHORTEST_S = 1.0
-"""Shortest recording that is calibrated from [s]."""
+"""Shortest recording that can be calibrated [s]."""
 Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
 RESULT_FILE = "result.json"
@@ -29,23 +29,22 @@ ProblemT = TypeVar("ProblemT", contravariant=True)
 
 
 BEFORE_SEARCH = "before the search"
-"""Stage of a calibration in which is said what no search will find."""
+"""Stage of a calibration before the search, for messages on what no search can find."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a long run stands; given to the callback after each generation or iteration.
+    """Progress of a long run; passed to the callback after each generation or iteration.
 
     Attributes:
-        stage: What is being done, such as ``"search"``, ``"refinement"`` or ``"latency"``.
+        stage: The current stage, such as ``"search"``, ``"refinement"`` or ``"latency"``.
         done: Units done.
         total: Units expected; may grow.
         message: One short line.
         population: The current population, (N, K) physical values, or None.
         latency_s: The population's mean total latency [s], or None.
-        values: What else is known of this generation or iteration, as in the result's trace.
-        estimate: A fit that could be the answer, (K,) physical values, with ``latency_s``; None within a
-            search or a fit.
+        values: Further values of this generation or iteration, as in the result's trace.
+        estimate: A complete fit, (K,) physical values, with ``latency_s``; None within a search or a fit.
     """
 
     stage: str
@@ -68,8 +67,8 @@ class Budget:
     Attributes:
         population: Members N.
         generations: Search steps T; restarts count.
-        refine: Whether the search is followed by multiple shooting.
-        brief: Whether a search that can tell ends as soon as that may begin, instead of at its best.
+        refine: Whether multiple shooting follows the search.
+        brief: Whether the search ends as soon as the refinement can begin, instead of at its optimum.
     """
 
     population: int = 100
@@ -80,7 +79,7 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """A reason to distrust a result, in sentences for people.
+    """A reason to distrust a result.
 
     Attributes:
         seen: What was seen, with its number and unit.
@@ -100,16 +99,16 @@ class Alarm:
             )
 
     def __str__(self) -> str:
-        """Return all of it in one line."""
+        """Return the three parts in one line."""
         return f"{self.seen} {self.means} {self.do}"
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
-    """Return names in a sentence, the first few of many.
+    """Return names as text, of many only the first.
 
     Args:
-        names: What to name.
-        most: So many are named.
+        names: The names.
+        most: Largest number of names.
     """
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
@@ -124,20 +123,20 @@ class CalibrationResult:
         space: The parameters.
         estimate: Physical values, (K,).
         interval: 90 % interval of each parameter, (K, 2).
-        covariance: In each parameter's own scale, (K, K); None where the method gives none.
+        covariance: In each parameter's own scale, (K, K); None if the method gives none.
         population: The last population, (N, K), or None.
-        verdicts: What the data can tell of each parameter.
-        null_directions: Combinations that the data cannot see, in words.
+        verdicts: How well the data determine each parameter.
+        null_directions: Combinations that the data do not determine, as text.
         latency_s: Total latency found, or given [s].
         latency_interval_s: 90 % interval of the latency [s].
         chi2: Mean squared residual over its expected variance; 1 is a perfect model.
         alarms: Reasons to distrust the result; empty is good.
-        advice: What to record next, one mapping a weak or unidentified parameter: ``parameter``, its standard
-            deviation in its own scale now (``std``) and after that recording (``std_after``),
-            ``excitation`` and a ``sentence``; empty where nothing is open or nobody asked.
+        advice: What to record next, one mapping per weak or unidentified parameter: ``parameter``, its
+            standard deviation in its own scale now (``std``) and after that recording (``std_after``),
+            ``excitation`` and a ``sentence``; empty if no parameter is weak or no advice was requested.
         heldout_nrmse: Held-out error by predictor: "nominal", "calibrated", "null" (the state stays as it
             is).
-        trace: One mapping a generation or iteration.
+        trace: One mapping per generation or iteration.
         steps: Simulated physics steps.
         seconds: Wall clock [s].
         provenance: Versions, digests, settings, seed: plain JSON values.
@@ -164,13 +163,13 @@ class CalibrationResult:
 
     @property
     def without_value(self) -> tuple[str, ...]:
-        """Names of the parameters of which the recordings say nothing."""
+        """Names of the parameters that the recordings do not determine."""
         verdicts = self.verdicts or ("",) * len(self.space)
         named = zip(self.space.names, verdicts, strict=True)
         return tuple(name for name, verdict in named if verdict == "not identifiable")
 
     def distribution(self) -> ParameterDistribution:
-        """Return what is now known about the parameters."""
+        """Return the calibrated distribution of the parameters."""
         covariance = self.covariance
         if covariance is None:
             spread = np.diff(self.space.to_scale(self.interval.T), axis=0)[0] / (2 * Z90)
@@ -261,7 +260,7 @@ def read_result(path: Path) -> CalibrationResult:
 
     Raises:
         DatasetError: There is none.
-        ConfigurationError: The file holds no result; the message names the field.
+        ConfigurationError: The file contains no result; the message names the field.
     """
     file = path / RESULT_FILE if path.is_dir() else path
     what, advice = "a calibration result", "`deal-hw calibrate` writes one"
@@ -271,21 +270,21 @@ def read_result(path: Path) -> CalibrationResult:
 
 
 class StateStore(Protocol):
-    """Where a method keeps what it needs to continue: nested mappings of plain values and arrays."""
+    """Stores the state from which a method can continue: nested mappings of plain values and arrays."""
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Replace what is kept, wholly or not at all."""
+        """Replace the stored state, completely or not at all."""
 
     def load(self) -> Mapping[str, Any] | None:
-        """Return what is kept, or None.
+        """Return the stored state, or None.
 
         Raises:
-            DealHwError: It is of another run, or unreadable.
+            DealHwError: It belongs to another run, or is unreadable.
         """
 
 
 class CalibrationMethod(abc.ABC, Generic[ProblemT]):
-    """A way to calibrate: it knows a problem (data and simulator); the optimiser inside knows neither."""
+    """A calibration method. It knows the problem (data and simulator); the optimiser inside knows neither."""
 
     name: str
 
@@ -305,6 +304,6 @@ class CalibrationMethod(abc.ABC, Generic[ProblemT]):
             budget: How much may be used.
             rng: The only source of randomness: the same generator state gives the same result.
             progress: Called after each generation; may raise to stop the run.
-            checkpoint: Kept up to date after each generation. What it holds at the start is continued, to
-                the same numbers as without the interruption; then ``rng`` is set to what was saved.
+            checkpoint: Updated after each generation. A state in it at the start is continued, with the same
+            numbers as without the interruption; ``rng`` is then set to the saved state.
         """

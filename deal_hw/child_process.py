@@ -1,4 +1,4 @@
-"""What a child process is started with."""
+"""Options for starting a child process."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 
 def own_process_group() -> dict[str, Any]:
-    """Return the arguments of ``subprocess.Popen`` that put a child into a process group of its own.
+    """Return the arguments of ``subprocess.Popen`` that put a child into its own process group.
 
-    Ctrl-C in the terminal then reaches the parent alone, also while the child's interpreter starts.
+    Ctrl-C in the terminal then reaches only the parent, even while the child's interpreter starts.
     """
     if sys.version_info >= (3, 11):
         return {"process_group": 0}

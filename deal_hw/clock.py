@@ -10,7 +10,7 @@ class Clock(Protocol):
     """A monotonic clock."""
 
     def now_ns(self) -> int:
-        """Return the time in ns; only differences mean anything."""
+        """Return the time in ns; only differences have a meaning."""
         ...
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
@@ -26,13 +26,13 @@ class MonotonicClock:
         return time.monotonic_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep to an absolute deadline, so that lateness never adds up."""
+        """Sleep to an absolute deadline, so that lateness does not accumulate."""
         while (left := deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left * 1e-9)
 
 
 class VirtualClock:
-    """A clock that moves only when told: for tests and for robots simulated faster than real time."""
+    """A clock that moves only by calls, for tests and for robots simulated faster than real time."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns

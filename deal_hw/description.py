@@ -15,12 +15,12 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 ACTUATIONS: Final = ("position", "motor")
-"""How actuators take commands: set-points of a PD position loop, or efforts as a share of the limit."""
+"""Kinds of actuator commands: set-points of a PD position loop, or efforts as a share of the limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorModel:
-    """What stands between the true state and the reported one.
+    """Sensor effects between the true state and the reported one.
 
     Attributes:
         noise: Standard deviation of white noise on positions, (J,) [m or rad].
@@ -40,25 +40,25 @@ class SensorModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LegLimits:
-    """What the safety module enforces on a robot with legs, beyond :class:`SafetyLimits`.
+    """Limits of the safety module for a robot with legs, beyond :class:`SafetyLimits`.
 
     Attributes:
-        effort: Largest predicted PD effort of a command, (A,) [N·m]; targets are moved, in the end gains
-            lowered, to keep it.
-        tilt: Leaning further than this trips, angle between the base's z axis and the vertical [rad];
-            infinite for a robot whose base is held.
-        tumble: Turning faster than this trips, any axis of the base [rad/s].
+        effort: Largest predicted PD effort of a command, (A,) [N·m]; to keep it, targets are moved and, last,
+            gains lowered.
+        tilt: A larger angle between the base's z axis and the vertical trips [rad]; infinite for a robot
+            whose base is held.
+        tumble: A faster turn about any axis of the base trips [rad/s].
         free_fall: A specific force below this [m/s²] for ``free_fall_s`` is a fall.
-        free_fall_s: See there [s].
-        flail_velocity: A joint that is faster than this for ``flail_s`` without a break flails, (J,) [rad/s].
-        flail_s: See there [s].
+        free_fall_s: See ``free_fall`` [s].
+        flail_velocity: A joint that stays faster than this for ``flail_s`` trips, (J,) [rad/s].
+        flail_s: See ``flail_velocity`` [s].
         temperature: A hotter motor trips [°C].
-        lost_rate: A motor that misses more commands a second than this trips [1/s].
+        lost_rate: A motor that misses more commands per second trips [1/s].
         battery: A lower state of charge refuses to arm [0..1].
         battery_low: A lower one trips [0..1].
         voltage: A lower supply voltage trips [V].
         arm_voltage: A lower one refuses to arm [V]; 0: the same as ``voltage``.
-        command_age_s: The robot must have been sent a command within this time [s].
+        command_age_s: Longest time without a command sent to the robot [s].
     """
 
     effort: tuple[float, ...]
@@ -79,7 +79,7 @@ class LegLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
-    """What the safety filter enforces, arrays as tuples in the order of the actuated joints (A) unless said.
+    """Limits of the safety filter; arrays are tuples in the order of the actuated joints (A) unless noted.
 
     Attributes:
         target: Lowest and highest position target, (A, 2).
@@ -91,11 +91,10 @@ class SafetyLimits:
         damping: Highest damping that may be sent, (A,).
         effort: Highest effort limit that may be sent, (A,).
         speed: Highest speed limit that may be sent, (A,).
-        state_age_s: Older states trip [s].
-        action_age_s: A policy that is later than this trips [s].
-        ease_in_s: Time over which control is handed to the policy [s].
-        silence_s: A control process without a heartbeat for this long is stalled, and the supervisor kills it
-            [s].
+        state_age_s: An older state trips [s].
+        action_age_s: A later action of the policy trips [s].
+        ease_in_s: Time over which the policy gets full control [s].
+        silence_s: The supervisor kills a control process without a heartbeat for this long [s].
         legs: For a robot with legs; None for others.
     """
 
@@ -121,7 +120,7 @@ class RobotDescription:
 
     Attributes:
         name: The robot's name, as on the command line.
-        joint_names: The J joints in the one order that every array follows.
+        joint_names: The J joints, in the order of every array.
         actuated: The A joints that take commands, in command order.
         position_units: Unit of each joint's position, "m" or "rad", (J,).
         default_position: The pose that policies are relative to, (J,).
@@ -132,8 +131,8 @@ class RobotDescription:
         control_rate_hz: Rate of commands.
         device_rate_hz: Rate of the PD loop inside the device.
         state_rate_hz: Rate of state samples.
-        repeat_rate_hz: Rate at which the driver sends the command in force again; 0: each is sent once.
-        limits: What the safety filter enforces.
+        repeat_rate_hz: Rate at which the driver repeats the current command; 0: each is sent once.
+        limits: Limits of the safety filter.
         sensor: The nominal sensor model.
         mjcf: The robot's MuJoCo model.
         actuation: "position": commands are set-points of a PD loop; "motor": commands are efforts, -1..1 of
@@ -145,9 +144,9 @@ class RobotDescription:
         rest_position: The pose in which a robot with legs lies and may go limp, (J,); empty: none.
         feet: Names of the model's foot geoms (spheres), in the order of ``BodyState.foot_force``; empty: no
             legs.
-        excitation_range: Where excitations may take the actuated joints' targets, (A, 2), for robots whose
-            parts hit each other (or slip) inside the limits; empty: as far as the limits.
-        sources: Where each number comes from, by attribute name.
+        excitation_range: Range of the actuated joints' targets in excitations, (A, 2), for robots whose parts
+            hit each other (or slip) inside the limits; empty: the limits.
+        sources: Source of each number, by attribute name.
     """
 
     name: str
@@ -186,8 +185,8 @@ class RobotDescription:
             )
         if self.floating_base in self.joint_names:
             raise ConfigurationError(
-                f"robot {self.name!r}: the free joint {self.floating_base!r} must not be among joint_names, "
-                "which hold one coordinate each"
+                f"robot {self.name!r}: the free joint {self.floating_base!r} must not be among "
+                "joint_names, which have one coordinate each"
             )
         J, A = len(self.joint_names), len(self.actuated)
         for name, length in (
@@ -215,13 +214,13 @@ class RobotDescription:
         return round(self.device_rate_hz / self.control_rate_hz)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; the MJCF goes in as its digest."""
+        """Return plain JSON values, with the MJCF's digest instead of its text."""
         import dataclasses
 
         values = dataclasses.asdict(self)
         values["mjcf"] = hashlib.sha256(self.mjcf.read_bytes()).hexdigest()
         values["sources"] = dict(self.sources)
-        # A default stays out: a description written before the field existed keeps its digest.
+        # Default values are omitted, so that a description from before the field existed keeps its digest.
         for name, default in (
             ("actuation", "position"),
             ("floating_base", None),

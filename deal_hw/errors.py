@@ -2,30 +2,19 @@
 
 The tree (built-in parents in parentheses)::
 
-    DealHwError
-    ├── ConfigurationError (ValueError)        a setting that cannot be used
-    │   └── UnknownNameError                   a name that is not in a table; lists the table
-    ├── MissingExtraError (ImportError)        an optional dependency is absent
-    ├── TransportError (ConnectionError)       the byte path to the robot
-    │   ├── PortNotFoundError                  no such port
-    │   ├── PortBusyError                      somebody else holds the port
-    │   ├── TransportLostError                 unplugged in flight
-    │   └── TransportTimeoutError (TimeoutError)
-    ├── ProtocolError                          bytes that do not make sense
-    │   ├── FrameError                         one corrupt frame; the stream goes on
-    │   ├── VersionMismatchError               the peer speaks another version
-    │   └── WrongDeviceError                   the peer is not the robot that was asked for
-    ├── SafetyError                            a command that must not be sent
-    ├── PolicyError                            a policy that cannot run
-    │   └── PolicyMismatchError                a policy for another robot or another observation
-    ├── DatasetError                           a recording that cannot be used
-    │   ├── EmptyRecordingError
-    │   └── TornRecordingError                 no footer: `deal-hw data repair` mends it
-    ├── TrainingError                          a training that cannot go on
-    │   ├── CheckpointError                    a checkpoint that cannot be read, or is of another training
-    │   └── TrainingDivergedError              weights that are no numbers any more
-    └── CalibrationError
-        └── InsufficientDataError              too short or without excitation; says what to record
+    DealHwError ├── ConfigurationError (ValueError) a setting that cannot be used │ └── UnknownNameError a
+    name that is not in a table; lists the table ├── MissingExtraError (ImportError) an optional dependency is
+    absent ├── TransportError (ConnectionError) the byte path to the robot │ ├── PortNotFoundError no such
+    port │ ├── PortBusyError another program holds the port │ ├── TransportLostError unplugged in flight │ └──
+    TransportTimeoutError (TimeoutError) ├── ProtocolError invalid bytes │ ├── FrameError one corrupt frame;
+    the stream continues │ ├── VersionMismatchError the peer speaks another version │ └── WrongDeviceError the
+    peer is not the requested robot ├── SafetyError a command that must not be sent ├── PolicyError a policy
+    that cannot run │ └── PolicyMismatchError a policy for another robot or another observation ├──
+    DatasetError a recording that cannot be used │ ├── EmptyRecordingError │ └── TornRecordingError no footer:
+    `deal-hw data repair` repairs it ├── TrainingError a training that cannot continue │ ├── CheckpointError a
+    checkpoint that cannot be read, or is of another training │ └── TrainingDivergedError weights that are not
+    finite └── CalibrationError └── InsufficientDataError too short or without excitation; names what to
+    record
 """
 
 from __future__ import annotations
@@ -47,24 +36,24 @@ def short(value: object, most: int = QUOTED) -> str:
     """Return text, or the `repr` of another value, in one printable line of a bounded length.
 
     Args:
-        value: What a message is to show; it may come from a hostile file. Of a long list the beginning and
-            the number of entries are shown.
+        value: The value to show; it may come from a hostile file. A long list gives its beginning and its
+            number of entries.
         most: Longest text to return.
     """
     size = ""
     if isinstance(value, _CONTAINERS):
         size = f" ({len(value)} entries)" if len(value) > _REPR.maxlist else ""
-        # A plain repr of nested lists that share their parts may be a million times as long as the file.
+        # A plain repr of nested lists with shared parts may be a million times as long as the file.
         value = _REPR.repr(value)
     text = " ".join(str(value)[: 4 * most].split())
-    # Control characters of a file would speak to the terminal.
+    # A file's control characters could change the terminal.
     text = "".join(c if c.isprintable() else "?" for c in text)
     most -= len(size)
     return (text if len(text) <= most else f"{text[: most - 4]} ...") + size
 
 
 def shown(value: object, most: int = SHORT) -> str:
-    """Return a value of a file as a message shows it: :func:`short`, text in quotes."""
+    """Return a file's value for a message: as :func:`short`, with text in quotes."""
     return short(repr(value[: 4 * most]) if isinstance(value, str) else value, most)
 
 
@@ -85,9 +74,9 @@ class UnknownNameError(ConfigurationError):
     """A name that is not in a table.
 
     Args:
-        what: The kind of thing that was looked up, such as ``"parameter"``.
-        given: The name that was given.
-        allowed: The names that exist.
+        what: The kind of name, such as ``"parameter"``.
+        given: The given name.
+        allowed: The existing names.
     """
 
     def __init__(self, what: str, given: str, allowed: Iterable[str]) -> None:
@@ -130,11 +119,11 @@ class TransportTimeoutError(TransportError, TimeoutError):
 
 
 class ProtocolError(DealHwError):
-    """Bytes that do not make sense."""
+    """Invalid bytes."""
 
 
 class FrameError(ProtocolError):
-    """One frame is corrupt; the stream goes on with the next."""
+    """One frame is corrupt; the stream continues with the next."""
 
 
 class VersionMismatchError(ProtocolError):
@@ -142,7 +131,7 @@ class VersionMismatchError(ProtocolError):
 
 
 class WrongDeviceError(ProtocolError):
-    """The peer is not the robot that was asked for."""
+    """The peer is not the requested robot."""
 
 
 class SafetyError(DealHwError):
@@ -162,15 +151,15 @@ class DatasetError(DealHwError):
 
 
 class EmptyRecordingError(DatasetError):
-    """The recording holds no state sample."""
+    """The recording contains no state sample."""
 
 
 class TornRecordingError(DatasetError):
-    """The recording has no footer, as after a kill; ``deal-hw data repair`` mends it."""
+    """The recording has no footer, as after a kill; ``deal-hw data repair`` repairs it."""
 
 
 class TrainingError(DealHwError):
-    """A training cannot go on."""
+    """A training cannot continue."""
 
 
 class CheckpointError(TrainingError):
@@ -178,7 +167,7 @@ class CheckpointError(TrainingError):
 
 
 class TrainingDivergedError(TrainingError):
-    """The weights are no numbers any more."""
+    """The weights are not finite."""
 
 
 class CalibrationError(DealHwError):

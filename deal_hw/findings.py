@@ -1,4 +1,4 @@
-"""What an examination found: each finding with its remedy."""
+"""Findings of checks, each with its remedy."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 
 class Level(enum.Enum):
-    """How bad a finding is."""
+    """Severity of a finding."""
 
     OK = "ok"
     NOTE = "note"
     """Worth knowing; nothing to do."""
     WARN = "warn"
-    """Works, but worse than it could."""
+    """Works, but not as well as possible."""
     FAIL = "fail"
     """Does not work."""
 
@@ -24,10 +24,10 @@ class Finding:
     """One finding.
 
     Attributes:
-        area: What was looked at, such as "scheduling".
-        level: How bad it is.
-        message: What was found, one sentence.
-        remedy: What to do; "" where nothing is wrong.
+        area: The checked area, such as "scheduling".
+        level: Its severity.
+        message: The finding, one sentence.
+        remedy: What to do; "" if nothing is wrong.
     """
 
     area: str

@@ -1,4 +1,4 @@
-"""The command that installs an extra where deal-hw itself was installed from."""
+"""The command that installs an extra, from the source of the installed deal-hw."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from urllib.parse import unquote, urlsplit
 def install_line(extra: str = "") -> str:
     """Return a pip command that works for this installation.
 
-    A checkout, a file and a repository are named as pip recorded them (``direct_url.json``, PEP 610); without
-    such a record deal-hw came from an index.
+    Checkouts, files and repositories are named as in pip's record (``direct_url.json``, PEP 610). Without a
+    record deal-hw came from an index.
 
     Args:
-        extra: The extra wanted; none by default.
+        extra: The extra; none by default.
     """
     wanted = f"[{extra}]" if extra else ""
     origin = _origin()
@@ -29,7 +29,7 @@ def install_line(extra: str = "") -> str:
 
 
 def _origin() -> dict[str, Any]:
-    """Return pip's record; a folder of sources that lies before the installation on the path has none."""
+    """Return pip's record; a source folder earlier on the path than the installation has none."""
     import importlib.metadata
 
     for found in importlib.metadata.distributions(name="deal-hw"):

@@ -1,8 +1,8 @@
-"""Contract of parameters: what may be searched, in which range, and what is known about it afterwards.
+"""Contract of parameters: their names, search ranges, and their distribution after a calibration.
 
 A :class:`Parameter` is named after the element and the MuJoCo field it changes. The search runs in the unit
-cube; :meth:`ParameterSpace.normalize` and :meth:`ParameterSpace.unnormalize` are the one pair that maps to
-it.
+cube; :meth:`ParameterSpace.normalize` and :meth:`ParameterSpace.unnormalize` are the only two functions that
+map to and from it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from deal_hw.types import FloatArray
 
 Scale = Literal["log", "linear"]
 FORMAT = "deal_hw.parameter_distribution/1"
-"""Names the layout of a distribution's JSON."""
+"""Format name of a distribution's JSON."""
 LONGEST_LATENCY_S = 1.0
-"""No robot is later [s]."""
+"""Longest total latency [s]."""
 _LARGEST_VARIANCE = 1e100
-"""Beyond that sums of squares are no numbers any more."""
+"""Above this variance, sums of squares overflow."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,16 +37,16 @@ class Parameter:
     Attributes:
         name: Unique name, ``<element>.<quantity>``.
         kind: Name of the function in ``deal_hw.sim.parameters`` that applies it.
-        elements: MuJoCo elements it changes together (symmetry); one is the usual case.
+        elements: MuJoCo elements that it changes together (symmetry), usually one.
         unit: SI unit.
-        nominal: The value the user's model has.
+        nominal: The value in the user's model.
         low: Lower end of the search range.
         high: Upper end of the search range.
-        scale: Whether equal steps are equal ratios ("log") or equal differences ("linear").
+        scale: "log": equal steps are equal ratios; "linear": equal differences.
         known: Measured by other means (ruler, scale); not searched.
-        prior_mean: Physical value that the parameter is expected to have; None: nothing is expected.
-        prior_std: Standard deviation of that expectation in the parameter's own scale: a share of the value
-            (0.05 for 5 %) on a log scale, the unit itself on a linear one.
+        prior_mean: Expected physical value; None: no expectation.
+        prior_std: Standard deviation of the expectation in the parameter's own scale: a share of the value
+        (0.05 for 5 %) on a log scale, in the parameter's unit on a linear one.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -67,7 +67,7 @@ class Parameter:
     def around(
         cls, name: str, kind: str, elements: Iterable[str], unit: str, nominal: float, ratio: float = 5.0
     ) -> Parameter:
-        """Return a parameter on a log scale, searched a factor ``ratio`` to either side of its nominal."""
+        """Return a parameter on a log scale, searched from nominal / ratio to nominal * ratio."""
         return cls(
             name=name,
             kind=kind,
@@ -108,7 +108,7 @@ class Parameter:
             return
         if not (np.isfinite(self.prior_std) and self.prior_std > 0):
             raise ConfigurationError(
-                f"parameter {self.name!r}: prior std must be above 0, got {self.prior_std:g}"
+                f"parameter {self.name!r}: prior std is {self.prior_std:g}; it must be above 0"
             )
         if not self.low <= self.prior_mean <= self.high:
             raise ConfigurationError(
@@ -117,10 +117,10 @@ class Parameter:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; a prior is there only where there is one."""
+        """Return plain JSON values, with a prior only if there is one."""
         values = dataclasses.asdict(self)
         if self.prior_mean is None:
-            # Policies carry a digest of these values: those made before priors existed must keep theirs.
+            # Policies contain a digest of these values; policies from before priors existed must keep it.
             del values["prior_mean"], values["prior_std"]
         return values
 
@@ -175,7 +175,7 @@ class ParameterSpace:
         raise UnknownNameError("parameter", name, (p.name for p in self.parameters))
 
     def to_scale(self, theta: FloatArray) -> FloatArray:
-        """Map physical values, (..., K), to the scale in which steps are taken: log or linear."""
+        """Map physical values, (..., K), to each parameter's scale: log or linear."""
         return np.where(self._log, np.log(np.where(self._log, theta, 1.0)), theta)
 
     def from_scale(self, value: FloatArray) -> FloatArray:
@@ -194,7 +194,7 @@ class ParameterSpace:
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Mean, in physical units, and standard deviation, in each parameter's own scale, (K,) each.
 
-        Where nothing is expected: the nominal value and infinity.
+        Without an expectation: the nominal value and infinity.
         """
         mean = np.array([p.nominal if p.prior_mean is None else p.prior_mean for p in self.free], dtype=float)
         std = np.array([np.inf if p.prior_std is None else p.prior_std for p in self.free], dtype=float)
@@ -215,7 +215,7 @@ class ParameterSpace:
         return self.unnormalize(rng.random((count, len(self))))
 
     def with_ratio(self, range_ratio: float) -> ParameterSpace:
-        """Return the space whose log ranges reach the ratio to either side of the nominal values.
+        """Return the space with log ranges from nominal / range_ratio to nominal * range_ratio.
 
         Raises:
             ConfigurationError: ``range_ratio`` is not above 1.
@@ -230,7 +230,7 @@ class ParameterSpace:
         )
 
     def with_known(self, values: Mapping[str, float]) -> ParameterSpace:
-        """Return the space with these parameters known at these values (ranges grow to hold them)."""
+        """Return the space with these parameters known at these values; ranges are widened to fit."""
         for name in values:
             self[name]
         return ParameterSpace(
@@ -247,7 +247,7 @@ class ParameterSpace:
         )
 
     def with_free(self, names: Iterable[str]) -> ParameterSpace:
-        """Return the space in which exactly these are searched; the others keep their nominal value."""
+        """Return the space in which exactly these are searched; all others keep their nominal value."""
         wanted = set(names)
         for name in wanted:
             self[name]
@@ -272,9 +272,10 @@ class ParameterSpace:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterDistribution:
-    """What is known about the parameters: the thing a policy is trained under.
+    """A distribution of the parameters, under which a policy is trained.
 
-    In each parameter's own scale (log or linear) a Gaussian, cut off at the range; or uniform over the range.
+    In each parameter's own scale (log or linear) it is a Gaussian, cut off at the range, or uniform over the
+    range.
 
     Attributes:
         space: The parameters.
@@ -295,7 +296,7 @@ class ParameterDistribution:
 
     @classmethod
     def point(cls, space: ParameterSpace, theta: FloatArray, latency_s: float) -> ParameterDistribution:
-        """Return the distribution that knows everything (the oracle's)."""
+        """Return the distribution without uncertainty (the oracle's)."""
         K = len(space)
         return cls(
             space=space,
@@ -311,7 +312,7 @@ class ParameterDistribution:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         draws = self.space.to_scale(self.mean) + rng.standard_normal((count, len(self.space))) @ root.T
-        # A draw beyond all numbers on a log scale is cut off at the range as well.
+        # A draw that overflows on a log scale is also cut off at the range.
         with np.errstate(over="ignore"):
             return np.clip(self.space.from_scale(draws), self.space.low, self.space.high)
 
@@ -345,29 +346,32 @@ class ParameterDistribution:
         low_s, high_s = numbers(values["latency_s"], "latency_s", (2,))
         if not 0 <= low_s <= high_s <= LONGEST_LATENCY_S:
             raise ConfigurationError(
-                f"latency_s is {low_s:g} to {high_s:g} s; it lies between 0 and {LONGEST_LATENCY_S:g} s"
+                f"latency_s is {low_s:g} to {high_s:g} s; allowed are 0 to {LONGEST_LATENCY_S:g} s, the "
+                "lower one first"
             )
         mean = numbers([values["mean"][name] for name in space.names], "mean", (K,))
         for p, value in zip(space, mean, strict=True):
             if p.scale == "log" and value <= 0:
-                raise ConfigurationError(f"mean of {p.name!r} is {value:g}; on a log scale it is above 0")
+                raise ConfigurationError(
+                    f"mean of {p.name!r} is {value:g}; on a log scale it must be above 0"
+                )
         return cls(
             space=space,
             mean=mean,
             covariance=None if covariance is None else _covariance(covariance, K),
-            # Minus zero, which is no less than zero, would be so for the generator.
+            # The generator would treat minus zero as below zero.
             latency_s=(float(low_s) + 0.0, float(high_s) + 0.0),
         )
 
     def digest(self) -> str:
-        """Return a digest of the distribution; a policy carries the one it was trained under."""
+        """Return a digest of the distribution; a policy contains that of its own."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _covariance(values: Any, size: int) -> FloatArray:
     found = numbers(values, "covariance", (size, size))
     if np.abs(found).max(initial=0.0) > _LARGEST_VARIANCE:
-        raise ConfigurationError(f"covariance holds a value above {_LARGEST_VARIANCE:g}")
+        raise ConfigurationError(f"covariance contains a value above {_LARGEST_VARIANCE:g}")
     if not np.allclose(found, found.T, rtol=1e-6, atol=1e-12) or (np.diag(found) < 0).any():
         raise ConfigurationError("covariance is not symmetric, or a variance in it is below 0")
     return found

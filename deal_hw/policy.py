@@ -1,8 +1,9 @@
-"""Contract of a policy: what it observes, what its action means, and for which robot it was made.
+"""Contract of a policy: its observation, the meaning of its action, and its robot.
 
-The same code builds observations on the robot and, batched, in training, so that the two cannot drift apart.
+The same code builds observations on the robot and, batched, in training, so that both stay equal.
 
-A spec is checked whole where it is made, in Python as from a file: names, lengths, ranges, finite numbers.
+A spec is checked completely when it is made, in Python or from a file: names, lengths, ranges, finite
+numbers.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ Observation = npt.NDArray[np.float32]
 AXES = ("x", "y", "z")
 CLOCK_AXES = ("sin", "cos")
 BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", "height")
-"""What a floating base adds, in the base's frame: the directions of gravity and of the world's x axis (unit
-vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
+"""Observed quantities of a floating base, in the base's frame: the directions of gravity and of the world's x
+axis (unit vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
 BASE_SIZE = 6
 
 VERDICT: Final = "calibration_verdict"
-"""Key in a policy's training record: the colour of the calibration that it was trained under."""
+"""Key in a policy's training record: the colour of its calibration's verdict."""
 MAX_DELAY: Final = 100
 """Most control periods that an observation may look back: 2 s at 50 Hz."""
 MAX_TERMS: Final = 4096
@@ -61,9 +62,10 @@ class ObservationTerm:
     """One entry of the observation.
 
     Attributes:
-        quantity: What is observed. Positions are relative to the default pose; "action" is a former action;
-            "command" is the wanted velocity of the base: x and y [m/s], z [rad/s], and "clock" a phase that
-            turns ``clock_hz`` times a second from the first observation on; both the same at all delays.
+        quantity: The observed quantity. Positions are relative to the default pose; "action" is a former
+            action. "command" is the requested velocity of the base: x and y [m/s], z [rad/s]. "clock" is a
+            phase that turns ``clock_hz`` times a second from the first observation on. Command and clock are
+            the same at all delays.
         joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z; for the
             clock "sin" or "cos".
         scale: The factor applied to it [1/unit].
@@ -71,8 +73,8 @@ class ObservationTerm:
             one).
 
     Raises:
-        ConfigurationError: Quantity or axis is unknown, the scale is zero or not finite, or the delay is out
-            of range.
+        ConfigurationError: The quantity or axis is unknown, the scale is zero or not finite, or the delay is
+            out of range.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
@@ -105,7 +107,7 @@ class ObservationTerm:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicySpec:
-    """What a policy needs to know and to be given; travels inside the ONNX file.
+    """The interface of a policy; stored inside the ONNX file.
 
     Attributes:
         robot: Name of the robot.
@@ -123,12 +125,12 @@ class PolicySpec:
         trained_under: Digest of the parameter distribution it was trained under.
         training: Plain JSON values about the training (algorithm, steps, seed, versions).
         position_units: Unit of each joint's position in training, "m" or "rad", (J,); empty: not noted.
-        clock_hz: Turns a second of the clock that is observed; 0: none is.
+        clock_hz: Turns per second of the observed clock; 0: no clock.
         command_range: Lowest and highest velocity command of training, x, y [m/s] and yaw rate [rad/s],
             (3, 2); empty: not noted.
 
     Raises:
-        ConfigurationError: A field cannot be; the message names the first.
+        ConfigurationError: A field is invalid; the message names the first one.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
@@ -169,7 +171,7 @@ class PolicySpec:
         # A robot without a set-point generator has no speed limit.
         check_numbers("speed_limit", self.speed_limit, A, lowest=0.0, endless=True)
         if len(self.position_units) not in (0, J):
-            raise refusal("position_units", self.position_units, f"{J} entries, one a joint, or none")
+            raise refusal("position_units", self.position_units, f"{J} entries, one per joint, or none")
         if not 0 < self.control_rate_hz < math.inf:
             raise refusal("control_rate_hz", self.control_rate_hz, "a finite rate above 0 Hz")
         if not 1 <= len(self.observation) <= MAX_TERMS:
@@ -223,7 +225,7 @@ class PolicySpec:
     def from_json(cls, text: str) -> PolicySpec:
         """Return the spec that :meth:`to_json` wrote.
 
-        Nothing is converted: a number that is written as text is refused, and so is an unknown field.
+        Nothing is converted: a number written as text is refused, and so is an unknown field.
 
         Raises:
             PolicyError: The text is not a policy spec; the message names the fields.
@@ -245,7 +247,7 @@ class PolicySpec:
         """Check that the policy was made for this robot.
 
         Raises:
-            PolicyMismatchError: It was not; the message names every field that differs.
+            PolicyMismatchError: It was made for another robot; the message names every field that differs.
         """
         wrong = {
             name: f"policy has {shown(given)}, robot has {shown(own)}"
@@ -268,7 +270,7 @@ class PolicySpec:
         ):
             given = getattr(self, name)
             if len(given) != len(allowed) or any(g > a for g, a in zip(given, allowed, strict=True)):
-                wrong[name] = f"policy asks for {shown(given)}, the robot allows at most {shown(allowed)}"
+                wrong[name] = f"policy requests {shown(given)}, the robot allows at most {shown(allowed)}"
         if wrong:
             listed = "; ".join(f"{name}: {words}" for name, words in list(wrong.items())[:SHOWN])
             others = "; also: " + ", ".join(list(wrong)[SHOWN:]) if len(wrong) > SHOWN else ""
@@ -283,11 +285,11 @@ class Policy(Protocol):
 
     @property
     def spec(self) -> PolicySpec:
-        """What the policy observes and what its action means."""
+        """The policy's interface."""
         ...
 
     def reset(self) -> None:
-        """Forget everything about the past."""
+        """Clear the memory."""
         ...
 
     def act(self, observation: Observation) -> FloatArray:
@@ -303,7 +305,7 @@ class ObservationBuilder:
         batch_shape: () on the robot, (B,) in training.
 
     Attributes:
-        command: The wanted velocity of the base: x, y [m/s] and yaw rate [rad/s], (..., 3); zero at first.
+        command: The requested velocity of the base: x, y [m/s] and yaw rate [rad/s], (..., 3); zero at first.
         clock: Phase of the clock at the next observation, (...,) [turns]; zero at first and after a reset.
     """
 
@@ -328,7 +330,7 @@ class ObservationBuilder:
         return len(self.spec.observation)
 
     def reset(self, where: npt.NDArray[np.bool_] | None = None) -> None:
-        """Forget the past of the members of the batch in ``where`` (all by default)."""
+        """Clear the memory of the batch members in ``where`` (all by default)."""
         mask = np.ones(self._fresh.shape, dtype=bool) if where is None else where
         self._fresh = self._fresh | mask
         self._action[:, mask] = 0.0
@@ -349,7 +351,7 @@ class ObservationBuilder:
             velocity: Their velocities: linear in the world, angular in the base's frame, joints.
 
         Raises:
-            ConfigurationError: The policy observes the base, and it is not given.
+            ConfigurationError: The policy observes the base, which is not given.
         """
         J = len(self._default)
         self._position = np.roll(self._position, 1, axis=0)
@@ -359,13 +361,14 @@ class ObservationBuilder:
         if self.spec.observes_base:
             if position.shape[-1] != BASE_SIZE + J:
                 raise ConfigurationError(
-                    f"the policy for {self.spec.robot!r} observes the base: it needs {BASE_SIZE} + {J} "
-                    f"coordinates, got {position.shape[-1]}; this robot's states carry no base"
+                    f"the policy for {self.spec.robot!r} observes the base and needs {BASE_SIZE} + {J} "
+                    f"coordinates, got {position.shape[-1]}; this robot's states do not contain the base: "
+                    "use another policy"
                 )
             self._base = np.roll(self._base, 1, axis=0)
             self._base[0] = base_features(position[..., :BASE_SIZE], velocity[..., :BASE_SIZE])
             self._base = np.where(self._fresh[..., None], self._base[:1], self._base)
-        # The past of a fresh member is its present: there is no other state to fill it with.
+        # The history of a new member is filled with its present state, since there is no other.
         fresh = self._fresh[..., None]
         self._position = np.where(fresh, self._position[:1], self._position)
         self._velocity = np.where(fresh, self._velocity[:1], self._velocity)
@@ -416,7 +419,8 @@ _READERS: Final[Mapping[str, Callable[[ObservationBuilder, ObservationTerm], Flo
         **dict.fromkeys(BASE_QUANTITIES, ObservationBuilder._read_base),
     }
 )
-"""What reads each quantity. There is no default: a quantity without a row cannot be observed."""
+"""The method that reads each quantity. There is no default: a quantity without an entry cannot be
+observed."""
 
 
 def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray:
@@ -435,13 +439,13 @@ def rotation_vector(quaternion: FloatArray) -> FloatArray:
     """Return the rotation vector, (3,) [rad], of an orientation, (4,), a unit quaternion wxyz."""
     w, v = float(quaternion[0]), quaternion[1:]
     sine = float(np.linalg.norm(v))
-    # Of the two quaternions of a rotation, the one with the smaller angle.
+    # Of a rotation's two quaternions, take the one with the smaller angle.
     angle = 2.0 * math.atan2(sine, abs(w))
     return np.asarray(v * (math.copysign(1.0, w) * (angle / sine if sine > 0 else 2.0)))
 
 
 def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return what is observed of a base, (..., 13), in the order of :data:`BASE_QUANTITIES`.
+    """Return the observed quantities of a base, (..., 13), in the order of :data:`BASE_QUANTITIES`.
 
     Args:
         position: Position in the world and rotation vector, (..., 6).

@@ -1,8 +1,8 @@
-"""Reads files that may be damaged or hostile: a size limit before, one clear line after.
+"""Reads files that may be damaged or hostile, with a size limit and one-line errors.
 
-Every reader of JSON, YAML and NPZ goes through here, so that a limit is stated once and an exception of a
-parser never reaches the user as a traceback. What a file means is for the caller to say: of JSON by a
-dataclass, see :mod:`deal_hw.schema`, of others inside :func:`reading`.
+Every reader of JSON, YAML and NPZ uses this module, so that each limit has one place and a parser's exception
+never reaches the user as a traceback. The caller defines the meaning of a file: of JSON by a dataclass, see
+:mod:`deal_hw.schema`, of others inside :func:`reading`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ JSON_BYTES: Final = 16 * MIB
 YAML_BYTES: Final = MIB
 """Largest YAML file. The longest hand-written one is a hundredth of that."""
 YAML_NODES: Final = 100_000
-"""Most values of a YAML file, those behind aliases counted each time they are referred to."""
+"""Most values of a YAML file; values behind an alias count at each reference."""
 YAML_TEXT: Final = 10_000
 """Longest single text of a YAML file [characters]."""
 RECORDING_BYTES: Final = 1024 * MIB
@@ -56,18 +56,17 @@ _DIRECTORY_BYTES: Final = 16 * MIB
 def reading(
     path: object, what: str, advice: str = "", *, error: type[DealHwError] = DatasetError
 ) -> Iterator[None]:
-    """Turn whatever goes wrong inside the block into one line that names the file.
+    """Turn any error inside the block into one line that names the file.
 
     Parsers of damaged bytes raise nearly anything (`struct.error`, `zlib.error`, `RecursionError`,
-    `MemoryError`, ...), and so does code that walks values of another structure than expected. Errors of our
-    own keep their class and get the path in front and the advice behind. ``--traceback`` shows where it came
-    from.
+    `MemoryError`, ...), and so does code that walks values of another structure than expected. Our own errors
+    keep their class; the path is put in front and the advice behind. ``--traceback`` shows the origin.
 
     Args:
-        path: The file, as messages call it.
-        what: What it should be, such as "CSV" or "a calibration result".
+        path: The file's name in messages.
+        what: Its expected kind, such as "CSV" or "a calibration result".
         advice: What to do instead, such as "`deal-hw calibrate` writes one".
-        error: What to raise.
+        error: The error to raise.
     """
     then = f"; {advice}" if advice else ""
     try:
@@ -76,7 +75,7 @@ def reading(
         raise
     except DealHwError as err:
         text = str(err) if str(path) in str(err) else f"{path}: {err}"
-        # What is ours may list the names that a file holds.
+        # Our own message may list the names in a file.
         text = short(text, LISTED + len(str(path)))
         err.args = (text if advice in text else text + then,)
         raise
@@ -104,12 +103,12 @@ def check_size(path: Path, most: int) -> None:
     """Check that a path is an ordinary file of a bounded size; to be called inside :func:`reading`.
 
     Raises:
-        OSError: There is none, or it cannot be looked at.
+        OSError: There is none, or it cannot be accessed.
         ValueError: It is a folder or a device, or too large.
     """
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
-        # A pipe or a device could keep the reader waiting, or feed it, for ever.
+        # A pipe or a device could block the reader, or send data, for ever.
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device"
         raise ValueError(f"it is {kind}; name an ordinary file")
     if status.st_size > most:
@@ -145,8 +144,8 @@ def read_json(
         most: Largest size [B].
 
     Raises:
-        DealHwError: Of the given class: the file cannot be read, is too large or nested too deep, is no JSON,
-            or a field is wrong; names file and fields.
+        DealHwError: The file cannot be read, is too large or nested too deep, is no JSON, or a field is
+            wrong; of the given class, with the names of file and fields.
     """
     with reading(path, what, advice, error=error):
         try:
@@ -163,7 +162,7 @@ def read_yaml(path: Path) -> Any:
 
 def parse_yaml(text: str) -> Any:
     """Return the plain values of YAML text; to be called inside :func:`reading`."""
-    # Only here: control processes read no YAML.
+    # Imported here, since control processes read no YAML.
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -179,10 +178,10 @@ def parse_yaml(text: str) -> Any:
 
 
 def _weigh(node: Any, weights: dict[int, float]) -> float:
-    """Return how many values a YAML node stands for.
+    """Return the number of values behind a YAML node.
 
-    Eight lists that each name the one before nine times are a line each, and 43 million values: merging or
-    printing them would not end. A node inside itself weighs infinitely much.
+    Eight lists of one line each, where each names the one before nine times, are 43 million values: merging
+    or printing them would not end. A node inside itself counts as infinite.
     """
     known = weights.get(id(node))
     if known is not None:
@@ -202,7 +201,7 @@ def _weigh(node: Any, weights: dict[int, float]) -> float:
 
 
 class _Sipped(io.FileIO):
-    """A file that is never read far at once: the ZIP reader takes a table of contents at its word."""
+    """A file with a limit on each read, since the ZIP reader trusts a table's announced size."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > _DIRECTORY_BYTES:
@@ -215,19 +214,19 @@ def read_arrays(
 ) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, str]]:
     """Return the arrays of an NPZ file; to be called inside :func:`reading`.
 
-    Sizes are read from the table of contents and from each array's own header before any memory is taken:
-    a file of 3 MB may claim terabytes. Nothing is unpickled.
+    Sizes are read from the table of contents and from each array's own header before any memory is taken: a
+    file of 3 MB may announce terabytes. Nothing is unpickled.
 
     Args:
         source: The file, or its bytes.
-        wanted: Says by kind and shape whether an array is to be read.
+        wanted: Returns from kind and shape whether to read an array.
 
     Returns:
-        The arrays by name, and what was left out with the reason.
+        The arrays by name, and the omitted ones with the reason.
 
     Raises:
-        ValueError: It holds more than :data:`NUMBERS` numbers, or an array is not as long as it says.
-        Exception: What ZIP and NPY readers raise.
+        ValueError: It contains more than :data:`NUMBERS` numbers, or an array is shorter than announced.
+        Exception: Errors of the ZIP and NPY readers.
     """
     if isinstance(source, Path):
         check_size(source, RECORDING_BYTES)
@@ -308,7 +307,7 @@ def numbers(values: Any, what: str, shape: tuple[int, ...], *, finite: bool = Tr
     """Return nested lists of numbers as an array of a given shape.
 
     Raises:
-        ConfigurationError: They have another shape, or hold what is no (finite) number.
+        ConfigurationError: They have another shape, or a value is not a (finite) number.
     """
     try:
         found = np.asarray(values, dtype=float)
@@ -317,5 +316,5 @@ def numbers(values: Any, what: str, shape: tuple[int, ...], *, finite: bool = Tr
     if found.shape != shape:
         raise ConfigurationError(f"{what} has the shape {short(found.shape, 60)}; it must have {shape}")
     if finite and not np.isfinite(found).all():
-        raise ConfigurationError(f"{what} holds a value that is not finite")
+        raise ConfigurationError(f"{what} contains a value that is not finite")
     return found

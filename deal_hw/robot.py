@@ -1,4 +1,4 @@
-"""Contract of a robot: a description plus a way to read and command it."""
+"""Contract of a robot: its description, and methods to read and command it."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from deal_hw.types import JointCommand, RobotState
 class Robot(abc.ABC):
     """A robot behind a transport. The constructor does no I/O; ``connect`` and ``disconnect`` are idempotent.
 
-    A driver never waits longer than it is told to, never retries silently, and does not judge commands: that
-    is the safety filter's work. What it cannot represent on the wire it rounds, and returns what was really
-    sent.
+    A driver never waits longer than the given time and never retries silently. It does not judge commands;
+    the safety filter does. It rounds values to the wire's resolution and returns the values actually sent.
     """
 
     description: ClassVar[RobotDescription]
     watchdog_s: ClassVar[float] = 0.0
-    """The device itself switches its motors off after this time without a command [s]; 0: it holds the last
-    command for ever, so only its own side can help where the link is cut or this computer dies."""
+    """The device itself switches its motors off after this time without a command [s]. 0: it holds the last
+    command for ever; if the connection is cut or this computer fails, only the robot's side can stop it."""
     homes_by_motor: ClassVar[bool] = True
-    """Whether ``home`` moves the motors by this driver's commands: from then on a run must end passive."""
+    """Whether ``home`` moves the motors by this driver's commands; a run must then end passive."""
 
     notice: ClassVar[str] = ""
-    """What the operator should read before a run of a device that is no ordinary one; "": nothing."""
+    """A note to the operator before a run of an unusual device; "": none."""
 
     @abc.abstractmethod
     def connect(self) -> None:
@@ -37,27 +36,27 @@ class Robot(abc.ABC):
 
         Raises:
             TransportError: The port is missing, busy or silent.
-            WrongDeviceError: Something else answers.
+            WrongDeviceError: Another device answers.
             VersionMismatchError: The protocol versions differ.
         """
 
     @abc.abstractmethod
     def disconnect(self) -> None:
-        """Close the transport. Does not send ``passive``: the caller does, last of all commands."""
+        """Close the transport. Does not send ``passive``; the caller sends it as the last command."""
 
     def reopen(self) -> None:  # noqa: B027
-        """Open the transport again where it is lost; what is known of the robot stays.
+        """Open a lost transport again; the knowledge of the robot stays.
 
         Raises:
-            TransportError: It cannot be opened now; another try may succeed.
+            TransportError: It cannot be opened now; a later attempt may succeed.
         """
 
     @abc.abstractmethod
     def home(self, timeout_s: float) -> None:
-        """Bring the robot to its start pose and wait until it is there.
+        """Bring the robot to its start pose and wait for its arrival.
 
         Raises:
-            TransportTimeoutError: It is not there in time.
+            TransportTimeoutError: It does not arrive in time.
         """
 
     @abc.abstractmethod
@@ -82,13 +81,13 @@ class Robot(abc.ABC):
 
     @abc.abstractmethod
     def send_command(self, command: JointCommand) -> JointCommand:
-        """Send PD targets and return what was really sent (rounded to the wire's resolution)."""
+        """Send PD targets and return the values actually sent (rounded to the wire's resolution)."""
 
     def repeat(self) -> None:  # noqa: B027
-        """Send the command in force again, as ``description.repeat_rate_hz`` asks for. Never waits."""
+        """Send the current command again, as ``description.repeat_rate_hz`` requires. Never waits."""
 
     def hand_back(self, timeout_s: float) -> None:  # noqa: B027
-        """Return the robot to the controller that it came with, after ``passive``; does nothing by default.
+        """Return the robot to its own controller, after ``passive``; does nothing by default.
 
         Raises:
             TransportTimeoutError: The robot does not confirm in time.
@@ -100,12 +99,12 @@ class Robot(abc.ABC):
 
     @property
     def operator_stop(self) -> str:
-        """Why the operator asked to stop through the robot itself, as by its remote; "": nobody did."""
+        """Reason of a stop requested through the robot itself, such as by its remote; "": none."""
         return ""
 
     @property
     def fault(self) -> str:
-        """What the driver saw that forbids going on, such as another program's commands; "" for nothing."""
+        """A problem that forbids to continue, such as another program's commands; "": none."""
         return ""
 
     @property
@@ -120,7 +119,7 @@ class Robot(abc.ABC):
 
     @abc.abstractmethod
     def fileno(self) -> int:
-        """The descriptor of the open port, which a child process can inherit; -1: it opens its own path."""
+        """The descriptor of the open port, which a child process can inherit; -1: a child opens its own."""
 
     @abc.abstractmethod
     def take_wire(self) -> list[Message]:

@@ -1,8 +1,8 @@
-"""Reads JSON into dataclasses and says which field is wrong.
+"""Reads JSON into dataclasses and names wrong fields.
 
-Types, missing and unknown fields come from the dataclass's annotations, by pydantic; ranges and what fields
-have to do with each other from the checks in its ``__post_init__``, which hold in Python, too. pydantic is
-imported on use: `import deal_hw` stays light.
+pydantic checks types, missing and unknown fields by the dataclass's annotations. Checks in its
+``__post_init__``, which also hold in Python, cover ranges and relations of fields. pydantic is imported on
+use, so that `import deal_hw` stays fast.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ T = TypeVar("T")
 STRICT: Final[Mapping[str, Any]] = MappingProxyType({"strict": True, "extra": "forbid"})
 """Value of ``__pydantic_config__`` in a dataclass: nothing is converted, unknown fields are refused."""
 FINITE: Final[Mapping[str, Any]] = MappingProxyType({**STRICT, "allow_inf_nan": False})
-"""The same, and all numbers are finite."""
+"""As :data:`STRICT`, and all numbers are finite."""
 OPEN: Final[Mapping[str, Any]] = MappingProxyType({"strict": True})
 """As :data:`STRICT`, but unknown fields are ignored."""
 SHOWN: Final = 3
-"""How many wrong fields a message explains; it counts or names the others."""
+"""Number of wrong fields that a message explains; it counts or names the rest."""
 _MAX_NAMES: Final = 16
 
 
@@ -59,7 +59,7 @@ def from_values(kind: type[T], values: Any) -> T:
 
 @dataclass(frozen=True, slots=True)
 class Tagged:
-    """Annotation of a union of dataclasses: a field of each, a ``Literal``, says which one it is."""
+    """Annotation of a union of dataclasses; a field of each, a ``Literal``, names its class."""
 
     field: str
 
@@ -77,14 +77,14 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def _explain(err: ValidationError) -> str:
-    """Return in one line each wrong field, what was found and what is allowed."""
+    """Return a line for each wrong field, with its value and the allowed ones."""
     errors = err.errors(include_url=False)
     found = []
     for error in errors[:SHOWN]:
         parts = [f"[{part}]" if isinstance(part, int) else f".{short(part, SHORT)}" for part in error["loc"]]
         place = "".join(parts).lstrip(".")
         if error["type"] == "value_error":
-            # A check of a dataclass, which does not know its own place.
+            # A check of a dataclass, which does not know its place in the file.
             found.append(": ".join(filter(None, (place, str(error["ctx"]["error"])))))
         elif not place or error["type"] == "missing":
             found.append(f"field {place} is missing" if place else error["msg"])
@@ -95,12 +95,12 @@ def _explain(err: ValidationError) -> str:
 
 
 def refusal(name: str, found: object, allowed: str, *, quote: bool = True) -> ConfigurationError:
-    """Return the error that names a field, what was found and what is allowed."""
+    """Return the error that names a field, its value and the allowed ones."""
     return ConfigurationError(f"field {name} is {shown(found) if quote else found}; allowed: {allowed}")
 
 
 def either(allowed: Sequence[str]) -> str:
-    """Return names as a message lists them; of many the first."""
+    """Return a message's list of names; of many names only the first."""
     text = ", ".join(shown(name) for name in allowed[:_MAX_NAMES])
     return text if len(allowed) <= _MAX_NAMES else f"{text}, ... ({len(allowed)} in all)"
 
@@ -109,7 +109,7 @@ def check_members(name: str, values: Sequence[str], known: Sequence[str]) -> Non
     """Check that each value is one of the known ones.
 
     Raises:
-        ConfigurationError: One is not.
+        ConfigurationError: A value is unknown.
     """
     for i, value in enumerate(values):
         if value not in known:
@@ -119,17 +119,17 @@ def check_members(name: str, values: Sequence[str], known: Sequence[str]) -> Non
 def check_numbers(
     name: str, values: Sequence[float], length: int, *, lowest: float = -math.inf, endless: bool = False
 ) -> None:
-    """Check that there are so many numbers, each finite and not too small.
+    """Check that there are ``length`` numbers, each finite and not too small.
 
     Args:
         name: Name of the field.
         values: Its values.
-        length: How many there must be.
-        lowest: The smallest that is allowed.
+        length: Required number of values.
+        lowest: Smallest allowed value.
         endless: Whether infinity is allowed, too.
 
     Raises:
-        ConfigurationError: They are not so.
+        ConfigurationError: A check failed.
     """
     if len(values) != length:
         raise refusal(name, f"of length {len(values)}", f"{length}", quote=False)

@@ -24,7 +24,7 @@ class TrainingStatus:
         steps: Environment steps done.
         total: Environment steps to do.
         mean_return: Mean return of the last hundred episodes; 0 before the first ends.
-        measures: What the task measured lately, by name with its unit, such as ``velocity_error_m_s``.
+        measures: Latest measures of the task, by name with unit, such as ``velocity_error_m_s``.
     """
 
     steps: int
@@ -38,14 +38,14 @@ TrainingProgress = Callable[[TrainingStatus], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingFiles:
-    """What a training keeps on disk, what it starts from, and how it is told to stop.
+    """Files and start of a training, and the request to stop it.
 
     Attributes:
-        checkpoint: The file (.safetensors) that training goes on from after a stop; None: none is written.
+        checkpoint: The file (.safetensors) from which a stopped training continues; None: none is written.
         start: A checkpoint whose networks are the start of a new training (a fine-tune); None: from scratch.
-        resume: Go on from ``checkpoint``, where it was left.
+        resume: Continue from ``checkpoint``.
         log: Folder for TensorBoard's files; None: none are written.
-        stop: Asked between updates; once it says True the training ends with the policy as it is.
+        stop: Called between updates; if it returns True, the training ends with the current policy.
     """
 
     checkpoint: Path | None = None
@@ -55,7 +55,7 @@ class TrainingFiles:
     stop: Callable[[], bool] = lambda: False
 
     def source(self, layout: PolicySpec, read: Callable[[Path, PolicySpec], FoundT]) -> FoundT | None:
-        """Return what a training starts from, read by ``read(path, layout)``; None: from scratch."""
+        """Return the start of a training, read by ``read(path, layout)``; None: from scratch."""
         path = self.checkpoint if self.resume else self.start
         return None if path is None else read(path, layout)
 
@@ -78,8 +78,8 @@ class PolicyTrainer(Protocol, Generic[EnvT, ConfigT]):
         """Return the trained policy; the same generator state gives the same policy on the same machine.
 
         Raises:
-            TrainingDivergedError: The networks hold numbers that are not finite; the checkpoint is the last
-                good one.
+            TrainingDivergedError: The networks contain numbers that are not finite; the checkpoint is the
+                last good one.
             CheckpointError: A checkpoint cannot be read, or is of another training.
         """
         ...

@@ -24,7 +24,7 @@ class Message:
         channel: CAN id, topic or key; "" for a byte stream.
         payload: The bytes.
         stamp_ns: Host clock at reception or sending [ns].
-        attachment: Further bytes beside the payload, where the path has room for them (Zenoh); b"" for none.
+        attachment: Further bytes beside the payload, if the path supports them (Zenoh); b"" for none.
     """
 
     channel: str
@@ -48,7 +48,7 @@ class Transport(abc.ABC):
 
         Raises:
             PortNotFoundError: There is no such port.
-            PortBusyError: Somebody else holds it.
+            PortBusyError: Another program holds it.
         """
 
     @abc.abstractmethod
@@ -56,10 +56,10 @@ class Transport(abc.ABC):
         """Close the path."""
 
     def reopen(self) -> None:
-        """Open the path again after it was lost. A path that is sound may be left alone.
+        """Open the path again after it was lost. An intact path may stay unchanged.
 
         Raises:
-            TransportError: It cannot be opened now; another try may succeed.
+            TransportError: It cannot be opened now; a later attempt may succeed.
         """
         self.close()
         self.open()
@@ -75,7 +75,7 @@ class Transport(abc.ABC):
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> Message:
-        """Return what arrived; for a byte stream, all bytes at hand (at least one).
+        """Return what arrived; for a byte stream, all waiting bytes (at least one).
 
         Args:
             timeout_s: How long to wait for the first byte [s]; 0 polls.
@@ -96,7 +96,7 @@ class Transport(abc.ABC):
 
 
 class TransportWrapper(Transport):
-    """A transport on top of another, which it opens and closes; what goes through is the subclass's matter.
+    """A transport on top of another, which it opens and closes; the subclass handles the data.
 
     Args:
         inner: The transport below.
@@ -107,7 +107,7 @@ class TransportWrapper(Transport):
 
     @property
     def port(self) -> str:
-        """Where the path leads."""
+        """The port of the path."""
         return str(getattr(self._inner, "port", type(self._inner).__name__))
 
     def open(self) -> None:
@@ -137,13 +137,13 @@ class WireOptions:
 
     Attributes:
         domain: Number of the DDS domain.
-        listen: Whether to wait for peers at the port (Zenoh) instead of going to them.
-        mode: Zenoh session mode, "peer" or "client"; "" is a peer where it listens, else a client. Two
-            clients of one listener hear each other, two peers do not: another program's commands would stay
-            unnoticed.
+        listen: Whether to wait for peers at the port (Zenoh) instead of connecting to them.
+        mode: Zenoh session mode, "peer" or "client"; "": peer if it listens, else client. Two clients of one
+        listener receive each other's messages; two peers do not, so another program's commands would stay
+        unnoticed.
         insecure: Whether plain TCP to another machine is allowed.
-        ca: Certificate authority that peers are checked against (PEM).
-        certificate: Our own certificate (PEM), which the peer checks.
+        ca: Authority that signed the peers' certificates (PEM).
+        certificate: This side's certificate (PEM), which the peer checks.
         key: Its private key (PEM).
     """
 
@@ -159,9 +159,9 @@ class WireOptions:
 
     def __post_init__(self) -> None:
         if self.mode not in ("", "peer", "client"):
-            raise ConfigurationError(f"wire mode {self.mode!r}: peer or client")
+            raise ConfigurationError(f"wire mode {self.mode!r}: allowed are peer and client")
         if not 0 <= self.domain <= 232:
-            raise ConfigurationError(f"DDS domain {self.domain}: 0 to 232")
+            raise ConfigurationError(f"DDS domain {self.domain}: allowed are 0 to 232")
         if (self.certificate is None) != (self.key is None):
             raise ConfigurationError(
                 "a certificate and its private key belong together: give both or neither"
@@ -169,7 +169,7 @@ class WireOptions:
 
     @property
     def session_mode(self) -> str:
-        """The Zenoh session mode that is meant, "peer" or "client"."""
+        """The resulting Zenoh session mode, "peer" or "client"."""
         return self.mode or ("peer" if self.listen else "client")
 
     def to_json(self) -> dict[str, Any]:
@@ -183,21 +183,21 @@ class WireOptions:
 
 
 class TopicTransport(Transport):
-    """A transport of messages with topics: publish and subscribe, no peer in particular.
+    """A transport of messages with topics: publish and subscribe, without a specific peer.
 
     Topics are named as on the wire of DDS, without a leading slash (``rt/lowstate``); payloads are whole CDR
     messages with their 4-byte header. ``receive`` returns the messages of all subscribed topics in order of
-    arrival, never our own; ``send`` accepts declared topics only. Nobody listening is no error.
+    arrival, never our own; ``send`` accepts declared topics only. A topic without a listener is no error.
 
     Args:
-        port: Where: an endpoint or a network interface.
-        clock: Gives the stamps.
-        options: How.
+        port: An end point or a network interface.
+        clock: Clock of the stamps.
+        options: Options of the connection.
     """
 
     @abc.abstractmethod
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        """Say which topics will be used; takes effect with ``open``, so call it before.
+        """Declare the used topics; call it before ``open``.
 
         Raises:
             UnknownNameError: The transport does not know the topic's type.
@@ -207,5 +207,5 @@ class TopicTransport(Transport):
     def writers(self, topic: str) -> tuple[str, ...]:
         """Return a description of each other participant that is known to write a subscribed topic.
 
-        A transport that cannot know (Zenoh) returns nothing: whoever must be sure listens as well.
+        A transport that cannot know them (Zenoh) returns nothing; for certainty, listen to the topic as well.
         """

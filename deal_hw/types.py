@@ -1,7 +1,7 @@
 """Messages between robot, policy, recorder and calibration.
 
-All quantities are SI: m, rad, s, N, N·m. Stamps are monotonic nanoseconds of the clock that is named. Arrays
-follow the joint order of the robot's :class:`~deal_hw.description.RobotDescription`: J joints, of which A are
+All quantities are SI: m, rad, s, N, N·m. Stamps are monotonic nanoseconds of the named clock. Arrays follow
+the joint order of the robot's :class:`~deal_hw.description.RobotDescription`: J joints, of which A are
 actuated.
 """
 
@@ -20,7 +20,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 class Status(enum.IntFlag):
-    """What a robot says of itself; each driver maps its own bits onto these."""
+    """Status of a robot; each driver maps its own bits onto these."""
 
     NONE = 0
     ARMED = 1
@@ -29,18 +29,18 @@ class Status(enum.IntFlag):
     """The position reference is valid."""
     HOMING = 4
     WATCHDOG = 8
-    """The device stopped its motors because commands stayed away; latched until it is armed again."""
+    """The device stopped its motors because no commands arrived; latched until it is armed again."""
     EFFORT_CLAMPED = 16
-    """The device's own effort limit is in force."""
+    """The device's own effort limit is active."""
     SPEED_CLAMPED = 32
-    """The device's own speed limit is in force."""
+    """The device's own speed limit is active."""
     AT_END_STOP = 64
     FAULT = 128
 
 
 @dataclass(frozen=True, slots=True)
 class BodyState:
-    """What a legged robot senses besides its joints' motion, at the same moment.
+    """Sensed state of a legged robot besides its joints' motion, at the same time.
 
     Attributes:
         orientation: Unit quaternion wxyz, base in the world, (4,).
@@ -80,10 +80,10 @@ class RobotState:
         receive_ns: Host clock at reception [ns].
         device_ns: Device clock at which the sample was sent [ns].
         sequence: Number of the sample, counted by the device.
-        command_sequence: Number of the command in force; -1 before the first.
+        command_sequence: Number of the active command; -1 before the first.
         command_age_ns: Device time since that command was received [ns]; -1 before the first.
-        status: What the robot says of itself.
-        body: What a legged robot senses besides; None for other robots.
+        status: Status bits of the robot.
+        body: Further sensed state of a legged robot; None for other robots.
     """
 
     position: FloatArray
@@ -123,7 +123,7 @@ class JointCommand:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something worth knowing that happened at one moment.
+    """An event at one time.
 
     Attributes:
         stamp_ns: Host clock [ns].
@@ -182,19 +182,19 @@ class Trajectory:
         velocity: (T, J).
         effort: (T, J).
         status: (T,), :class:`Status` bits.
-        command_sequence: The command in force at each sample, (T,); -1 where none.
-        command_age_s: Device time since that command was received, (T,) [s]; NaN where none.
+        command_sequence: The active command at each sample, (T,); -1 for none.
+        command_age_s: Device time since that command was received, (T,) [s]; NaN for none.
         sent_s: Host time of each command, on the time base of ``receive_s``, (C,) [s].
         sent_sequence: Number of each command, (C,).
-        requested_position: Position targets the policy asked for, (C, A).
-        position_target: Position targets really sent, (C, A).
+        requested_position: Position targets that the policy requested, (C, A).
+        position_target: Position targets actually sent, (C, A).
         stiffness: (C, A).
         damping: (C, A).
         effort_limit: (C, A).
         speed_limit: (C, A).
-        events: What happened.
+        events: Events.
         metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
-        body: What a legged robot sensed besides; None for other robots.
+        body: Further sensed state of a legged robot; None for other robots.
     """
 
     joint_names: tuple[str, ...]

@@ -1,3 +1,3 @@
-"""The version of this package, where modules can read it without importing the package's workflows."""
+"""The version of this package, for modules that must not import the package's workflows."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""Robots and the transports that reach them.
+"""Robots and their transports.
 
 Explicit tables, name -> "module:class", imported on use: naming a robot loads its driver and nothing else.
 """
@@ -37,7 +37,7 @@ DESCRIPTIONS: Final = {
     "humanoid": "deal_hw.drivers.humanoid.description:DESCRIPTION",
     "so101": "deal_hw.drivers.so101.description:DESCRIPTION",
 }
-"""Robots as they are simulated and calibrated, where that is not the driver's own description."""
+"""Descriptions for simulation and calibration, of robots whose driver has another one."""
 SPACES: Final = {
     "allegro": "deal_hw.drivers.allegro.description:SPACES",
     "ant": "deal_hw.drivers.ant.description:SPACES",
@@ -50,9 +50,9 @@ SPACES: Final = {
 }
 """Tables of parameter sets, name -> function; the first of each is the default."""
 ODOMETRY: Final = {"go2": "deal_hw.drivers.go2.odometry:walked"}
-"""Robots that tell where they walked: a function of a recording."""
+"""Robots with odometry -> function that returns the walked track of a recording."""
 BALANCE: Final = {"cartpole": "deal_hw.control.balance:recorded_balance"}
-"""Robots whose policies hold a pole up, and what judges a recording of it."""
+"""Robots whose policies balance a pole -> function that judges a recording."""
 TRANSPORTS: Final = {
     "serial": "deal_hw.drivers.transports.serial_transport:SerialTransport",
     "dds": "deal_hw.drivers.transports.dds_transport:DdsTransport",
@@ -64,27 +64,26 @@ WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "dds": ("domain",),
     "zenoh": ("listen", "mode", "insecure", "ca", "certificate", "key"),
 }
-"""What of :class:`~deal_hw.transport.WireOptions` each of them takes."""
+"""The fields of :class:`~deal_hw.transport.WireOptions` that each transport takes."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
     ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
     ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
     ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.connect:dynamixel_robot",
 }
-"""Robots whose driver on a wire is another than that of :data:`ROBOTS`, (robot, wire) -> "module:function".
+"""Robots with another driver on one wire than in :data:`ROBOTS`, (robot, wire) -> "module:function".
 
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
-descriptor of the port that a parent process opened. It does no I/O.
-"""
+descriptor of the port that a parent process opened. It does no I/O."""
 SIMULATED: Final[Mapping[tuple[str, str], str]] = {
     ("go2", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoRobot",
     ("go2_on_stand", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot",
 }
-"""Drivers for a simulator of others in the place of a robot, (robot, simulator) -> "module:class"."""
+"""Drivers for a third-party simulator in place of a robot, (robot, simulator) -> "module:class"."""
 CAN_BUSES: Final[Mapping[str, str]] = {
     "can": "deal_hw.drivers.cartpole.can_robot:can_bus",
     "odrive": "deal_hw.drivers.cartpole.odrive_robot:odrive_bus",
 }
-"""Transports over a CAN bus, and what tells the bus and the nodes that a port means."""
+"""Transports over a CAN bus -> function that returns a port's bus and nodes."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     "cartpole": ("serial", "can", "odrive", "dynamixel"),
     "go2": TOPIC_TRANSPORTS,
@@ -140,8 +139,8 @@ def make_robot(
         clock: Gives the stamps.
         options: More about a transport of topics.
         settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2. ``simulator`` names
-            what stands in the place of the robot, and with it the driver.
-        can_send: False for a robot that is only listened to, as in a dry run.
+            a simulator in place of the robot, and thereby the driver.
+        can_send: False for listening only, as in a dry run.
 
     Raises:
         UnknownNameError: There is no such robot or transport.
@@ -167,7 +166,7 @@ def make_robot(
 
 
 def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
-    """Return the name under which a robot is claimed on this computer: how and where it is reached."""
+    """Return the name under which a robot is claimed on this computer: its transport and port."""
     if transport_name == "zenoh":
         from deal_hw.drivers.transports.zenoh_session import parse_endpoints
 
@@ -186,7 +185,7 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
 
 
 def walked(name: str, trajectory: Trajectory) -> Track | None:
-    """Return where a robot walked by its own sensors; None where it has none for that, or does not walk."""
+    """Return a robot's track by its own sensors; None if it has no odometry, or does not walk."""
     if name not in ODOMETRY:
         return None
     found: Track | None = _find("odometry", ODOMETRY, name)(trajectory)
@@ -194,7 +193,7 @@ def walked(name: str, trajectory: Trajectory) -> Track | None:
 
 
 def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
-    """Return how well a robot's pole was held up; None where it has none, or the recording no duration."""
+    """Return how well a robot's pole was held up; None without a pole, or without a duration."""
     if name not in BALANCE:
         return None
     found: BalanceResult | None = _find("balance", BALANCE, name)(trajectory)
@@ -204,7 +203,7 @@ def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
 def wire_claim(
     name: str, transport_name: str, port: str, clock: Clock, holder: str, options: WireOptions
 ) -> WireClaim | None:
-    """Return the claim on a robot that others on its wire hear; None where the port itself is exclusive.
+    """Return the claim on a robot that other programs on its wire see; None if the port itself is exclusive.
 
     Args:
         name: The robot.
@@ -278,8 +277,8 @@ def adopt_robot(
     transport = _find("transport", TRANSPORTS, transport_name)
     if transport_name in TOPIC_TRANSPORTS:
         raise ConfigurationError(
-            f"transport {transport_name!r} has no descriptor to inherit: each process opens its own, "
-            "make_robot() does"
+            f"transport {transport_name!r} has no descriptor to inherit; each process opens its own "
+            "connection by make_robot()"
         )
     link: Transport = transport.from_fd(fd, clock=clock, port=port)
     made: Robot = robot(link if can_send else listen_only(link), clock)
@@ -287,7 +286,7 @@ def adopt_robot(
 
 
 def driver_description(name: str) -> RobotDescription:
-    """Return the facts about a robot as its driver has them, with the rates of its real wire.
+    """Return the facts about a robot in its driver, with the rates of its real wire.
 
     Raises:
         UnknownNameError: There is no such robot.
@@ -382,7 +381,8 @@ def _refuse_options(transport_name: str, options: WireOptions | None) -> None:
     """Refuse settings of a network on a wire that is none."""
     if given := _given(options):
         raise ConfigurationError(
-            f"{_options(given)} would have no effect: transport {transport_name!r} is no network"
+            f"{_options(given)} would have no effect: transport {transport_name!r} is no network; leave it "
+            "out"
         )
 
 

@@ -1,4 +1,4 @@
-"""The verbs of `deal-hw`, one module each: the only place where the parts are put together.
+"""The verbs of `deal-hw`, one module each; only this package joins all the parts.
 
-:mod:`deal_hw.cli.main` holds the table of verbs and imports the one that was asked for.
+:mod:`deal_hw.cli.main` holds the table of verbs and imports the requested one.
 """

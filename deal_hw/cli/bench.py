@@ -31,7 +31,7 @@ Seeds = Range(0, 2**32 - 1 - MOST_SEEDS)
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
+    """Measure how well calibration and the whole loop work; a stopped bench continues where it stopped."""
 
     bench: tyro.conf.Positional[
         Literal[
@@ -48,14 +48,14 @@ class Bench:
         ]
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
-    go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned.
-    fixed-range: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
-    simulator here does. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings
-    of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
-    without deliberate faults: is a right model called right, and a wrong one wrong? first-answer:
-    seconds until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. speed: what a
-    search costs beside bare physics and DEAL's Table 3. go2-codec: what the Go2's messages cost to write
-    and read."""
+    go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned. fixed-range: calibrate
+    off-centre truths in a fixed range. mismatch: the same on robots with effects that no simulator here
+    models. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings of a real
+    robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and without
+    deliberate faults: does the verdict accept a right model and reject a wrong one? first-answer: seconds
+    until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. speed: what a search
+    costs beside bare physics and DEAL's Table 3. go2-codec: what the Go2's messages cost to write and read.
+    """
 
     recordings: Annotated[tyro.conf.OmitArgPrefixes[Recordings], REAL] = field(default_factory=Recordings)
 
@@ -63,14 +63,14 @@ class Bench:
     """A dataset instead of --model and --data; of a robot of ours, or one that carries its robot."""
 
     holdout: Annotated[tuple[Path, ...], REAL] = ()
-    """Recordings that only judge, of a dataset episodes by number; by default the last part of each."""
+    """Held-out recordings, of a dataset episode numbers; by default the last part of each recording."""
 
     heldout_window: Annotated[float, Range(1e-3, 600, "s"), REAL] = 5.0
-    """Held-out predictions restart this often [s]."""
+    """Held-out predictions restart from the measured state after this time [s]."""
 
     residual_std: Annotated[tuple[str, ...], REAL] = ()
-    """What a prediction may be off, as for `deal-hw calibrate`; by default the residual of a first
-    fit to the recordings that are fitted."""
+    """Standard deviation of the prediction error, as for `deal-hw calibrate`; by default the residual of a
+    first fit to the fitted recordings."""
 
     real: Annotated[Path | None, Only(("first-answer",))] = None
     """Folder with so101/ and go2_suspended/: the recordings and the columns.yaml of each. Pages 'SO-101 arm'
@@ -84,7 +84,7 @@ class Bench:
     faults: Annotated[str, Only(("verdict",))] = ""
     """Faults, comma separated; by default none, friction, backlash, jitter, mass, sign. Faults of recordings
     that commands and measurements share: mirrored, swapped, fast-clock, slow-clock, degrees, doubled,
-    doubled-joint; these calibrations end when they have said which."""
+    doubled-joint; these calibrations end as soon as they have named the fault."""
 
     task: Annotated[str, TASKS] = "cartpole"
     """Tasks, comma separated: cartpole, ant, humanoid, go2, allegro."""
@@ -110,8 +110,8 @@ class Bench:
     """Refine every method; by default only `default` is."""
 
     demonstration: Annotated[Literal["excite", "policy"], ROBOTS] = "excite"
-    """How robots are demonstrated: by motions that excite, or by their shipped policies, which methods of the
-    paper need."""
+    """What moves the robots: exciting motions, or their shipped policies, which the methods of the paper
+    need."""
 
     demonstration_seconds: Annotated[float, Range(1, 600, "s"), ROBOTS] = 4.0
     """Length of the demonstration [s]."""
@@ -224,8 +224,8 @@ class _Table:
 
     Attributes:
         cells: What it runs.
-        line: A row in words.
-        summary: Prints what rows without errors say.
+        line: Returns a row as one line of text.
+        summary: Prints a summary of the rows without errors.
         draw: Draws all rows beside the file of rows.
     """
 

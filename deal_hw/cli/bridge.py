@@ -1,4 +1,4 @@
-"""``deal-hw bridge``: what runs on the Go2's own computer, between its DDS and a network."""
+"""``deal-hw bridge``: the program on the Go2's own computer, between its DDS and a network."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class Bridge(Checked):
     """The robot: go2."""
 
     port: str
-    """The robot's side: network interface of its DDS, by name or address, such as eth0."""
+    """Network interface of the robot's DDS, by name or address, such as eth0."""
 
     listen: str = ""
-    """The network's side: end point such as tls/192.168.1.20:7447. By default this computer alone:
+    """End point for clients, such as tls/192.168.1.20:7447. By default only this computer can reach it:
     tls/127.0.0.1:7447, or tcp/127.0.0.1:7447 without certificates."""
 
     controllers: tuple[str, ...] = ("controller",)
@@ -66,26 +66,27 @@ class Bridge(Checked):
     """Its private key (PEM)."""
 
     insecure: bool = False
-    """Allow plain TCP beyond this computer: whoever reaches the port may then command the robot."""
+    """Allow plain TCP beyond this computer. Everybody who reaches the port may then command the robot."""
 
     domain: Annotated[int, Range(0, 232)] = 0
     """DDS domain."""
 
     state_check: Literal["strict", "length"] = "strict"
-    """What the states of the robot must pass to be known here: strict, or length for other firmware."""
+    """How to check the robot's state messages: strict (length, head and checksum), or length alone, for other
+    firmware."""
 
     rules: tyro.conf.OmitArgPrefixes[BridgeConfig] = field(default_factory=BridgeConfig)
-    """What is admitted, and when the robot is damped."""
+    """Which commands are admitted, and when the robot is damped."""
 
     duration_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """Stop after this time [s]; without it, at Ctrl-C."""
 
     parent: Annotated[int | None, Range(1, 2**22)] = None
-    """Stop when the process with this id is no longer the parent (for programs that start a bridge)."""
+    """Stop when the process with this id is no longer the parent. For programs that start a bridge."""
 
     @property
     def end_point(self) -> str:
-        """Where it listens."""
+        """The end point at which clients connect."""
         return self.listen or f"{'tls' if self.certificate else 'tcp'}/127.0.0.1:{LOOPBACK_PORT}"
 
 
@@ -114,7 +115,7 @@ def bridge(config: Bridge) -> int:
                 state_check=config.state_check,
                 tell=_tell,
             )
-            # The transports' threads inherit the priority that holds when they are opened.
+            # Threads of the transports inherit the priority of the moment when they are opened.
             with priority(FIFO_PRIORITY, children=True, lock=True), _switching():
                 if os.sched_getscheduler(0) != os.SCHED_FIFO:
                     _tell("warning: real-time priority was refused; damping may be late under load")
@@ -136,7 +137,7 @@ def bridge(config: Bridge) -> int:
 
 @contextlib.contextmanager
 def _switching() -> Iterator[None]:
-    """Let the interpreter's threads switch sooner: neither may keep the other waiting for the usual 5 ms."""
+    """Let the interpreter switch threads sooner; by default one may keep the other waiting for 5 ms."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -158,7 +159,7 @@ def _network(config: Bridge, port: str) -> ZenohTransport:
     else:
         default = Bridge(robot=config.robot, port=config.port)
         named = given(config, default, ("controllers", "observers"))
-        refuse(named, f"{port} has no TLS, so nobody's certificate is known; listen on tls/")
+        refuse(named, f"{port} has no TLS, so the bridge sees no certificates; listen on tls/")
     return ZenohTransport(port, MonotonicClock(), options, settings)
 
 
@@ -167,11 +168,11 @@ def _tell(text: str) -> None:
 
 
 def summary(made: Go2Bridge) -> list[str]:
-    """Return what happened, in words."""
+    """Return a summary of the run as text."""
     judge = made.admission
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(judge.refused.items()))
     return [
         f"bridge: {made.counts['rt/lowstate']} states and {judge.admitted} commands passed, {made.unsent} "
-        f"messages not sent; the latest look for silence {made.latest_ns / 1e6:.1f} ms late; "
-        f"refused: {kinds or 'none'}" + (f" (the last: {judge.last_refusal})" if kinds else "")
+        f"messages not sent; the latest check for silence was {made.latest_ns / 1e6:.1f} ms late; refused: "
+        f"{kinds or 'none'}" + (f" (the last: {judge.last_refusal})" if kinds else "")
     ]

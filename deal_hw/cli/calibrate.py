@@ -33,8 +33,7 @@ __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_para
 class Calibrate(CalibrateSettings):
     """Find the simulator parameters that explain a recording.
 
-    Of a dataset, of a robot that deal-hw drives or that the dataset carries:
-    deal-hw calibrate runs/first/dataset
+    From a dataset, of a robot of deal-hw or with its own robot.yaml: deal-hw calibrate runs/first/dataset
 
     Of any robot, from its MuJoCo model and recordings of joint positions and commands:
     deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine
@@ -49,19 +48,19 @@ class Calibrate(CalibrateSettings):
     residual_std: tuple[str, ...] = ()
 
     resume: bool = False
-    """Go on with the calibration that was stopped in this folder; all other settings must be the same."""
+    """Continue the calibration that was stopped in this folder; all other settings must be the same."""
 
     watch: bool = False
-    """Show the population while it searches: in a window, or in a browser where there is no desktop."""
+    """Show the population during the search: in a window, or in a browser if there is no desktop."""
 
     watch_save: Path | None = None
-    """Write that view to a file, FILE.rrd."""
+    """Write the view of --watch to a file, FILE.rrd."""
 
     report: bool = True
-    """Write report.html, one page with everything; off saves some seconds."""
+    """Write report.html, one page with all results; takes some seconds."""
 
     advise: bool = True
-    """Compute what to record next where a parameter stayed weak or open; off saves some seconds."""
+    """Compute which motion to record next if the data say little of a parameter; takes some seconds."""
 
     quiet: bool = False
     """Print nothing but errors."""
@@ -71,7 +70,7 @@ def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:
     """Run the verb: calibrate, or write a file of parameters to edit.
 
     Raises:
-        DealHwError: A setting, a recording or the data are unusable; nothing long was begun.
+        DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     if config.recordings.write_parameters is not None:
         path = write_parameters(config.recordings, config.dataset)
@@ -87,7 +86,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     """Calibrate, write the result folder, return both.
 
     Raises:
-        DealHwError: A setting, a recording or the data are unusable; nothing long was begun.
+        DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     config.check()
     say = silent if config.quiet else aloud

@@ -1,4 +1,4 @@
-"""What `deal-hw calibrate` shows: a bar while it runs, and the result."""
+"""Output of `deal-hw calibrate`: a progress bar, then the result."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
 
 
 def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
-    """Print the parameters with their intervals, and what the data cannot tell.
+    """Print the parameters with their intervals, and the combinations that the data do not determine.
 
     Args:
-        result: What was found.
-        advice: How to get a held-out recording where there is none.
-        name: Name under which `deal-hw collect` records this robot; "" where it does not.
+        result: The result.
+        advice: How to get a held-out recording if there is none.
+        name: Name under which `deal-hw collect` records this robot; "" if it cannot.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -88,23 +88,21 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     if console.width < TABLE_WIDTH:
         console = Console(width=TABLE_WIDTH)
     console.print(table)
-    told = trust(result)
-    console.print(f"[bold]{told.colour}:[/bold] {told.sentence}")
+    overall = trust(result)
+    console.print(f"[bold]{overall.colour}:[/bold] {overall.sentence}")
     for words in result.null_directions:
-        console.print(f"the data cannot tell: {words}")
+        console.print(f"the data do not determine: {words}")
     for number, line in enumerate(next_step(result.advice, name)):
-        # A command is to be copied: not wrapped.
+        # A command must not be wrapped: users copy it.
         console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
     for alarm in result.alarms:
         console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
         console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
     step = result.provenance.get("physics_step", {})
     if "note" in step:
-        console.print(
-            f"physics step of {1e3 * step['step_s']:g} ms, whether it is fine enough: {step['note']}"
-        )
+        console.print(f"check of the physics step, {1e3 * step['step_s']:g} ms: {step['note']}")
     if not result.heldout_nrmse:
-        console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
+        console.print(f"no held-out recording: the result was not tested on other motion; {advice}")
         return
     window_s = result.provenance.get("heldout_window_s", HELDOUT_WINDOW_S)
     errors = ", ".join(f"{name} {value:.4f}" for name, value in result.heldout_nrmse.items())

@@ -1,4 +1,4 @@
-"""``deal-hw collect``: record the robot while it moves in an informative way."""
+"""``deal-hw collect``: record the robot during an informative motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deal-hw data`: tell about recordings, verify them, repair them, import and export them."""
+"""`deal-hw data`: show, verify, repair, import and export recordings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InfoSettings:
-    """Tell what is in a dataset or an episode."""
+    """Show the contents of a dataset or an episode."""
 
     path: tyro.conf.Positional[Path]
     """A dataset (DIR) or an episode (DIR/episodes/000000.mcap)."""
@@ -44,7 +44,7 @@ class InfoSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verify:
-    """Check files without changing them, checksums included; exit code 1 if one is torn or damaged."""
+    """Check files and their checksums, without changes; exit code 1 if a file is torn or damaged."""
 
     path: tyro.conf.Positional[Path]
     """A dataset (DIR) or an episode (DIR/episodes/000000.mcap)."""
@@ -54,7 +54,7 @@ class Verify:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Repair:
-    """Mend torn or damaged files and say what was lost; sound files stay as they are."""
+    """Repair torn or damaged files and print what was lost; other files stay unchanged."""
 
     path: tyro.conf.Positional[Path]
     """A dataset (DIR) or an episode (DIR/episodes/000000.mcap)."""
@@ -64,7 +64,7 @@ class Repair:
 
 @dataclass(frozen=True, kw_only=True)
 class Import(ImportSettings):
-    """Make a dataset of recordings of any robot; refuses what is not plausible."""
+    """Make a dataset from plausible recordings of any robot."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
 
@@ -118,7 +118,7 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
         for error in errors:
             print(f"error: {error}")
     if isinstance(config, Repair) and (config.path / INDEX_NAME).is_file():
-        # Opening takes in what no index names yet, such as the episode of a killed collector.
+        # Opening also indexes new episodes, such as that of a killed collector.
         Dataset.open(config.path)
     return (
         EXIT_OK if not errors and all(report.sound or report.repaired for report in reports) else EXIT_UNSOUND
@@ -126,7 +126,7 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
 
 
 def _each(files: list[Path], mend: bool) -> tuple[list[RepairReport], list[str]]:
-    """Return what was found in each file; one that cannot be read does not keep the others from it."""
+    """Return the findings of each file; an unreadable file does not stop the check of the next one."""
     reports, errors = [], []
     for path in files:
         try:
@@ -146,7 +146,10 @@ def _episode_files(path: Path) -> list[Path]:
     folder = path if path.name == "episodes" else path / "episodes"
     files = sorted(folder.glob("*.mcap"))
     if not files and not (path / INDEX_NAME).is_file():
-        raise DatasetError(f"{path} is neither a dataset (no {INDEX_NAME}) nor has it episodes/*.mcap")
+        raise DatasetError(
+            f"{path} is no dataset: it has neither {INDEX_NAME} nor episodes/*.mcap; name a "
+            "dataset (DIR) or an episode (DIR/episodes/000000.mcap)"
+        )
     return files
 
 
@@ -178,7 +181,7 @@ def _info(config: InfoSettings) -> int:
         console.print(note, style="yellow", markup=False)
     console.print(_dataset_table(dataset))
     if carries_robot(dataset.folder):
-        console.print(f"it carries its robot: {dataset.folder / 'robot' / 'robot.yaml'}", markup=False)
+        console.print(f"its robot: {dataset.folder / 'robot' / 'robot.yaml'}", markup=False)
     for problem in carried_problems(dataset.folder):
         console.print(problem, style="red", markup=False)
     for episode in dataset.episodes:
@@ -190,7 +193,7 @@ def _dataset_table(dataset: Dataset) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    # Words from a file are no markup, hence Text.
+    # Text, since words from a file could look like markup.
     title = Text(f"{dataset.folder}: {dataset.description['name']}, description {dataset.digest}")
     table = Table(title=title, title_justify="left")
     table.add_column("no.", justify="right", no_wrap=True)
@@ -208,21 +211,21 @@ def _dataset_table(dataset: Dataset) -> Table:
             f"{episode.duration_s:.1f}",
             str(episode.states),
             str(episode.commands),
-            Text(_moved_by(episode, dataset.description)),
+            Text(_position_ranges(episode, dataset.description)),
             _worst(episode),
         )
     return table
 
 
 def _motion(episode: EpisodeInfo) -> str:
-    """Return why an episode was recorded and what was played, with its level where that was changed."""
+    """Return the purpose of an episode and its motion, with a changed excitation level."""
     level = float(episode.facts.get("excitation_level") or 0.0)
     words = [episode.purpose, motion_of(episode.facts), f"level {level:+g}" if level else ""]
     return " ".join(word for word in words if word)
 
 
-def _moved_by(episode: EpisodeInfo, description: Mapping[str, Any]) -> str:
-    """Return the range of each joint's positions, of more than two joints the widest alone."""
+def _position_ranges(episode: EpisodeInfo, description: Mapping[str, Any]) -> str:
+    """Return the range of each joint's positions; with more than two joints only the widest range."""
     ranges = (episode.excitation or {}).get("position_range") or ()
     units, names = description.get("position_units") or (), description.get("joint_names") or ()
     parts = [f"{value:.2f} {unit}" for value, unit in zip(ranges, units, strict=False)]

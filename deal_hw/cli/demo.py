@@ -1,7 +1,7 @@
-"""``deal-hw demo``: all five jobs on an emulated robot whose physics the calibrator cannot see.
+"""``deal-hw demo``: all five jobs on an emulated robot with hidden physics.
 
-What each robot does is a module of its own, :mod:`deal_hw.cli.demo_cartpole` and
-:mod:`deal_hw.cli.demo_go2`; stages, summary and tables are here.
+The part of each robot is in :mod:`deal_hw.cli.demo_cartpole` and :mod:`deal_hw.cli.demo_go2`. This module has
+stages, summary and tables.
 """
 
 from __future__ import annotations
@@ -33,41 +33,41 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 END_WIDTH = 110
-"""Width of the demo's last words [columns]."""
+"""Width of the demo's final output [columns]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Checked):
-    """Record, calibrate, retrain, deploy and compare on an emulated robot over its wire."""
+    """Record, calibrate, retrain, deploy and compare on an emulated robot."""
 
     robot: tyro.conf.Positional[Literal["cartpole", "go2"]] = "cartpole"
     """cartpole balances its pole, go2 walks."""
 
     out: Path | None = None
-    """Run folder, by default runs/demo (go2: runs/demo_go2); a former demo in it is replaced."""
+    """Run folder, by default runs/demo (go2: runs/demo_go2). A former demo in it is deleted."""
 
     transport: str = ""
     """The wire. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the default) or
     zenoh."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
-    """What stands between the emulated mechanics and the wire."""
+    """Sensor effects of the emulated robot, as for `deal-hw emulate`."""
 
     seed: Seed = 0
-    """Draws the hidden truth, the demonstration, the search and the training."""
+    """Seed of the hidden truth, the motion, the search and the training."""
 
     episodes: Annotated[int | None, Range(1, 1000)] = None
     """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s."""
 
     firmware: Annotated[Literal["python", "host", "avr"], CARTPOLE] = "python"
-    """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
+    """How the firmware of the cart-pole runs, as for `deal-hw emulate cartpole`."""
 
     on_stand: Annotated[bool, Only(("go2",))] = False
-    """Calibrate from a recording with its body on a stand instead of from its walk."""
+    """Calibrate from a recording with the body on a stand instead of from the walk."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
-    """Training steps. Cart-pole: by default those of the shipped UDR policy. Go2: 300,000, from the shipped
-    policy on."""
+    """Training steps. Cart-pole: by default as many as for the shipped UDR policy. Go2: 300,000, starting
+    from the shipped policy."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,10 +81,10 @@ class Demo(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoReport:
-    """What the demo found.
+    """Result of the demo.
 
     Attributes:
-        summary: What ``summary.json`` holds.
+        summary: Contents of ``summary.json``.
         folder: The run folder.
     """
 
@@ -94,12 +94,12 @@ class DemoReport:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measure:
-    """One number of each policy's deployments.
+    """A measure of each policy's deployments.
 
     Attributes:
         name: Key in the summary; ends with the unit.
-        unit: As names write it.
-        values: By policy, one a deployment, (E,).
+        unit: As it stands in names.
+        values: By policy: one value per deployment, (E,).
     """
 
     name: str
@@ -115,14 +115,14 @@ class Measure:
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstrated:
-    """What a robot's part of the demo hands back.
+    """Result of a robot's part of the demo.
 
     Attributes:
         found: The calibration.
         truth: True values of its parameters, by name.
         latency_s: The true latency [s].
-        measures: What is compared of the policies.
-        sentence: What came of the loop, with what was measured alone.
+        measures: Measures that compare the policies.
+        sentence: The outcome of the loop, from measurements alone.
         episode: The recording to look at.
         run: The last deployment of the retrained policy.
         paths: Files to look at.
@@ -144,7 +144,7 @@ class Demonstrated:
 
 @dataclass
 class Stages:
-    """Announces stages and keeps their times: elapsed, and of processors in this process and its children."""
+    """Prints the start of each stage and keeps its wall-clock and CPU time, children included."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
@@ -165,10 +165,10 @@ class Part(Protocol):
     """A robot's part."""
 
     def check(self, config: Demo) -> None:
-        """Refuse settings, and an installation, with which it would fail later.
+        """Check settings and installation, so that no later stage fails by them.
 
         Raises:
-            ConfigurationError: There is something.
+            ConfigurationError: A setting or a package is missing or unusable.
         """
         ...
 
@@ -178,13 +178,13 @@ class Part(Protocol):
 
 
 def demo(config: Demo) -> DemoReport:
-    """Run the whole loop and print what came of it.
+    """Run the whole loop and print the outcome.
 
     Raises:
-        DealHwError: A stage failed; the robot is passive, and what was recorded is whole.
+        DealHwError: A stage failed; the robot is passive, and the recordings are complete.
     """
     try:
-        # What any stage will need is missed now, not after minutes.
+        # A missing package is reported now, not after minutes.
         importlib.import_module("deal_hw.cli.inspect_")
         importlib.import_module("deal_hw.policies.trainers")
         part = cast("Part", importlib.import_module(f"deal_hw.cli.demo_{config.robot}"))
@@ -228,7 +228,7 @@ def clear(folder: Path) -> None:
 
 
 def read_truth(path: Path) -> dict[str, Any]:
-    """Return what an emulator revealed when it ended."""
+    """Return the truth that an emulator wrote at its end."""
     return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
 
 
@@ -238,7 +238,7 @@ def first_episode(dataset: Path) -> Path:
 
 
 def show_episode(folder: RunFolder, episode: Path) -> Path:
-    """Write a recording beside what both models predict; return the file."""
+    """Write a recording with the predictions of both models; return the file."""
     from deal_hw.cli.inspect_ import Inspect, inspect
 
     rrd = folder.path / "inspect.rrd"
@@ -288,18 +288,18 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
 
 
 def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationResult, folder: Path) -> None:
-    """Say in a sentence what came of it, show what was found beside the truth, and how to look at it.
+    """Print the outcome, the estimates beside the truth, and the commands that show more.
 
     Args:
         console: Where to print.
-        summary: What ``summary.json`` holds.
+        summary: Contents of ``summary.json``.
         result: The calibration.
         folder: The run folder.
     """
     from rich.table import Table
 
     console.print(f"\n{summary['sentence']}", markup=False)
-    table = Table(title="what the calibrator found of a robot it could not look inside")
+    table = Table(title="estimates of the calibration beside the hidden truth")
     for name in ("parameter", "unit", "nominal", "estimate", "90 % interval", "truth"):
         table.add_column(name, justify="left" if name in ("parameter", "unit") else "right")
     for k, (name, row) in enumerate(summary["parameters"].items()):

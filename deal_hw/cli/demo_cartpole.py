@@ -32,7 +32,7 @@ EPISODES = 3
 
 
 def check(config: Demo) -> None:
-    """Refuse what cannot work. See :class:`deal_hw.cli.demo.Part`."""
+    """Check settings. See :class:`deal_hw.cli.demo.Part`."""
     required_policy("cartpole")
 
 
@@ -57,7 +57,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     with EmulatorProcess("cartpole", *options) as emulator:
         port = emulator.port
         print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
-        with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
+        with stages.stage("collect", "4 s of informative motion, and 4 s of other motion as held-out data"):
             for kind in ("rich", "chirp"):
                 collect(
                     Collect(robot="cartpole", port=port, link=link, out=out, motion=kind, seed=config.seed)
@@ -65,7 +65,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
         with stages.stage("calibrate", "search, refinement, latency, intervals"):
             found = calibrate(Calibrate(dataset=folder.dataset, out=out, seed=config.seed))
         with (
-            stages.stage("calibrate deal", "the adversarial search alone, to compare with"),
+            stages.stage("calibrate deal", "the adversarial search alone, for comparison"),
             PipedProgress("calibrate deal", sys.stderr.isatty()),
         ):
             beside = calibrate(
@@ -79,7 +79,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
                 )
             )
         policy = folder.policies / "calibrated.onnx"
-        with stages.stage("train", "a policy under what is now known of the robot"):
+        with stages.stage("train", "a policy under the calibrated distribution"):
             train(
                 Train(
                     robot="cartpole",
@@ -116,8 +116,8 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
             Measure(name=name, unit=unit, values={p: score[:, i] for p, score in scores.items()})
             for i, (name, unit) in enumerate((("angle_error_rad", "rad"), ("cart_speed_m_s", "m_s")))
         ],
-        sentence=f"The policy that was trained under the calibration held {held(runs['retrained'])}; the one "
-        f"that was trained without recordings of this robot held {held(runs['udr'])}.",
+        sentence=f"The policy trained under the calibration held {held(runs['retrained'])}; the policy "
+        f"trained without recordings of this robot held {held(runs['udr'])}.",
         episode=episode,
         run=runs["retrained"],
         paths={"rrd": str(rrd), "mjcf": str(found.files["calibrated.xml"]), "policy": str(policy)},
@@ -127,7 +127,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
 
 
 def held(run: RunReport) -> str:
-    """Return for how long a policy held the pole up, in the deployments that were run."""
+    """Return how long a policy held the pole up, over all deployments."""
     judged = [episode.balance for episode in run.episodes if episode.balance is not None]
     planned_s = sum(episode.planned_s for episode in run.episodes)
     count = len(run.episodes)
@@ -140,7 +140,7 @@ def held(run: RunReport) -> str:
 def task_scores(dataset: Path, episodes: int) -> FloatArray:
     """Return mean |pole angle| [rad] and mean |cart speed| [m/s] of each deployment, (E, 2).
 
-    What is missing of a run that the safety filter ended early counts as fallen: pi rad, and a cart at rest.
+    If the safety filter ended a run early, the missing part counts as fallen: pi rad, and a cart at rest.
     """
     from deal_hw.control.balance import TASK_SECONDS, balance_result
     from deal_hw.data.recording.dataset import Dataset
@@ -152,6 +152,6 @@ def task_scores(dataset: Path, episodes: int) -> FloatArray:
         period_s = float(np.median(np.diff(recorded.device_s)))
         result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
         scores.append((result.angle_error_rad, result.cart_speed_m_s))
-    # Episodes that were not run any more, because an earlier one was tripped, count like that one's worst.
+    # After a trip no more episodes run. These count like the worst episode before.
     scores += [(np.pi, 0.0)] * (episodes - len(scores))
     return np.array(scores)

@@ -44,14 +44,14 @@ from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import read_distribution
 
 STEPS: Final = 300_000
-"""Of the fine-tune: a minute of a processor."""
+"""Steps of the fine-tune: about a minute of one processor."""
 PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
 ATTEMPTS: Final = 3
-"""Walks, until one to calibrate from is whole."""
+"""Most walks until one can be used for the calibration."""
 
 
 def check(config: Demo) -> None:
-    """Refuse what cannot work. See :class:`deal_hw.cli.demo.Part`."""
+    """Check settings. See :class:`deal_hw.cli.demo.Part`."""
     required_policy("go2")
     if _transport(config) not in PORTS:
         raise ConfigurationError(
@@ -69,12 +69,12 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     out, episodes = config.folder, config.episodes or 1
     profile, heldout = write_script(out / "profile.csv", PROFILE), write_script(out / "heldout.csv", HELDOUT)
     walks: dict[str, _Walked] = {}
-    # The emulator runs only while the robot is needed: it takes a third of a processor.
+    # The emulator takes a third of a processor, so it runs only while the robot is needed.
     with _emulated(config, "before") as robot:
         with stages.stage("walk udr", f"stand up, walk {PROFILE_S:g} s, lie down; {episodes} times"):
             walks["udr"] = robot.whole_walk(udr, profile, PROFILE_S, folder.dataset, episodes)
         if not config.on_stand:
-            with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities, to judge by"):
+            with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities as held-out data"):
                 judge = robot.whole_walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
     if config.on_stand:
         found, distribution = _on_stand(config, folder, stages)
@@ -119,7 +119,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Walked:
-    """Walks of one policy: the report, and the file of where the base really was."""
+    """Walks of one policy: the report, and the file of the true base positions."""
 
     report: RunReport
     track: Path
@@ -139,7 +139,7 @@ class _Emulated:
     track: Path
 
     def walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
-        """Let it walk."""
+        """Run a policy on the robot."""
         report = deploy(
             Deploy(
                 robot="go2",
@@ -156,26 +156,26 @@ class _Emulated:
         return _Walked(report=report, track=self.track)
 
     def whole_walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
-        """Let it walk, again where a walk ended early or its recording cannot be calibrated from.
+        """Run a policy; repeat if a walk ended early or its recording cannot be used for calibration.
 
         Raises:
-            SafetyError: No walk was whole.
+            SafetyError: No walk could be used.
         """
         for _ in range(ATTEMPTS):
             walked = self.walk(policy, script, seconds, dataset, times)
             reason = next(filter(None, map(_unusable, walked.report.episodes)), "")
             if not reason:
                 return walked
-            print(f"warning: the walk is of no use ({reason})", file=sys.stderr)
+            print(f"warning: the walk cannot be used for calibration ({reason})", file=sys.stderr)
         raise SafetyError(
-            f"{ATTEMPTS} walks are of no use, the last one: {reason}. Old states and clocks that jump come "
-            "from a computer that is busy or pauses (`deal-hw doctor`); end other programs, or try another "
-            "--seed"
+            f"no walk of {ATTEMPTS} can be used for calibration; the last one: {reason}. A busy computer, "
+            "or one that pauses, causes old states and clock jumps (see `deal-hw doctor`); end other "
+            "programs, or try another --seed"
         )
 
 
 def _unusable(episode: EpisodeReport) -> str:
-    """Return why a walk is nothing to calibrate from; "" where it is."""
+    """Return why a walk cannot be used for calibration; "" if it can."""
     if episode.outcome is not Outcome.FINISHED or episode.path is None:
         return episode.reason
     verdicts = check_recording(read_episode(episode.path).trajectory)
@@ -184,7 +184,7 @@ def _unusable(episode: EpisodeReport) -> str:
 
 @contextmanager
 def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
-    """Yield the robot of the demo's seed; its truth and its track are in files of this name."""
+    """Yield the robot of the demo's seed. Its truth and its track go to files of this name."""
     out, transport = config.folder, _transport(config)
     track = out / f"truth_track_{name}.csv"
     with EmulatorProcess(
@@ -204,7 +204,7 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
         *options,
     ) as emulator:
         print(f"an emulated Go2 ({config.profile}) with hidden physics is on {emulator.port}")
-        # The raw bytes are nobody's need here, and half of the recorder's work.
+        # The demo needs no raw bytes, and they are half of the recorder's work.
         link = LinkOptions(transport=transport, record_wire=False)
         yield _Emulated(port=emulator.port, link=link, track=track)
 
@@ -213,11 +213,11 @@ def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[Calibrat
     """Record the same robot on a stand and calibrate from that.
 
     Returns:
-        The calibration, and the file of what it says of the robot on the floor.
+        The calibration, and the file of its distribution for the robot on the floor.
     """
     out, dataset = config.folder, config.folder / "dataset_on_stand"
     with _emulated(config, "on_stand", "--on-stand") as robot:
-        with stages.stage("collect on a stand", "10 s of a multisine, and 8 s of a sweep to judge by"):
+        with stages.stage("collect on a stand", "10 s of a multisine, and 8 s of a sweep as held-out data"):
             for excite, seconds in (("multisine", 10.0), ("chirp", 8.0)):
                 collect(
                     Collect(
@@ -245,11 +245,11 @@ def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[Calibrat
 def _fine_tuned(
     config: Demo, folder: RunFolder, stages: Stages, found: Path, udr: Path
 ) -> Mapping[str, Path]:
-    """Fine-tune the shipped policy under what was found, and as long under UDR to compare with."""
+    """Fine-tune the shipped policy under the calibration, and as long under UDR for comparison."""
     policies = {name: folder.policies / f"{name}.onnx" for name in ("udr more", "calibrated")}
     for name, policy in policies.items():
         distribution = found if name == "calibrated" else None
-        with stages.stage(f"train {name}", "the shipped policy, some steps more"):
+        with stages.stage(f"train {name}", "some more training steps of the shipped policy"):
             train(
                 Train(
                     robot="go2",
@@ -265,7 +265,7 @@ def _fine_tuned(
 
 
 def _errors(report: EpisodeReport, track: Track) -> tuple[VelocityError | None, bool]:
-    """Return the errors of a walk by the truth, and whether the robot fell or was stopped."""
+    """Return the true errors of a walk, and whether the robot fell or was stopped."""
     fell = report.outcome is not Outcome.FINISHED
     if report.path is None:
         return None, fell
@@ -273,14 +273,14 @@ def _errors(report: EpisodeReport, track: Track) -> tuple[VelocityError | None, 
     wanted = wanted_velocity(episode.trajectory)
     if wanted is None:
         return None, fell
-    # The track is on the robot's clock, what is wanted on the host's.
+    # The track is on the robot's clock, the requested velocities on the host's.
     late = float(np.median(episode.trajectory.receive_s - episode.trajectory.device_s))
     shifted = Track(track.time_s - episode.device_start_ns * 1e-9 + late, track.place, track.heading)
     return velocity_error(shifted, wanted), fell
 
 
 def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
-    """Return errors by the truth, by the robot's own sensors, and falls."""
+    """Return true errors, errors by the robot's own sensors, and falls."""
     tracks = {name: read_track(walk.track) for name, walk in walks.items()}
     true = {
         name: [_errors(report, tracks[name]) for report in walk.report.episodes]
@@ -317,7 +317,7 @@ def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
 
 
 def _sentence(measures: Sequence[Measure]) -> str:
-    """Return how well the policies followed, by what was measured of the walks."""
+    """Return a sentence on how well the policies followed the requested velocities, as measured."""
     by_name = {measure.name: measure.values for measure in measures}
 
     def walked(policy: str) -> str:
@@ -327,6 +327,6 @@ def _sentence(measures: Sequence[Measure]) -> str:
         return f"{missed} in {seen.size} of {errors.size} walks, {falls.sum():.0f} of which ended early"
 
     return (
-        f"Fine-tuned under the calibration the policy {walked('calibrated')}; fine-tuned as long without it "
-        f"{walked('udr more')}; as shipped it {walked('udr')}."
+        f"The policy fine-tuned under the calibration {walked('calibrated')}; the policy fine-tuned as "
+        f"long without it {walked('udr more')}; the shipped policy {walked('udr')}."
     )

@@ -34,12 +34,12 @@ def design_excitation(config: DesignExcitation) -> ExcitationReport:
 
 
 def note(done: int, total: int, text: str) -> None:
-    """Show how far a search is."""
+    """Show the progress of a search."""
     print(f"\r{done}/{total} {text:<60.60}", end="" if done < total else "\n", file=sys.stderr, flush=True)
 
 
 def print_design(robot: str, report: ExcitationReport) -> None:
-    """Print a motion and, where it was searched, what it and the plain ones are predicted to tell."""
+    """Print a motion and, after a search, its predicted standard deviations beside those of plain motions."""
     if report.optimum is not None:
         _print_optimum(report)
     print(report.plan.words)

@@ -1,4 +1,4 @@
-"""``deal-hw doctor``: what is wrong with this computer, the link and the robot, and what to do about it."""
+"""``deal-hw doctor``: check this computer, the connection and the robot, and advise what to do."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: 
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(DoctorSettings):
-    """Find out what is wrong with this computer, the link and the robot; sends no command to a motor.
+    """Check this computer, the connection and the robot; sends no command to a motor.
 
-    Without a robot only this computer is examined. Exits with 1 where something does not work (FAIL), with 0
-    where there are notes and warnings only.
+    Without ROBOT only this computer is checked. The exit code is 1 if a check failed (FAIL), and 0 with notes
+    and warnings only.
     """
 
     robot: tyro.conf.Positional[str] = ""
@@ -33,7 +33,7 @@ class Doctor(DoctorSettings):
 
 
 def doctor(config: Doctor) -> DoctorReport:
-    """Examine and print as it goes.
+    """Run the checks and print each finding at once.
 
     Raises:
         UnknownNameError: There is no such robot.
@@ -59,7 +59,7 @@ def doctor(config: Doctor) -> DoctorReport:
 
 
 def _wrapped(lead: str, text: str) -> str:
-    """Return a text after its lead, in lines that the terminal holds."""
+    """Return a text after its lead, wrapped to the terminal's width."""
     width = shutil.get_terminal_size().columns
     return textwrap.fill(
         text,

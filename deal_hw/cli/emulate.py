@@ -1,4 +1,4 @@
-"""``deal-hw emulate``: a robot on the wire without a robot."""
+"""``deal-hw emulate``: a simulated robot that speaks the real robot's protocol."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from deal_hw.workflows.say import aloud
 
 @dataclass(frozen=True, kw_only=True)
 class Emulate(EmulateSettings):
-    """Emulate a robot in real time on a port of its own, with physics that nobody can look inside."""
+    """Emulate a robot in real time on its own port, with hidden physics."""
 
     robot: tyro.conf.Positional[str] = "cartpole"
 
 
 def emulate(config: Emulate) -> int:
-    """Run the emulator until a signal, the time given, or until the port vanished; return the exit status.
+    """Run the emulator until a signal, the given time or the port's end; return the exit status.
 
     The first line on standard output is ``port PATH``.
     """

@@ -28,22 +28,22 @@ class Inspect(InspectSettings):
     episode: tyro.conf.Positional[Path]
 
     calibration: Path | None = None
-    """Result of `deal-hw calibrate` to show beside it: the folder, or its result.json."""
+    """Result of `deal-hw calibrate` to compare with: the folder, or its result.json."""
 
     save: Path | None = None
     """Write a rerun recording (.rrd)."""
 
     screenshot: Path | None = None
-    """Write a picture (.png); needs a Vulkan renderer, but no desktop."""
+    """Write a picture (.png). Needs a Vulkan renderer, but no desktop."""
 
     web: bool = False
-    """Serve it to a browser on this machine until Ctrl-C."""
+    """Show the view in a browser on this machine, until Ctrl-C."""
 
     web_port: Annotated[int, Range(0, 65535)] = DEFAULT_WEB_PORT
-    """Where the browser connects; 0 for any free port."""
+    """Port to which the browser connects; 0: any free one."""
 
     at: Annotated[float | None, Range(0, 1e6, "s")] = None
-    """Device time that the screenshot shows [s]; by default where the nominal model errs most."""
+    """Device time of the screenshot [s]; by default the moment of the nominal model's largest error."""
 
     quiet: bool = False
     """Print nothing but errors and the address to open."""
@@ -58,12 +58,12 @@ class Inspect(InspectSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class InspectReport:
-    """What was shown.
+    """The recording that was shown.
 
     Attributes:
-        overlay: The predictions; None where the recording allows none.
-        note: Why there is none; empty otherwise.
-        files: The files written.
+        overlay: The predictions; None if the recording allows none.
+        note: Why there is no prediction; empty otherwise.
+        files: The written files.
     """
 
     overlay: Overlay | None
@@ -72,12 +72,12 @@ class InspectReport:
 
 
 def inspect(config: Inspect) -> InspectReport:
-    """Write, serve, picture or open a recording with predictions beside it.
+    """Show a recording with predictions: as a file, in a browser, as a picture or in a window.
 
     Raises:
         DatasetError: The recording cannot be read.
-        ConfigurationError: A setting cannot be used, or this machine cannot show it; the message says what
-            would do.
+        ConfigurationError: A setting cannot be used, or this machine cannot show the view; the message names
+            another way.
     """
     for file, suffix in ((config.save, ".rrd"), (config.screenshot, ".png")):
         if file is not None:
@@ -104,7 +104,7 @@ def inspect(config: Inspect) -> InspectReport:
 
 
 def _serve(rrd: Path, port: int) -> None:
-    # By default SIGTERM would end us without a word to the server, which would stay behind.
+    # By default SIGTERM would end this process and leave the server running.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with (

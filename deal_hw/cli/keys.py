@@ -21,7 +21,7 @@ from deal_hw.workflows.options import Checked, Range
 
 Days = Annotated[float, Range(1, 36500, "days")]
 WARN_DAYS = 30
-"""`show` warns of a certificate that ends sooner."""
+"""`show` warns of a certificate that expires within this time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,44 +29,44 @@ class Make(Checked):
     """Make an authority, and certificates for the robot, a controller and an observer."""
 
     out: Path
-    """Folder for the files; made where it is not there, and nothing in it is overwritten."""
+    """Folder for the files; made if missing. No file in it is overwritten."""
 
     robot: tuple[str, ...]
     """Addresses or host names under which clients reach the bridge, such as 192.168.1.20."""
 
     controllers: tuple[str, ...] = ("controller",)
-    """Names of those who may command the robot; one file each."""
+    """Names of the clients that may command the robot; one certificate each."""
 
     observers: tuple[str, ...] = ("observer",)
-    """Names of those who may only read."""
+    """Names of the clients that may only read."""
 
     days: Days = 825
-    """How long the certificates hold [days]."""
+    """How long the certificates are valid [days]."""
 
     authority_days: Days = 3650
-    """How long the authority holds [days]."""
+    """How long the authority is valid [days]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Add(Checked):
-    """Make one more certificate with an authority that is there."""
+    """Make one more certificate with an existing authority."""
 
     folder: tyro.conf.Positional[Path]
     """Folder with ca.pem and ca.key."""
 
     name: tyro.conf.Positional[str]
-    """Its name; what it may do is said to the bridge (--controllers, --observers)."""
+    """Name in the certificate; the bridge's options --controllers and --observers give it its rights."""
 
     addresses: tuple[str, ...] = ()
     """For a robot: addresses or host names under which clients reach it."""
 
     days: Days = 825
-    """How long it holds [days]."""
+    """How long the certificate is valid [days]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Show(Checked):
-    """Tell what the certificates in a folder are for, and how long they still hold."""
+    """Show the role of each certificate in a folder, and how long it is still valid."""
 
     folder: tyro.conf.Positional[Path]
     """The folder."""
@@ -80,10 +80,10 @@ Keys = (
 
 
 def keys(config: Make | Add | Show) -> int:
-    """Make or show; return the exit status, 1 where one that is shown has expired.
+    """Make or show certificates; return the exit status, 1 if a shown certificate has expired.
 
     Raises:
-        ConfigurationError: A name or address is none, or a file is there.
+        ConfigurationError: A name or address is invalid, or a file exists already.
         MissingExtraError: cryptography is not installed.
     """
     now = datetime.datetime.now(datetime.timezone.utc)

@@ -1,8 +1,8 @@
-"""The `deal-hw` command: finds the verb, hands it its settings, turns what goes wrong into one line.
+"""The `deal-hw` command: finds the verb, passes its settings, and prints an error as one line.
 
-A verb is a module of this package that holds a frozen dataclass of settings and a function that takes it.
-The table names them as text and imports only the verb that was asked for, so that `deal-hw --help` starts at
-once and `collect` never loads what only `train` needs.
+A verb is a module of this package that holds a frozen dataclass of settings and a function that takes it. The
+table names them as text and imports only the requested verb. This keeps `deal-hw --help` fast, and `collect`
+never loads the packages of `train`.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from deal_hw.version import __version__
 
 EXIT_OK = 0
 EXIT_ERROR = 2
-"""Something was wrong with what was asked for, or with the world; the message says what."""
+"""The request, a file or a device caused an error; the message names it."""
 EXIT_INTERRUPTED = 130
 """Ctrl-C, as shells count it: 128 + SIGINT."""
 EXIT_PIPE = 141
-"""Whoever read the output has gone, as with ``| head``; as shells count it: 128 + SIGPIPE."""
+"""The reader of the output has closed it, as with ``| head``; as shells count it: 128 + SIGPIPE."""
 
 LONGEST_MESSAGE = 2000
-"""Longest error in one line [characters]: part of it may come from a file that somebody else wrote."""
+"""Longest error in one line [characters]: part of it may come from a file of unknown origin."""
 TRACEBACK_VARIABLE = "DEAL_HW_TRACEBACK"
 
 
@@ -43,8 +43,8 @@ class Verb:
         config: Its settings: a dataclass, or a union of dataclasses for a verb with sub-verbs.
         function: Called with the settings; returns an exit code, or a report, which may have an `exit_code`.
         help: One line.
-        example: Arguments that run, as `deal-hw --help` shows them.
-        extra: The extra of the distribution that installs what the verb needs; "" for the base install.
+        example: Working arguments, as `deal-hw --help` shows them.
+        extra: The extra that installs the verb's packages; "" for the base install.
     """
 
     module: str
@@ -78,7 +78,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         ),
         "calibrate": _verb(
             "calibrate",
-            help="find the simulator parameters that explain recordings, of any robot (--model)",
+            help="find the simulator parameters that explain recordings of any robot (--model)",
             example="calibrate runs/first/dataset",
             extra="calib",
             function="calibrate_or_write_parameters",
@@ -109,7 +109,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
     {
         "demo": _verb(
             "demo",
-            help="do all five on an emulated cart-pole or Go2",
+            help="do all five jobs on an emulated cart-pole or Go2",
             example="demo --out runs/demo",
             extra="all",
         ),
@@ -121,31 +121,32 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         ),
         "emulate": _verb(
             "emulate",
-            help="be a robot on the wire, with hidden physics",
+            help="emulate a robot on its own port, with hidden physics",
             example="emulate cartpole --profile realistic --seed 0",
             extra="sim",
         ),
         "bridge": _verb(
             "bridge",
-            help="run on the Go2's computer: DDS to Zenoh, one certified controller, damping without one",
+            help="on the Go2's computer: connect DDS and Zenoh, admit one controller, damp the robot "
+            "without one",
             example="bridge go2 --port eth0",
             extra="dds",
         ),
         "keys": _verb(
             "keys",
-            help="make certificates for the bridge, its controllers and observers; show how long they hold",
+            help="make certificates for the bridge and its clients, and show how long they are valid",
             example="keys make --out keys --robot 192.168.1.20",
             extra="keys",
         ),
         "robot": _verb(
             "robot",
-            help="describe a robot of your own by its MJCF (robot.yaml), and check that",
+            help="describe your own robot (robot.yaml, made from its MJCF), and check the description",
             example="robot new robot.xml",
             extra="sim",
         ),
         "data": _verb(
             "data",
-            help="tell about a dataset, verify it, repair it, import and export recordings",
+            help="show, verify and repair datasets; import and export recordings",
             example="data info runs/first/dataset",
             extra="sim",
         ),
@@ -156,18 +157,18 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         ),
         "doctor": _verb(
             "doctor",
-            help="find out what is wrong with this computer, the link and the robot",
+            help="check this computer, the connection and the robot",
             example="doctor go2 --port enp2s0",
         ),
         "bench": _verb(
             "bench",
-            help="measure how well calibration and the loop do, as JSON rows",
+            help="measure how well calibration and the whole loop work, as JSON rows",
             example="bench loop --profile sensor --seeds 0,1 --out loop.json",
             extra="bench",
         ),
     }
 )
-"""What helps with the five."""
+"""The verbs beside the five jobs."""
 
 VERBS: Mapping[str, Verb] = MappingProxyType({**JOBS, **TOOLS})
 
@@ -186,7 +187,8 @@ def help_text() -> str:
     lines += [
         "",
         "No robot at hand? `deal-hw demo` needs none; `deal-hw emulate cartpole` prints a port to use.",
-        f"with every verb: --help; --traceback (or {TRACEBACK_VARIABLE}=1) to see where an error came from",
+        f"with every verb: --help; --traceback (or {TRACEBACK_VARIABLE}=1) shows the code that raised an "
+        "error",
         "without a verb: --help, --version",
     ]
     return "\n".join(lines)
@@ -196,7 +198,7 @@ def find(name: str) -> Verb:
     """Return the verb of that name.
 
     Raises:
-        UnknownNameError: There is none; the message lists the verbs, and the nearest one if any is near.
+        UnknownNameError: There is no such verb; the message lists all verbs, and one of a similar name.
     """
     if name in VERBS:
         return VERBS[name]
@@ -215,7 +217,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     Raises:
         UnknownNameError: There is no such verb.
         DealHwError: A setting refuses its value.
-        SystemExit: The arguments do not parse, or asked for help.
+        SystemExit: The arguments do not parse, or are --help.
     """
     verb = find(name)
     import importlib
@@ -242,7 +244,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
         with contextlib.redirect_stderr(io.StringIO()):
             settings = read(speak=False)
     except SystemExit as stop:
-        # tyro draws a box around what a setting itself refuses; that gets its one line like other errors.
+        # tyro draws a box around an error of a setting; here it becomes one line, like other errors.
         cause: BaseException | None = stop
         while cause is not None and not isinstance(cause, DealHwError):
             cause = cause.__context__
@@ -253,15 +255,13 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
 
 def _description(verb: Verb, config: Any, hidden: Iterable[str]) -> str:
-    """Return what a verb's help says above its options: what it does, an example, what is not shown."""
+    """Return the text above the options in a verb's help: purpose, example, hidden options."""
     text = inspect.cleandoc(config.__doc__) if isinstance(config, type) and config.__doc__ else verb.help
     lines = [text]
     if f"deal-hw {verb.example}" not in text:
         lines.append(f"Example:  deal-hw {verb.example}")
     if hidden:
-        lines.append(
-            f"There are more options for {', '.join(sorted(hidden))}: write one of these before --help."
-        )
+        lines.append(f"More options for {', '.join(sorted(hidden))}: name one before --help to see them.")
     return "\n\n".join(lines)
 
 
@@ -269,8 +269,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """Run a verb with its command-line arguments and return its exit code.
 
     Raises:
-        DealHwError: What the verb raised; or an extra is missing.
-        SystemExit: The arguments do not parse, or asked for help.
+        DealHwError: The verb failed, or an extra is missing.
+        SystemExit: The arguments do not parse, or are --help.
     """
     try:
         settings, function = parse(name, arguments)
@@ -288,7 +288,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code.
 
     Args:
-        arguments: What follows `deal-hw` on the command line; by default the process's own.
+        arguments: Arguments after `deal-hw` on the command line; by default those of this process.
     """
     _occupy_standard_streams()
     code = EXIT_INTERRUPTED
@@ -296,7 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with contextlib.redirect_stderr(cast(TextIO, _Stderr(sys.stderr))):
             code = _answer(list(sys.argv[1:] if arguments is None else arguments))
         if arguments is None:
-            # The verb is done and has said so: from here to the end of the process a Ctrl-C changes nothing.
+            # The verb is done and has printed its result. From here a Ctrl-C must change nothing.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         if _flushed():
             return code
@@ -309,7 +309,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit:
         if _flushed():
             raise
-    # The interpreter flushes once more as it ends, and would complain.
+    # The interpreter flushes once more at its end, and would report an error.
     _to_nowhere(sys.stdout)
     return EXIT_PIPE
 
@@ -321,7 +321,7 @@ def _to_nowhere(stream: TextIO) -> None:
 
 
 class _Stderr:
-    """The error output, whose reader may go: the work goes on all the same, to the same exit code.
+    """The error output. If its reader closes it, the work continues, with the same exit code.
 
     Args:
         stream: The output itself.
@@ -335,7 +335,7 @@ class _Stderr:
             self._stream.write(text)
             self._stream.flush()
         except (OSError, ValueError):
-            # What waits in its buffer would fail again as the interpreter ends, and change the exit code.
+            # Text left in the buffer would fail again at the interpreter's end and change the exit code.
             with contextlib.suppress(OSError, ValueError):
                 _to_nowhere(self._stream)
         return len(text)
@@ -350,8 +350,8 @@ class _Stderr:
 def _occupy_standard_streams() -> None:
     """Open the null device for each standard stream that the process was started without.
 
-    The next file opened, a recording or a robot's port, would get its number, and whatever a library prints
-    would go into it.
+    Otherwise the next opened file, a recording or a robot's port, gets the stream's number, and a library's
+    prints go into it.
     """
     for number in range(3):
         try:
@@ -377,16 +377,16 @@ def _answer(given: list[str]) -> int:
         print("deal-hw: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (DealHwError, OSError) as err:
-        # A broken pipe may be a robot's, which is told, or that of our own output, which nobody reads.
+        # A broken pipe may be that of a robot, an error, or that of our output after its reader closed it.
         if show_traceback or (isinstance(err, BrokenPipeError) and _reader_is_gone()):
             raise
-        # An OSError is the world's refusal (no such file, disk full), not a bug: it gets its one line, too.
+        # An OSError (no such file, disk full) is not a bug and becomes one line, too.
         print(f"deal-hw: error: {short(str(err), LONGEST_MESSAGE)}", file=sys.stderr)
         return EXIT_ERROR
 
 
 def _flushed() -> bool:
-    """Write out what was printed and return whether somebody was there to take it."""
+    """Flush the output and return whether its reader took it."""
     try:
         # None where the process was started without an output.
         if sys.stdout is not None:
@@ -394,16 +394,16 @@ def _flushed() -> bool:
     except BrokenPipeError:
         return False
     except OSError:
-        # A full disk: the interpreter tries again as it ends, and tells.
+        # A full disk: the interpreter tries again at its end and reports the error.
         pass
     return True
 
 
 def _reader_is_gone() -> bool:
-    """Return whether a pipe that broke is that of the output."""
+    """Return whether the broken pipe is that of the output."""
     if not _flushed():
         return True
-    # What was written without a buffer leaves nothing to flush; then only the pipe itself knows.
+    # Unbuffered output leaves nothing to flush; then only the pipe itself shows its state.
     import select
 
     if sys.stdout is None or not hasattr(select, "poll"):

@@ -1,4 +1,4 @@
-"""How settings become a command line: values from words, and a help page for the robot that was named."""
+"""Makes a command line from settings: values from arguments, and a help page for the named robot."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from deal_hw.workflows.options import OWN_ROBOT, Only
 
 
 class Rules:
-    """What the parser is told of settings beyond their types.
+    """Parser rules for settings, beyond their types.
 
-    Files and folders, which Python may also name by a string, are paths. Choices are left to the settings,
-    which refuse wrong ones with the same words from Python. An option that is off by default has one flag,
-    one that is on has two. A help page leaves out options for other robots, or for other benches; otherwise
-    they are parsed, so that the settings can refuse them.
+    Files and folders, which Python may also name by a string, are paths. The settings themselves refuse wrong
+    choices, with the same words as from Python. An option that is off by default has one flag, one that is on
+    has two. A help page hides options of other robots or benches; they are still parsed, so that the settings
+    can refuse them.
 
     Args:
-        words: The arguments, which may ask for help, and name a robot or a bench.
+        words: The arguments, which may contain --help, and name a robot or a bench.
     """
 
     def __init__(self, words: Sequence[str] = ()) -> None:
@@ -40,14 +40,14 @@ class Rules:
             self._named |= set(OWN_ROBOT.names)
         self._asks_others = False
         self.hidden: set[str] = set()
-        """Names that have options of their own, which were not shown."""
+        """Names whose own options were not shown."""
         self.registry = ConstructorRegistry()
         self.registry.primitive_rule(_choice)
         self.registry.primitive_rule(_path)
         self.registry.struct_rule(self._struct)
 
     def hides(self, hint: Any) -> set[str]:
-        """Return for whom the options of a type are, where the page leaves them out; else nothing."""
+        """Return the names that an option type is for, if the page hides it; else nothing."""
         names = {name for part in get_args(hint)[1:] if isinstance(part, Only) for name in part.names}
         return names if self._helps and not self._named & names else set()
 
@@ -60,7 +60,7 @@ class Rules:
         finally:
             self._asks_others = False
         if not isinstance(found, StructConstructorSpec):
-            # A default of another type, which the parser's own rule tells.
+            # A default of another type, which the parser's own rule handles.
             return None
         return dataclasses.replace(found, fields=tuple(map(self._field, found.fields)))
 
@@ -79,11 +79,11 @@ class Rules:
 
 
 def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:
-    """Return what a help page writes for a value; None leaves that to the parser."""
+    """Return the help page's placeholder of a value; None: the parser's own."""
     if tyro.conf.Positional in parts[1:]:
         return name.upper()
     kinds = set(get_args(parts[0])) if get_origin(parts[0]) in (Union, UnionType) else set()
-    # A file that may be left out: Python may name it by a string, too.
+    # An optional file, which Python may also name by a string.
     kinds -= {str} if Path in kinds else set()
     if NoneType not in kinds or len(kinds) != 2:
         return None
@@ -92,7 +92,7 @@ def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:
 
 
 def _default(label: str) -> str:
-    """Return what a help page says of a default; one that is empty, or off, says nothing."""
+    """Return the help page's text on a default; empty for a default that is empty or off."""
     if label == "True":
         return "(on by default)"
     return "" if label in ("", "''", "None", "False") else f"(default: {label})"

@@ -1,4 +1,4 @@
-"""Where a long verb stands, told in lines: for logs and pipes, where no terminal shows a bar."""
+"""Progress of a long verb in lines, for logs and pipes without a terminal for a bar."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ EVERY_S = 10.0
 
 
 def _to_stderr(line: str) -> None:
-    # A reader that has gone, such as `head`, ends the lines and nothing else.
+    # If the reader has ended, such as `head`, only these lines end.
     with contextlib.suppress(OSError, ValueError):
         print(line, file=sys.stderr, flush=True)
 
 
 class PipedProgress:
-    """Tells every ten seconds how long a verb has run and what it was last doing.
+    """Prints every ten seconds how long a verb has run and its current step.
 
-    A thread tells: what is computed may take longer than ten seconds between two steps, and a pipe that
-    nobody reads must not hold up a process that watches a robot.
+    A thread prints, since one step may take longer than ten seconds. A pipe that nobody reads must not block
+    a process that watches a robot.
 
     Args:
         title: The verb.
-        quiet: Whether to tell nothing.
-        clock: For the time that has passed.
-        wait: Waits so long [s] and returns whether the verb has ended; by default until the block is left.
+        quiet: Whether to print nothing.
+        clock: Clock of the elapsed time.
+        wait: Waits for the given time [s] and returns whether the verb has ended; by default until the block
+        is left.
         say: Called with each line.
     """
 
@@ -50,11 +51,11 @@ class PipedProgress:
         self._thread = None if quiet else threading.Thread(target=self.tell, name="progress", daemon=True)
 
     def at(self, text: str) -> None:
-        """Note what is being done now; the next line says it."""
+        """Note the current step for the next line."""
         self._text = text
 
     def tell(self) -> None:
-        """Say a line every ten seconds until the verb has ended."""
+        """Print a line every ten seconds until the verb has ended."""
         while not self._wait(EVERY_S):
             passed_s = (self._clock.now_ns() - self._began_ns) * 1e-9
             self._say(f"{self._title}: {passed_s:.0f} s" + (f", {self._text}" if self._text else ""))

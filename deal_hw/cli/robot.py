@@ -13,7 +13,7 @@ from deal_hw.workflows.robot import CheckRobotSettings, NewRobotSettings, RobotC
 
 @dataclass(frozen=True, kw_only=True)
 class New(NewRobotSettings):
-    """Write a robot.yaml with what an MJCF tells: joints, units, gains, ranges, effort limits."""
+    """Write a robot.yaml from an MJCF: joints, units, gains, ranges, effort limits."""
 
     model: tyro.conf.Positional[Path]
 
@@ -32,7 +32,7 @@ def robot(config: New | Check) -> int | RobotCheck:
     """Run the verb.
 
     Returns:
-        0, or what was found; its exit code is 1 where something does not work.
+        0, or the findings, whose exit code is 1 if a check failed.
 
     Raises:
         ConfigurationError: A file cannot be used, or robot.yaml and MJCF contradict each other.
@@ -50,5 +50,5 @@ def robot(config: New | Check) -> int | RobotCheck:
         feet=config.feet,
         several_trees=config.several_trees,
     )
-    print(f"written: {path}; look at the rates and limits in it, then: deal-hw robot check {path}")
+    print(f"written: {path}; check its rates and limits, then: deal-hw robot check {path}")
     return 0

@@ -1,4 +1,4 @@
-"""What the terminal shows of a run: a progress bar, sentences, the account of each episode."""
+"""Output of a run on the terminal: a progress bar, messages, a report on each episode."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from deal_hw.workflows.say import aloud
 
 
 class SecondsBar:
-    """A bar on the terminal; without one, what the next line says.
+    """A bar on the terminal; without a terminal, the text of the next line.
 
     Args:
         bar: A rich Progress; None: there is no terminal.
-        piped: Tells lines; None: there is a bar.
-        title: What is going on.
-        seconds: How long it takes [s].
+        piped: Prints lines; None: there is a bar.
+        title: The current activity.
+        seconds: Its duration [s].
     """
 
     def __init__(self, bar: Any, piped: PipedProgress | None, title: str, seconds: float) -> None:
@@ -31,14 +31,14 @@ class SecondsBar:
         self._task = bar.add_task(title, total=seconds) if bar is not None else None
 
     def passed(self, seconds: float) -> None:
-        """So many seconds have passed [s]."""
+        """Set the elapsed time [s]."""
         if self._bar is not None:
             self._bar.update(self._task, completed=min(seconds, self._seconds))
         if self._piped is not None:
             self._piped.at(f"running, {seconds:.0f} of {self._seconds:.0f} s")
 
     def say(self, doing: str) -> None:
-        """Something else is going on; "": the run itself."""
+        """Set the current activity; "": the run itself."""
         if self._bar is not None:
             self._bar.update(self._task, description=f"{self._title}: {doing}" if doing else self._title)
         if self._piped is not None:
@@ -52,7 +52,7 @@ def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[Sec
         with PipedProgress(title, quiet) as piped:
             yield SecondsBar(None, piped, title, seconds)
         return
-    # Only here: rich takes longer to load than all else that a robot's computer needs.
+    # Imported here: rich takes longer to load than all other imports on a robot's computer.
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -62,10 +62,10 @@ def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[Sec
 
 
 class Terminal(RunView):
-    """Tells on standard error, prints accounts, asks on standard input.
+    """Shows messages on standard error, prints reports, asks on standard input.
 
     Args:
-        quiet: Whether to tell only what the operator must know.
+        quiet: Whether to show only what the operator must know.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -79,7 +79,7 @@ class Terminal(RunView):
 
     @contextlib.contextmanager
     def progress(self, title: str, seconds: float) -> Iterator[OnBeat]:
-        """Show a bar on a terminal, elsewhere lines; each second trouble in making the robot passive."""
+        """Show a bar on a terminal, elsewhere lines; trouble in making the robot passive each second."""
         if self._quiet:
             yield ignore
             return

@@ -14,7 +14,7 @@ from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import InterruptedTrainingError, Training, TrainSettings, run
 
 SHOWN_MEASURES = 3
-"""So many of a task's measures are shown beside the progress; all are in TensorBoard's files."""
+"""Number of a task's measures beside the progress; TensorBoard's files have all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ def train(config: Train) -> Training:
                 training = run(config, lambda status: piped.at(_words(status)))
     except InterruptedTrainingError as stopped:
         _print(stopped.training)
-        print("stopped before the end; --resume goes on from the checkpoint")
+        print("stopped before the end; --resume continues from the checkpoint")
         raise
     _print(training)
     return training
@@ -88,7 +88,7 @@ def _follow(bar: Progress) -> TrainingProgress:
     row = bar.add_task("training", total=None, recent=0.0, measures="")
 
     def follow(status: TrainingStatus) -> None:
-        # Not before: what is refused has no bar.
+        # Not before, since a refused training has no bar.
         bar.start()
         bar.update(
             row,

@@ -1,4 +1,5 @@
-"""What moves a robot in real time: control loop, safety filter, supervisor, hand-over to the recorder.
+"""Real-time control of a robot: control loop, safety filter, supervisor, channel to the recorder.
 
-Nothing here loads torch or MuJoCo, writes to disk in the control process, or knows one robot from another.
+Nothing here loads torch or MuJoCo, writes to disk in the control process, or contains code for a single
+robot.
 """

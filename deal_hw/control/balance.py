@@ -1,7 +1,7 @@
-"""How well a cart-pole was balanced, from what it reported: the task of the DEAL paper's Table 2.
+"""How well a cart-pole was balanced, from its reported states: the task of the DEAL paper's Table 2.
 
-The task is frozen: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). Judged
-are the reported states, because on a robot there are no others.
+The task is frozen: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). It is
+judged by the reported states, since a robot has no others.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from deal_hw.types import FloatArray, Trajectory
 
 CART, POLE = 0, 1
-"""The joints' places."""
+"""Index of each joint."""
 
 TASK_SECONDS = 10.0
 FALLEN_RAD = 0.5
-"""A pole beyond this angle has fallen: no cart of this size brings it back."""
+"""A pole beyond this angle has fallen: no cart of this size can raise it again."""
 
 
 _SLACK_S = 0.1
@@ -28,8 +28,8 @@ class BalanceResult:
     """One run of the task.
 
     Attributes:
-        angle_error_rad: Mean |pole angle| [rad]. The angle is taken modulo a turn, so that after a fall it
-            counts with what is left to upright, pi at most; nothing is left out and nothing counts for more.
+        angle_error_rad: Mean |pole angle| [rad]. The angle is taken modulo a turn: after a fall it is the
+            remaining angle to upright, pi at most. All samples count alike.
         cart_speed_m_s: Mean |cart velocity| [m/s].
         fell: Whether the pole was ever beyond :data:`FALLEN_RAD`.
         upright_s: Time until then, or the whole duration [s].
@@ -57,11 +57,11 @@ def balance_result(
         position: Reported joint positions (cart, pole), (T, 2).
         velocity: Reported joint velocities, (T, 2).
         period_s: Time between samples [s].
-        duration_s: How long the run should have lasted [s]. Where the safety module ended it before, the
-            time that is missing counts as a hanging pole and a cart at rest; None: as it is.
+        duration_s: How long the run should have lasted [s]. If the safety module ended it early, the missing
+            time counts as a hanging pole and a cart at rest. None: the recorded time.
     """
     missing = 0 if duration_s is None else max(0, round(duration_s / period_s) - len(position))
-    # A recording has a sample less or more than its duration, depending on where its first one falls.
+    # A recording has one sample more or less than its duration, depending on the time of the first one.
     if missing * period_s > _SLACK_S:
         position = np.concatenate([position, np.tile([0.0, np.pi], (missing, 1))])
         velocity = np.concatenate([velocity, np.zeros((missing, 2))])
@@ -78,7 +78,7 @@ def balance_result(
 
 
 def recorded_balance(trajectory: Trajectory) -> BalanceResult | None:
-    """Judge a recording, from its first to its last sample; None where it has fewer than two."""
+    """Judge a recording from its first to its last sample; None if it has fewer than two."""
     if len(trajectory.device_s) < 2:
         return None
     period_s = float(np.median(np.diff(trajectory.device_s)))

@@ -1,4 +1,4 @@
-"""What a run asks of the robot, cycle by cycle; numpy only, and the safety filter judges all of it."""
+"""Behaviours: the commands of a run, cycle by cycle, before the safety filter. Numpy only."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Behaviour(Protocol):
 
     @property
     def action(self) -> FloatArray | None:
-        """The unitless action behind the last command, (A,); None where there is none."""
+        """The unitless action behind the last command, (A,), or None."""
         ...
 
     def reset(self) -> None:
-        """Start anew; the same state sequence gives the same commands again."""
+        """Restart; the same state sequence then gives the same commands."""
         ...
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
@@ -61,16 +61,17 @@ def position_command(
 class PolicyBehaviour:
     """Runs a policy: target = default + scale x action, with the gains and limits of the policy's spec.
 
-    Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on. A wanted velocity is
-    clipped to what the policy was trained for, where its spec notes that.
+    Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on. A requested velocity
+    is clipped to the policy's training range, if its spec contains one.
 
     Args:
         policy: The policy.
         description: The robot that it will run on.
-        source: The wanted velocity of the base, for a policy that observes it; by default standing still.
+        source: The requested velocity of the base, for a policy that observes it; by default zero.
 
     Raises:
-        PolicyMismatchError: The policy was made for another robot, or observes what this one cannot sense.
+        PolicyMismatchError: The policy was made for another robot, or observes a quantity that this one
+            cannot sense.
         PolicyError: It returns an action of another shape.
     """
 
@@ -86,7 +87,7 @@ class PolicyBehaviour:
         if unseen:
             raise PolicyMismatchError(
                 f"the policy observes {' and '.join(unseen)} of the base, which no sensor of "
-                f"{description.name!r} reports; train one that does without"
+                f"{description.name!r} reports; train a policy without them"
             )
         self._source = source or FixedVelocity()
         self._slowest, self._fastest = np.array(spec.command_range or ((-np.inf, np.inf),) * 3).T
@@ -108,7 +109,7 @@ class PolicyBehaviour:
         self.action: FloatArray | None = None
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Clear the policy's memory."""
         self._policy.reset()
         self._observations.reset()
         self.action = None
@@ -121,21 +122,24 @@ class PolicyBehaviour:
         action = np.asarray(self._policy.act(observation), dtype=float)
         if action.shape != self._scale.shape:
             raise PolicyError(
-                f"the policy returned an action of shape {action.shape}, expected {self._scale.shape}"
+                f"the policy returned an action of shape {action.shape}, expected {self._scale.shape}; "
+                "export a policy for this robot"
             )
         self.action = np.clip(action, -1.0, 1.0)
         self._observations.record_action(self.action)
         return dataclasses.replace(self._template, position_target=self._default + self._scale * self.action)
 
     def _coordinates(self, state: RobotState) -> tuple[FloatArray, FloatArray]:
-        """Return positions and velocities as the policy knows them, the base's first where it needs it."""
+        """Return positions and velocities in the policy's layout, with the base's first if it needs them."""
         if not self._observes_base:
             return state.position, state.velocity
         if state.body is None:
             raise PolicyError(
-                "the policy observes the base's orientation, and this robot's states carry none"
+                "the policy observes the base's orientation, which this robot's states do not contain; use "
+                "a policy for this robot"
             )
-        # Where the base is and how fast it moves along is not sensed, and was checked not to be observed.
+        # Position and linear velocity of the base are not sensed; a check has shown that the policy does not
+        # observe them.
         unknown = np.zeros(3)
         return (
             np.concatenate([unknown, rotation_vector(state.body.orientation), state.position]),
@@ -153,15 +157,15 @@ class HoldBehaviour:
         self._command = position_command(description, default if position is None else position)
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """No memory to clear."""
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
-        """Return the one command."""
+        """Return the command."""
         return self._command
 
 
 class ReplayBehaviour:
-    """Asks again, by time, for what a recording asked for.
+    """Repeats the requested commands of a recording, by time.
 
     Args:
         trajectory: The recording.
@@ -169,7 +173,7 @@ class ReplayBehaviour:
 
     Raises:
         ConfigurationError: The recording is of another robot.
-        DatasetError: It holds no command.
+        DatasetError: It contains no command.
     """
 
     action: FloatArray | None = None
@@ -177,16 +181,16 @@ class ReplayBehaviour:
     def __init__(self, trajectory: Trajectory, description: RobotDescription) -> None:
         if trajectory.actuated != description.actuated or trajectory.joint_names != description.joint_names:
             raise ConfigurationError(
-                f"the recording is of joints {trajectory.joint_names}, actuated {trajectory.actuated}; "
-                f"robot {description.name!r} has {description.joint_names}, actuated {description.actuated}; "
-                "replay it on the robot that was recorded"
+                f"the recording has joints {trajectory.joint_names}, actuated {trajectory.actuated}; robot "
+                f"{description.name!r} has {description.joint_names}, actuated {description.actuated}; "
+                "replay it on the recorded robot"
             )
         if not trajectory.sent_s.size:
-            raise DatasetError("the recording holds no command to replay")
+            raise DatasetError("the recording contains no command to replay; choose another episode")
         self._trajectory = trajectory
         self._time_s = trajectory.sent_s - trajectory.sent_s[0]
-        # Commands go out on a grid of periods: half a period of slack keeps send jitter from shifting them by
-        # one.
+        # Commands are sent on a grid of periods; half a period of slack keeps send jitter from shifting them
+        # by one.
         self._slack_s = 0.5 / description.control_rate_hz
 
     @property
@@ -195,10 +199,10 @@ class ReplayBehaviour:
         return float(self._time_s[-1]) + 2 * self._slack_s
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """No memory to clear."""
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
-        """Return the command that was in force at this time of the recording."""
+        """Return the command that was active at this time of the recording."""
         i = max(int(np.searchsorted(self._time_s, time_s + self._slack_s, side="right")) - 1, 0)
         t = self._trajectory
         zeros = np.zeros(len(t.actuated))

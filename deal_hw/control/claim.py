@@ -1,4 +1,4 @@
-"""The exclusive claim on a robot, on this computer: a name that the kernel lets one process tree hold."""
+"""The exclusive claim on a robot on this computer: a name that only one process tree can hold."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ _PEER_CREDENTIALS = struct.Struct("3i")
 
 
 class LocalClaim:
-    """Holds a name for as long as this process, or a child that inherited the descriptor, lives.
+    """Holds a name as long as this process lives, or a child that inherited the descriptor.
 
-    An abstract Unix socket: no file is left behind by a process that was killed, no permission is needed, and
-    who holds it can be asked. The child counts, because it makes the robot passive when its parent dies.
+    The name is an abstract Unix socket: a killed process leaves no file behind, no permission is needed, and
+    other programs can ask for the holder. The child counts, since it makes the robot passive when its parent
+    dies.
 
     Args:
-        resource: What is claimed, such as a transport with its address; the same text is the same claim.
+        resource: The claimed resource, such as a transport with its address; the same text is the same claim.
     """
 
     def __init__(self, resource: str) -> None:
@@ -42,12 +43,12 @@ class LocalClaim:
         """Take the name.
 
         Raises:
-            PortBusyError: Another run holds it; the text says which.
+            PortBusyError: Another run holds it; the message names it.
         """
         held = socket.socket(socket.AF_UNIX)
         try:
             held.bind(self._name)
-            # Those who ask are never taken from the queue: it must be long enough for many of them.
+            # Connections of other programs stay in the queue, so it must be long enough for many of them.
             held.listen()
         except OSError as error:
             held.close()
@@ -55,12 +56,12 @@ class LocalClaim:
                 raise
             raise PortBusyError(
                 f"{self._resource}: the robot is in use by {self._holder()}. Two programs that command one "
-                "robot make it jump. End that run first (Ctrl-C in its terminal), then start this one"
+                "robot make it jump. End the other run (Ctrl-C in its terminal), then start this one"
             ) from None
         self._socket = held
 
     def release(self) -> None:
-        """Give the name up; idempotent."""
+        """Release the name; idempotent."""
         held, self._socket = self._socket, None
         if held is not None:
             held.close()

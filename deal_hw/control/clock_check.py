@@ -1,4 +1,4 @@
-"""Whether a device's clock runs as fast as this computer's."""
+"""Compares the rate of a device's clock with that of this computer's."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from deal_hw.types import IntArray
 
 WARN_SHARE: Final = 1e-3
 FAIL_SHARE: Final = 1e-2
-"""A quartz is right to 1e-4. A clock that is off by this share makes speeds and latencies wrong by it."""
+"""Largest relative clock error without a finding. A quartz is correct to 1e-4; speeds and latencies are wrong
+by the same share as the clock."""
 RESOLUTION_S: Final = 1e-3
 
 
 def judge_clock(host_ns: IntArray, device_ns: IntArray) -> Finding:
-    """Return what two clocks say of each other.
+    """Return the finding on the rate difference of two clocks.
 
-    Messages come late, never early: the fastest of the first quarter is compared with that of the last.
+    Messages arrive late, never early. The fastest message of the first quarter is therefore compared with
+    that of the last.
 
     Args:
-        host_ns: When messages arrived, by our clock, (N,) [ns].
-        device_ns: When they were made, by the device's, (N,) [ns].
+        host_ns: Arrival times of messages by our clock, (N,) [ns].
+        device_ns: Their times by the device's clock, (N,) [ns].
     """
     delay_ns = host_ns - device_ns
     quarter = max(len(host_ns) // 4, 1)
@@ -32,21 +34,21 @@ def judge_clock(host_ns: IntArray, device_ns: IntArray) -> Finding:
     if span_s <= 0:
         return Finding("states", Level.NOTE, "too few states to compare the robot's clock with ours")
     drift = float(device_ns[last] - device_ns[first]) * 1e-9 / span_s - 1.0
-    text = f"robot's clock against ours: {drift * 100:+.2f} %"
+    text = f"rate of the robot's clock against ours: {drift * 100:+.2f} %"
     sure = abs(drift) - RESOLUTION_S / span_s
     if sure > FAIL_SHARE:
         return Finding(
             "states",
             Level.FAIL,
-            f"{text}; at most 1 % is usable",
-            "is it a simulator that does not keep real time? Give it a faster computer or real-time "
-            "priority; recordings made like this give wrong speeds and latencies",
+            f"{text}; at most 1 % can be used",
+            "recordings would have wrong speeds and latencies; if it is a simulator slower than real time, "
+            "give it a faster computer or real-time priority",
         )
     if sure > WARN_SHARE:
         return Finding(
             "states",
             Level.WARN,
-            f"{text}; a sound clock is right to 0.01 %",
-            "listen longer (--seconds 30); if it stays, a calibrated latency will be wrong",
+            f"{text}; a good clock is correct to 0.01 %",
+            "listen longer (--seconds 30); if the difference stays, a calibrated latency will be wrong",
         )
     return Finding("states", Level.OK, text)

@@ -21,7 +21,7 @@ LONGEST_S = 3600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segment:
-    """A part of the run in which other gains and limits are sent, as factors of the description's."""
+    """A part of the run with other commanded gains and limits, as factors of the description's."""
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
@@ -49,7 +49,7 @@ class Segment:
 def segment_command(
     description: RobotDescription, segments: Sequence[Segment], target: FloatArray, fraction: float
 ) -> JointCommand:
-    """Return the command for a target, with the factors of the first segment that holds here."""
+    """Return the command for a target, with the factors of the first segment at this time."""
     for part in segments:
         if part.start <= fraction < part.stop:
             return position_command(
@@ -70,7 +70,7 @@ class RichConfig:
     duration_s: float = 4.0
     """Length of the run [s]; segments are fractions of it."""
     balance_s: float = 0.6
-    """Time spent balancing first [s]; 0 without a policy."""
+    """Time of balancing at the start [s]; 0 without a policy."""
     amplitude: float = 0.12
     """Set-points are drawn within this distance of the default position [m or rad]."""
     hold_s: tuple[float, float] = (0.1, 0.3)
@@ -100,13 +100,13 @@ class RichConfig:
 
 
 class RichBehaviour:
-    """Balances with a policy, then asks for random set-points held for random times.
+    """Balances with a policy, then commands random set-points for random times.
 
     Args:
         description: The robot.
         balance: What balances at first; None starts with the set-points at once.
         config: The motion.
-        seed: Fixes the set-points; ``reset`` repeats them.
+        seed: Seed of the set-points; ``reset`` repeats them.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class RichBehaviour:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew with the same set-points."""
+        """Restart with the same set-points."""
         self._rng = np.random.default_rng(self._seed)
         self._until_s = -math.inf
         self._target = self._default
@@ -130,7 +130,7 @@ class RichBehaviour:
             self._balance.reset()
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
-        """Return the balancing command or the set-point in force, with the gains of the segment."""
+        """Return the balancing command or the current set-point, with the gains of the segment."""
         if self._balance is not None and time_s < self._config.balance_s:
             wanted = self._balance.command(state, time_s)
             self.action = self._balance.action
@@ -182,7 +182,7 @@ class ChirpBehaviour:
         """Nothing to forget."""
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
-        """Return the set-point of this time: the phase is the integral of a frequency that grows linearly."""
+        """Return the set-point at this time; the phase is the integral of a linearly growing frequency."""
         c = self._config
         slope = (c.high_hz - c.low_hz) / c.duration_s
         phase = 2 * math.pi * (c.low_hz * time_s + 0.5 * slope * time_s**2)

@@ -1,7 +1,7 @@
-"""How strong a demonstration is: judged by what it recorded, and repeated stronger or gentler where needed.
+"""Strength of a demonstration: judged by its recording, and repeated stronger or gentler if needed.
 
-Robots differ by factors: a set-point that throws one cart against its trips does not get another one out of
-its friction. As a person at the robot would, the search looks at the recording, never at anything hidden.
+Robots differ by large factors: a set-point that trips one cart does not overcome the friction of another.
+Like a person at the robot, the search uses the recording only, never hidden values.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 
 LEAST_FOLLOWED = 0.3
-"""An actuated joint that covers less than this share of what was asked of it hardly moves."""
+"""An actuated joint that covers less than this share of its commanded range hardly moves."""
 
 LEAST_NOISE_RATIO = 20.0
-"""Motion below this many standard deviations of the sensor's noise says little of a joint."""
+"""Motion below this many standard deviations of the sensor's noise contains little information on a joint."""
 
 LEAST_FREE_RATIO = 100.0
-"""The same for a joint without a motor: it swings once it has left its friction, or it has not."""
+"""The same for a joint without a motor, which either overcomes its friction and swings, or stays."""
 
 LOWEST_LEVEL, HIGHEST_LEVEL = -3.0, 3.0
 LOWEST_EFFORT = 0.1
-"""Effort limits sent below this share are halved where a demonstration becomes stronger."""
+"""Commanded effort limits below this share are halved for a stronger demonstration."""
 
 HELD_FACTOR = 8.0
-"""Factor on effort limits that are sent low, from more than one step up on."""
+"""Factor on low commanded effort limits, from two steps up."""
 
 FINEST = 0.5
-"""Between a step that hardly moves and one that trips there may be a half step that does neither."""
+"""Half a step: between a step that hardly moves and one that trips, it may do neither."""
 
 ATTEMPTS = 4
 
@@ -46,7 +46,7 @@ def joint_noise(description: RobotDescription) -> tuple[float, ...]:
 
 
 def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, ...]:
-    """Return what hardly moved in a recording, in words; nothing where the motion suffices.
+    """Return a sentence for each joint that hardly moved in a recording; empty if the motion is large enough.
 
     Args:
         found: Movement and commands of the recording.
@@ -65,7 +65,7 @@ def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, .
         if asked is None:
             least, why = LEAST_FREE_RATIO * noise, f"{LEAST_FREE_RATIO:g} times the sensor's noise"
         else:
-            least, why = LEAST_FOLLOWED * asked, f"{LEAST_FOLLOWED:.0%} of what was asked"
+            least, why = LEAST_FOLLOWED * asked, f"{LEAST_FOLLOWED:.0%} of the commanded range"
             if least < LEAST_NOISE_RATIO * noise:
                 least, why = LEAST_NOISE_RATIO * noise, f"{LEAST_NOISE_RATIO:g} times the sensor's noise"
         if span < least:
@@ -74,23 +74,24 @@ def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, .
 
 
 def with_excitation_level(config: RichConfig, level: float, description: RobotDescription) -> RichConfig:
-    """Return the motion, stronger or gentler by some steps, inside the safety limits.
+    """Return the motion, stronger or gentler by some steps, within the safety limits.
 
-    A step up: set-points half again as far and held half again as long, gains stiffer and less damped, higher
-    limits (those sent low to be felt apart), half the balancing. A step down: nearer set-points, softer and
+    A step up: set-points 1.5 times as far and held 1.5 times as long, stiffer and less damped gains, higher
+    limits (except deliberately low ones), half the balancing time. A step down: nearer set-points, softer and
     more damped gains, lower limits.
 
     Args:
-        config: The motion as it is at 0.
-        level: Steps up, or down where negative; half steps, too.
+        config: The motion at level 0.
+        level: Steps up, or down if negative; half steps are allowed.
         description: The robot.
 
     Raises:
-        ConfigurationError: There are no such steps.
+        ConfigurationError: The level is outside the allowed range.
     """
     if not LOWEST_LEVEL <= level <= HIGHEST_LEVEL:
         raise ConfigurationError(
-            f"excitation level {level:g}: {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}, 0 is the motion itself"
+            f"excitation level {level:g}: allowed are {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}; 0 is the "
+            "motion itself"
         )
     if level == 0:
         return config
@@ -100,7 +101,7 @@ def with_excitation_level(config: RichConfig, level: float, description: RobotDe
     balance_s = config.balance_s * 0.5**up
     return dataclasses.replace(
         config,
-        # A user's own amplitude may be beyond the room already; the safety filter clips that.
+        # A user's own amplitude may already exceed the room; the safety filter clips it.
         amplitude=min(amplitude, max(float(np.min(most[most > 0])), config.amplitude)),
         hold_s=(config.hold_s[0] * 1.5**up, config.hold_s[1] * 1.5**up),
         balance_s=balance_s if level > LOWEST_LEVEL and up < 2 else 0.0,
@@ -109,7 +110,7 @@ def with_excitation_level(config: RichConfig, level: float, description: RobotDe
 
 
 def _whole(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
-    """Return segments that cover the whole run: what was left out has the description's own gains."""
+    """Return segments that cover the whole run; the gaps get the description's own gains."""
     return (*segments, Segment(start=0.0, stop=1.0))
 
 
@@ -134,24 +135,25 @@ def _scaled(part: Segment, level: float, description: RobotDescription) -> Segme
 
 
 def _effort_factor(sent: float, up: float, down: float) -> float:
-    """Return the factor on an effort limit that is sent at this share of the description's."""
+    """Return the factor on an effort limit that is commanded at this share of the description's."""
     if down:
         return float(0.7**down)
     if sent >= 1 or not up:
         return float(2.0**up)
-    # A limit is sent low to be felt. What creeps asks for little effort, and the lowest is halved. What the
-    # first step does not move is held by friction, which low efforts do not overcome.
+    # A low limit must be reached to be identified. A creeping joint needs little effort, so the lowest limit
+    # is halved. A joint that does not move after the first step is held by friction, which low efforts cannot
+    # overcome.
     return (0.5 if sent < LOWEST_EFFORT else 1.0) * (HELD_FACTOR if up > 1 else 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One recording and what it was worth.
+    """One recording and its assessment.
 
     Attributes:
-        level: How strong it was.
-        shortfalls: What hardly moved, in words.
-        tripped: Why the safety module ended it; "" where it did not.
+        level: Excitation level.
+        shortfalls: A sentence for each joint that hardly moved.
+        tripped: Why the safety module ended it; "" if it did not.
     """
 
     level: float
@@ -160,43 +162,44 @@ class Attempt:
 
     @property
     def enough(self) -> bool:
-        """Whether the recording is whole and moves."""
+        """Whether the recording is complete and moves enough."""
         return not self.shortfalls and not self.tripped
 
 
 class ExcitationLevelSearch:
-    """Chooses how strong to record next until a recording is whole and moves: ask (`level`) and tell.
+    """Chooses excitation levels until a recording is complete and moves enough: ask (`level`) and tell.
 
     Args:
-        level: Where to start.
+        level: First level.
         attempts: Most recordings.
-        rearm: Whether a recording that the safety module ended may be followed by another. On a robot a
-            person has to look first.
+        rearm: Whether another recording may follow a trip of the safety module. On a real robot a person must
+        check it first.
 
     Raises:
-        ConfigurationError: It is to start outside what there is, or never.
+        ConfigurationError: The first level is outside the range, or attempts is below 1.
     """
 
     def __init__(self, level: float = 0.0, attempts: int = ATTEMPTS, *, rearm: bool = True) -> None:
         if not LOWEST_LEVEL <= level <= HIGHEST_LEVEL:
             raise ConfigurationError(
-                f"excitation level {level:g}: {LOWEST_LEVEL:g} (gentlest) to {HIGHEST_LEVEL:g} (strongest)"
+                f"excitation level {level:g}: allowed are {LOWEST_LEVEL:g} (gentlest) to {HIGHEST_LEVEL:g} "
+                "(strongest)"
             )
         if attempts < 1:
-            raise ConfigurationError(f"{attempts} attempts at a recording: at least 1")
+            raise ConfigurationError(f"{attempts} attempts at a recording: give at least 1")
         self._most, self._rearm = attempts, rearm
         self.level = level
         self.attempts: list[Attempt] = []
         self.words = ""
 
     def tell(self, found: tuple[str, ...], tripped: str = "") -> bool:
-        """Take what came of the recording at `level`; return whether to record again, at the new one.
+        """Take the outcome of the recording at `level`; return whether to record again at the new level.
 
-        `words` then says what was wrong and what is done next.
+        Afterwards `words` has the problem and the next step.
 
         Args:
-            found: What hardly moved, from :func:`shortfalls`.
-            tripped: Why the safety module ended it; "" where it did not.
+            found: Result of :func:`shortfalls`.
+            tripped: Why the safety module ended it; "" if it did not.
         """
         attempt = Attempt(self.level, found, tripped)
         self.attempts.append(attempt)
@@ -205,7 +208,7 @@ class ExcitationLevelSearch:
             return False
         how = "gentler" if tripped else "stronger"
         following = self._following(-1.0 if tripped else 1.0)
-        why = f"it was cut short ({tripped})" if tripped else f"it hardly moves: {'; '.join(found)}"
+        why = f"the safety module ended it ({tripped})" if tripped else f"it hardly moves: {'; '.join(found)}"
         end = self._end(following, how, bool(tripped))
         if not end:
             self.level = following
@@ -213,26 +216,26 @@ class ExcitationLevelSearch:
         return not end
 
     def _following(self, step: float) -> float:
-        """Return the level a step away, or half way to one that was tried on the way there."""
+        """Return the level one step away, or half a step if the full step was tried."""
         tried = [(a.level - self.level) * step for a in self.attempts]
         nearest = min((t for t in tried if 0 < t <= 1), default=2.0)
         return self.level + step * min(1.0, nearest / 2)
 
     def _end(self, following: float, how: str, tripped: bool) -> str:
-        """Return why there is no further attempt, in words; "" where there is one."""
+        """Return why there is no further attempt, as text; "" if there is one."""
         if not LOWEST_LEVEL <= following <= HIGHEST_LEVEL:
-            return "there is nothing gentler" if tripped else "the limits allow nothing stronger"
+            return "it is the gentlest level" if tripped else "it is the strongest level"
         if abs(following - self.level) < FINEST:
             return f"half a step {how} was tried before"
         if tripped and not self._rearm:
-            return f"look at the robot, then record again with --excitation-level {following:g}"
+            return f"check the robot, then record again with --excitation-level {following:g}"
         if len(self.attempts) >= self._most:
-            return f"no more recordings are allowed here; go on with --excitation-level {following:g}"
+            return f"the number of recordings is used up; continue with --excitation-level {following:g}"
         return ""
 
     @property
     def best(self) -> int:
-        """Index of the recording to use: whole and moving, else moving, else whole; then the strongest."""
+        """Index of the best recording: complete and moving, else moving, else complete, then strongest."""
 
         def worth(index: int) -> tuple[bool, bool, float]:
             attempt = self.attempts[index]

@@ -1,4 +1,4 @@
-"""How large an excitation may be: what a description says of ranges, steps, speeds and efforts."""
+"""How large an excitation may be, from a description's ranges, steps, speeds and efforts."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 MARGIN = 0.9
-"""Share of a limit that is used: what is added on top (noise, the blend from balancing) needs room, too."""
+"""Used share of a limit; noise and the transition from balancing need the rest."""
 
 
 def centre(description: RobotDescription) -> FloatArray:
-    """Return what signals are offsets from, (A,): the default pose; for motors no effort."""
+    """Return the centre of signals, (A,): the default pose; for motors zero effort."""
     if description.actuation == "motor":
         return np.zeros(len(description.actuated))
     return np.array(description.default_position)[list(description.actuated_index)]
 
 
 def room(description: RobotDescription) -> FloatArray:
-    """Return the largest offset of each actuated joint to either side of the centre, (A,); 0 where none.
+    """Return the largest offset of each actuated joint to either side of the centre, (A,); 0 if it has none.
 
     Raises:
-        ConfigurationError: No joint has any.
+        ConfigurationError: No joint has room.
     """
     low, high = np.array(description.limits.target).T
     if description.excitation_range:
@@ -31,18 +31,18 @@ def room(description: RobotDescription) -> FloatArray:
         low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
     around = centre(description)
     found = np.maximum(np.minimum(around - low, high - around), 0.0)
-    # While a joint does not follow at all, the set-point may be off by the offset.
+    # If a joint does not follow at all, its position error is the whole offset.
     found = MARGIN * np.minimum(found, np.array(description.limits.target_distance))
     if not np.isfinite(found).all():
         endless = [n for n, width in zip(description.actuated, found, strict=True) if not np.isfinite(width)]
         raise ConfigurationError(
-            f"how far {', '.join(endless)} of {description.name!r} may go is not known; write its "
-            "position_range into robot.yaml"
+            f"the range of {', '.join(endless)} of {description.name!r} is unknown, so no excitation can "
+            "be planned; write its position_range into robot.yaml"
         )
     if not np.any(found > 0):
         raise ConfigurationError(
             f"no joint of {description.name!r} has room around its centre {around.tolist()} within the "
-            f"target limits {list(description.limits.target)}"
+            f"target limits {list(description.limits.target)}; change default pose or limits"
         )
     return np.asarray(found)
 
@@ -50,9 +50,9 @@ def room(description: RobotDescription) -> FloatArray:
 def predicted_effort(description: RobotDescription, offsets: FloatArray) -> FloatArray:
     """Return the PD effort of servos that follow a signal, before any limit, (T, A).
 
-    All that a description tells of a servo's motion is its gains: kd v = kp (target - x), a first-order lag
-    with the corner kp / kd. It leaves inertia, friction and load out, so it is a lower estimate for heavy
-    joints; the device's own effort limit is what holds.
+    A description has only the gains of a servo: kd v = kp (target - x), a first-order lag with the corner kp
+    / kd. Inertia, friction and load are missing, so the effort of heavy joints is underestimated; the
+    device's own effort limit protects it.
 
     Args:
         description: The robot.
@@ -72,9 +72,9 @@ def predicted_effort(description: RobotDescription, offsets: FloatArray) -> Floa
 def fit_to_limits(description: RobotDescription, offsets: FloatArray, *, smooth: bool) -> FloatArray:
     """Return the factor, at most 1, by which each joint's signal must be scaled to keep the limits, (A,).
 
-    Target range, change of the target from one command to the next, half the speed that trips, and for smooth
-    signals the predicted effort. Steps ask for more effort than there is on purpose: that is how they show
-    the limit.
+    The limits: target range, change of the target between two commands, half the trip speed, and for smooth
+    signals the predicted effort. Steps request more effort than available on purpose, to show the effort
+    limit.
 
     Args:
         description: The robot.
@@ -95,7 +95,7 @@ def fit_to_limits(description: RobotDescription, offsets: FloatArray, *, smooth:
     scale = np.ones(offsets.shape[1])
     for found, most in pairs:
         over = (found > most) & np.isfinite(most)
-        # Limits may be infinite: they are none.
+        # An infinite limit is no limit.
         ratio = np.where(over, most, 0.0) / np.where(over, found, 1.0)
         scale = np.where(over, np.minimum(scale, ratio), scale)
     return np.asarray(scale)

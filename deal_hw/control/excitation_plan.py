@@ -1,6 +1,6 @@
-"""A planned excitation: what to play on a robot for calibration, as a small JSON file, and its behaviour.
+"""A planned excitation for calibration, as a small JSON file, and its behaviour.
 
-What is optimal is computed before the run, elsewhere; the control process only reads the table and plays it.
+The optimum is computed before the run; the control process only reads the table and plays it.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ FORMAT = "deal_hw.excitation/1"
 MAX_SECONDS = 86_400.0
 """Longest run that a plan may describe [s]."""
 _CHECKED = 1000
-"""Moments of a run at which a signal is looked at before it is played."""
+"""Number of times of a run at which a signal is checked before it is played."""
 Family = Literal["multisine", "chirp", "steps"]
 FAMILIES = get_args(Family)
 OF_FAMILY: Mapping[Family, tuple[str, ...]] = MappingProxyType(
     {"multisine": ("low_hz", "high_hz", "seed"), "chirp": ("low_hz", "high_hz"), "steps": ("seed",)}
 )
-"""What of a design only some families have."""
+"""Design fields that only some families have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExcitationDesign:
-    """What a plan is made from: few numbers, which an optimiser varies."""
+    """A few numbers from which a plan is made; an optimiser varies them."""
 
     family: Family = "multisine"
     """multisine: sum of sines with a low peak; chirp: a sweep; steps: random set-points."""
     seconds: float = 4.0
     """Length of the run [s]."""
     amplitude: float = 1.0
-    """Share of the largest amplitude that the limits allow, up to 1."""
+    """Amplitude, as a share of the largest one within the limits, up to 1."""
     low_hz: float = 0.3
-    """Least frequency of multisine and chirp."""
+    """Lowest frequency of multisine and chirp [Hz]."""
     high_hz: float = 5.0
-    """Greatest frequency of multisine and chirp."""
+    """Highest frequency of multisine and chirp [Hz]."""
     tilt: float = 0.5
-    """How amplitudes of a multisine fall with frequency: 0 flat, 1 equal speeds."""
+    """How the amplitudes of a multisine fall with frequency: 0 flat, 1 equal speeds."""
     law: Law = "linear"
     """How a chirp's frequency grows."""
     arrangement: Arrangement = "one-by-one"
@@ -70,30 +70,30 @@ class ExcitationDesign:
     hold_s: tuple[float, float] = (0.1, 0.3)
     """Shortest and longest hold of a step [s]."""
     balance_s: float = 0.0
-    """Time spent balancing with a policy first [s]; 0 for robots that stand by themselves."""
+    """Time of balancing with a policy at the start [s]; 0 for robots that stand by themselves."""
     ease_s: float = 0.2
-    """Time over which a signal swells from the first set-point, and fades at the end [s]; steps have none."""
+    """Time of fading in from the first set-point, and of fading out at the end [s]; not for steps."""
     split: float = 0.5
-    """Fraction of the run from which on the second factors hold."""
+    """Fraction of the run after which the second factors hold."""
     effort: tuple[float, float] = (1.0, 1.0)
-    """Factor on the effort limit that is sent, before and after the split."""
+    """Factor on the commanded effort limit, before and after the split."""
     speed: tuple[float, float] = (1.0, 1.0)
-    """Factor on the speed limit that is sent, before and after the split."""
+    """Factor on the commanded speed limit, before and after the split."""
     seed: int = 0
-    """Fixes what is random in the signal."""
+    """Seed of the signal's random numbers."""
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
             raise UnknownNameError("excitation", self.family, FAMILIES)
         if not (0 < self.amplitude <= 1 and 0 <= self.balance_s < self.seconds and 0 < self.split <= 1):
             raise ConfigurationError(
-                f"not a usable excitation: amplitude {self.amplitude:g} (a share of what the limits allow, "
-                f"in (0, 1]), balance_s {self.balance_s:g} of {self.seconds:g} s, "
-                f"split {self.split:g} in (0, 1]"
+                f"not a usable excitation: amplitude {self.amplitude:g} (a share of the largest amplitude; "
+                f"allowed: above 0, up to 1), balance_s {self.balance_s:g} of {self.seconds:g} s, split "
+                f"{self.split:g} (allowed: above 0, up to 1)"
             )
 
     def segments(self) -> tuple[Segment, ...]:
-        """Return the parts of the run in which other limits are sent; none where all factors are 1."""
+        """Return the parts of the run with other commanded limits; empty if all factors are 1."""
         bounds = [(0.0, self.split), (self.split, 1.0)] if self.split < 1 else [(0.0, 1.0)]
         parts = [
             Segment(start=low, stop=high, effort_limit=effort, speed_limit=speed)
@@ -108,17 +108,17 @@ class ExcitationPlan:
 
     Attributes:
         robot: Name of the robot.
-        digest: Digest of the description that it was made for.
+        digest: Digest of the robot's description.
         seconds: Length of the run [s].
-        balance_s: Time spent balancing with a policy first [s].
-        ease_s: Time of swelling and fading [s].
-        wave: Offsets from the robot's centre, from the end of balancing on.
-        segments: Parts of the run in which other gains and limits are sent.
-        words: One line that says what it is.
-        predicted: Predicted standard deviation of each parameter in its own scale, where it was computed.
+        balance_s: Time of balancing with a policy at the start [s].
+        ease_s: Time of fading in, and of fading out [s].
+        wave: Offsets from the robot's centre, after the balancing.
+        segments: Parts of the run with other commanded gains and limits.
+        words: One line that describes the plan.
+        predicted: Predicted standard deviation of each parameter in its own scale, if computed.
 
     Raises:
-        ConfigurationError: The times make no sense.
+        ConfigurationError: The times do not fit together.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -136,32 +136,34 @@ class ExcitationPlan:
     def __post_init__(self) -> None:
         if not (0 <= self.balance_s < self.seconds <= MAX_SECONDS and 0 <= self.ease_s <= self.seconds):
             raise ConfigurationError(
-                f"an excitation of {self.seconds:g} s, {self.balance_s:g} s of it balancing, eased over "
-                f"{self.ease_s:g} s; wanted: up to {MAX_SECONDS:g} s, and balancing and easing within them"
+                f"an excitation of {self.seconds:g} s, with {self.balance_s:g} s of balancing and fades of "
+                f"{self.ease_s:g} s; allowed: up to {MAX_SECONDS:g} s, which include balancing and fades"
             )
 
     def check_fits(self, description: RobotDescription) -> None:
         """Check that the plan was made for this robot.
 
         Raises:
-            ConfigurationError: It was not, or its signal is not one finite number for each actuated joint.
+            ConfigurationError: It was made for another robot, or its signal is not one finite number for each
+                actuated joint.
         """
         if self.robot != description.name or self.digest != description.digest():
             raise ConfigurationError(
-                f"the excitation was made for robot {shown(self.robot)} (description {shown(self.digest)}), "
-                f"this is {description.name!r} ({description.digest()}); make another with "
-                "`deal-hw design-excitation`"
+                f"the excitation was made for robot {shown(self.robot)} (description "
+                f"{shown(self.digest)}), but this is {description.name!r} ({description.digest()}); make a "
+                "new one with `deal-hw design-excitation`"
             )
         with np.errstate(all="ignore"):
             offsets = self.offsets(np.linspace(0.0, self.seconds, _CHECKED))
         if offsets.shape[1] != len(description.actuated) or not np.isfinite(offsets).all():
             raise ConfigurationError(
-                f"the excitation moves {offsets.shape[1]} joints, some by no finite number; wanted: finite "
-                f"offsets of the {len(description.actuated)} actuated joints of {description.name!r}"
+                f"the excitation has offsets for {offsets.shape[1]} joints, or offsets that are not "
+                f"finite; needed: finite offsets of the {len(description.actuated)} actuated joints of "
+                f"{description.name!r}; make a new one with `deal-hw design-excitation`"
             )
 
     def offsets(self, time_s: FloatArray) -> FloatArray:
-        """Return the eased signal at times of the run, (T,) -> (T, A); 0 while balancing."""
+        """Return the signal with its fades at times of the run, (T,) -> (T, A); 0 while balancing."""
         local = time_s - self.balance_s
         window = ease(local, self.seconds - self.balance_s, self.ease_s)
         return np.asarray(self.wave.at(local) * window[:, None])
@@ -195,7 +197,7 @@ def read_plan(path: Path) -> ExcitationPlan:
     """Return the plan of a file.
 
     Raises:
-        ConfigurationError: It cannot be read, or holds no plan.
+        ConfigurationError: It cannot be read, or contains no plan.
     """
     advice = f"--excite takes {', '.join(FAMILIES[:2])}, or a file that `deal-hw design-excitation` wrote"
     values = read_json(path, dict[str, Any], "an excitation", advice, error=ConfigurationError)
@@ -204,10 +206,10 @@ def read_plan(path: Path) -> ExcitationPlan:
 
 
 def make_plan(description: RobotDescription, design: ExcitationDesign) -> ExcitationPlan:
-    """Return the plan of a design, as large as the design asks and the safety limits allow.
+    """Return the plan of a design, with the design's amplitude within the safety limits.
 
     Raises:
-        ConfigurationError: No joint has room to move, or a factor exceeds what may be sent.
+        ConfigurationError: No joint has room to move, or a factor is too large.
     """
     _check_factors(description, design)
     rng = np.random.default_rng(design.seed)
@@ -250,12 +252,12 @@ def _check_factors(description: RobotDescription, design: ExcitationDesign) -> N
         ("speed", design.speed, description.speed_limit, limits.speed),
     ):
         for factor in factors:
-            # The description's own defaults are not this plan's choice.
+            # The description's own defaults are always allowed.
             if factor != 1.0 and not 0 < factor <= largest_factor(default, most):
                 greatest = largest_factor(default, most)
                 raise ConfigurationError(
-                    f"{what} factor {factor:g} on robot {description.name!r}: above 0 and up to "
-                    f"{greatest:.3g} is allowed, or the safety filter would clip it"
+                    f"{what} factor {factor:g} on robot {description.name!r}: allowed is above 0 and up to "
+                    f"{greatest:.3g}; the safety filter would clip more"
                 )
 
 
@@ -266,7 +268,7 @@ def largest_factor(default: Sequence[float], most: Sequence[float]) -> float:
 
 
 def describe_design(design: ExcitationDesign) -> str:
-    """Return a design in words, as advice and file carry it."""
+    """Return a design as text, for the advice and the file."""
     band = f"{design.low_hz:.2g} to {design.high_hz:.2g} Hz"
     what = {
         "multisine": f"a multisine of {band}",
@@ -289,17 +291,17 @@ def describe_design(design: ExcitationDesign) -> str:
 
 
 class ExcitationBehaviour:
-    """Balances where the plan says so, then plays its signal around the robot's centre.
+    """Balances if the plan requires it, then plays its signal around the robot's centre.
 
-    The signal swells from the last set-point of the balancing, so the first sample is continuous.
+    The signal fades in from the last set-point of the balancing, so it starts without a jump.
 
     Args:
-        plan: What to play.
+        plan: The plan.
         description: The robot.
-        balance: What balances at first; needed where the plan balances.
+        balance: The balancing behaviour; needed if the plan balances first.
 
     Raises:
-        ConfigurationError: The plan is another robot's, or nothing balances.
+        ConfigurationError: The plan is for another robot, or the balancing behaviour is missing.
     """
 
     def __init__(
@@ -308,7 +310,8 @@ class ExcitationBehaviour:
         plan.check_fits(description)
         if plan.balance_s > 0 and balance is None:
             raise ConfigurationError(
-                f"the excitation balances for {plan.balance_s:g} s first, but there is no policy"
+                f"the excitation balances for {plan.balance_s:g} s first, but there is no policy; give "
+                "--policy FILE"
             )
         self._plan, self._description = plan, description
         self._balance = balance if plan.balance_s > 0 else None
@@ -317,14 +320,14 @@ class ExcitationBehaviour:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew with the same signal."""
+        """Restart with the same signal."""
         self._last = self._centre
         self.action = None
         if self._balance is not None:
             self._balance.reset()
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
-        """Return the balancing command or the signal's set-point, with the limits of the segment."""
+        """Return the balancing command or the signal's set-point, with the segment's limits."""
         # Half a millisecond of slack: times are multiples of the control period, not exact in binary.
         if self._balance is not None and time_s + 5e-4 < self._plan.balance_s:
             wanted = self._balance.command(state, time_s)
@@ -335,7 +338,7 @@ class ExcitationBehaviour:
         return self._scaled(self._centre + offset + self._left(time_s) * (self._last - self._centre), time_s)
 
     def _left(self, time_s: float) -> float:
-        """Return how much of the balancing's last set-point is left at a time."""
+        """Return the remaining share of the balancing's last set-point at a time."""
         if self._plan.ease_s <= 0:
             return 0.0
         since = max(time_s - self._plan.balance_s, 0.0)

@@ -1,7 +1,7 @@
-"""What is checked on a robot with legs besides its joints: body, motors, battery.
+"""Safety checks of a robot with legs, besides its joints: body, motors, battery.
 
-Pure, like the rest of the safety module: no I/O, and time is the device clock of the samples. A sample that
-comes twice adds nothing to a duration.
+Pure, like the rest of the safety module: no I/O, and time is the device clock of the samples. A repeated
+sample adds nothing to a duration.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.types import BodyState, FloatArray, IntArray, RobotState
 
 LOST_WINDOW_S = 1.0
-"""Time over which commands that a motor missed are counted [s]."""
+"""Time window in which a motor's missed commands are counted [s]."""
 UNIT_TOLERANCE = 0.01
 """A quaternion's norm may differ from 1 by this; single precision takes less than 1e-6 of it."""
 
@@ -33,11 +33,11 @@ def tilt(orientation: FloatArray) -> float:
 
 
 class LegChecks:
-    """The checks, and the memory of those that need some.
+    """The checks and their memory.
 
     Args:
-        description: Gives names.
-        limits: What to enforce.
+        description: The robot, for joint names.
+        limits: The limits.
     """
 
     def __init__(self, description: RobotDescription, limits: LegLimits) -> None:
@@ -64,7 +64,7 @@ class LegChecks:
         found: dict[str, str] = {}
         self._check_flail(state, found)
         if state.body is None:
-            found["body_missing"] = "the robot reports nothing of its body: no orientation, no battery"
+            found["body_missing"] = "the robot reports no state of its body: no orientation, no battery"
             return found
         self._check_body(state.device_ns, state.body, found)
         self._check_motors(state.device_ns, state.body, found)
@@ -77,8 +77,8 @@ class LegChecks:
         first = int(np.argmin(self._fast_since))
         if state.device_ns - int(self._fast_since[first]) >= round(self._limits.flail_s * 1e9):
             found["flail"] = (
-                f"joint {self._names[first]!r} flails: faster than {self._flail_velocity[first]:g} rad/s for "
-                f"{self._limits.flail_s:g} s, now {state.velocity[first]:.2f} rad/s"
+                f"joint {self._names[first]!r} flails: faster than {self._flail_velocity[first]:g} rad/s "
+                f"for {self._limits.flail_s:g} s, now {state.velocity[first]:.2f} rad/s"
             )
 
     def _check_body(self, now_ns: int, body: BodyState, found: dict[str, str]) -> None:
@@ -112,7 +112,7 @@ class LegChecks:
 
     def _check_motors(self, now_ns: int, body: BodyState, found: dict[str, str]) -> None:
         hot = int(np.argmax(body.temperature))
-        # Written so that NaN, which is no reading, does not pass.
+        # Written so that NaN, a missing reading, does not pass.
         if not body.temperature[hot] <= self._limits.temperature:
             found["motor_temperature"] = (
                 f"the motor of joint {self._names[hot]!r} is at {body.temperature[hot]:.0f} °C, at most "
@@ -127,7 +127,7 @@ class LegChecks:
             )
 
     def _lost_in_window(self, now_ns: int, lost: IntArray) -> IntArray:
-        # A counter that falls has been started anew: what it counted before stays counted.
+        # A counter that decreases was restarted; its earlier counts remain.
         last = lost if self._lost_last is None else self._lost_last
         self._lost_total = self._lost_total + np.maximum(lost - last, 0)
         self._lost_last = lost.copy()

@@ -25,32 +25,32 @@ from deal_hw.types import Event, JointCommand, RobotState
 __all__ = ["RUNNING", "ControlLoop", "LoopConfig", "LoopReport", "OperatorStop", "Outcome", "Sink"]
 
 Sink = Callable[[CycleRecord], bool]
-"""Takes a record and never waits; False: refused. Raises a DealHwError where nobody will ever take one
-again."""
+"""Takes a record without waiting; False: refused. Raises a DealHwError if no record can be taken any more."""
 
 
 _MOST_WIRE_BYTES = 48_000
-"""Raw bytes in one record: a datagram holds no more beside the rest; a cycle of a Go2 has 13 000."""
+"""Most raw bytes in one record, limited by the size of a datagram; a cycle of a Go2 has 13 000."""
 _MOST_STATE_BYTES = 72_000
-"""The same of states: 0.2 s of a Go2's. What a longer stall brings would cost the record that says so."""
+"""Most states in one record: 0.2 s of a Go2's. More states, after a longer stall, would lose the record of
+that stall."""
 
 
 class OperatorStop(BaseException):
-    """The operator requested to stop while the loop waited for the robot; no error, so not an Exception."""
+    """The operator requested a stop while the loop waited for the robot; not an error, hence no Exception."""
 
 
 class ControlLoop:
-    """Connects, homes, arms, runs cycles on absolute deadlines and always leaves the robot passive.
+    """Connects, homes, arms, runs cycles on absolute deadlines, always ends with a passive robot.
 
     Args:
         robot: The robot; the loop connects and disconnects it.
-        behaviour: What to ask of it.
+        behaviour: Source of the commands.
         safety: Judges every command.
         clock: The clock of deadlines and stamps; virtual for benches.
         sink: Takes each cycle's record.
         config: Settings.
-        progress: Called with the phase's name and the longest time until the next call [s]: the heartbeat.
-        scheduling: What the operating system granted, for the report.
+        progress: The heartbeat: called with the phase's name and the longest time until the next call [s].
+        scheduling: Scheduling granted by the operating system, for the report.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class ControlLoop:
         self._states = self._blind = self._losses = self._sent = self._errors_seen = 0
 
     def request_stop(self, reason: str = "stopped by the operator") -> None:
-        """End the run; safe to call from a signal handler and from the behaviour."""
+        """End the run; may be called from a signal handler and from the behaviour."""
         self._stop_reason = self._stop_reason or reason
         if self._raise_on_stop:
             self._raise_on_stop = False
@@ -91,7 +91,7 @@ class ControlLoop:
         self._events.append(Event(self._clock.now_ns(), kind, message, data))
 
     def run(self) -> LoopReport:
-        """Run once. Errors come back in the report, after the robot was made passive."""
+        """Run once. Errors are returned in the report, after the robot was made passive."""
         outcome, reason, error, confirmed = Outcome.FAILED, "", "", False
         running = False
         try:
@@ -107,12 +107,12 @@ class ControlLoop:
         except Exception as err:
             reason, error = str(err) or type(err).__name__, type(err).__name__
             if isinstance(err, TransportError) and running:
-                # The link is lost while commands go out. It is judged like what the safety module finds: the
-                # run is tripped, latched, and the passive command goes out over whatever link there is.
+                # The connection is lost while commands are sent. This counts as a trip of the safety module:
+                # it is latched, and the passive command is sent over any connection there is.
                 outcome, reason, error = Outcome.TRIPPED, f"the link is lost: {reason}", ""
                 self.note("passive", reason, flags=["link_lost"])
         finally:
-            # First of all, and before anything that might fail: the robot.
+            # The robot comes first, before any step that might fail.
             self._raise_on_stop = False
             confirmed = self._make_passive()
             if confirmed and outcome in (Outcome.FINISHED, Outcome.STOPPED):
@@ -135,7 +135,8 @@ class ControlLoop:
         self._connected = True
         self._behaviour.reset()
         if c.home and not c.dry_run:
-            # Told before it happens: a supervisor that finds this process dead knows whether to send damping.
+            # Reported before it happens, so that a supervisor that finds this process dead knows whether to
+            # send damping.
             self._phase(HOMING, c.home_timeout_s + c.state_timeout_s + 2.0)
             self._commanding = self._robot.homes_by_motor
             self._robot.home(c.home_timeout_s)
@@ -146,11 +147,10 @@ class ControlLoop:
             self._commanding = True
             self._robot.arm(c.arm_timeout_s)
             self.note("armed", "the motors follow commands")
-            # What waited in buffers meanwhile is old: the first cycle takes what comes from now on.
+            # Data that waited in buffers are old; the first cycle uses only later ones.
             self._drain()
             self._await_state()
-        # The recording starts with the sample that the first command answers, not with hands that set up the
-        # robot.
+        # The recording starts with the sample that the first command uses, not with the setting up by hand.
         self._pending = self._pending[-1:]
 
     def _await_state(self) -> None:
@@ -186,7 +186,7 @@ class ControlLoop:
         if not self._pending:
             self._blind += 1
             flags |= CycleFlag.NO_STATE
-        # A policy must not see numbers that are not: its memory would carry them on.
+        # A policy must not see values that are not finite: its memory would keep them.
         if state is not None and _is_finite(state):
             with self._loop_timing.section("behaviour"):
                 wanted = self._behaviour.command(state, index * self._loop_timing.period_ns * 1e-9)
@@ -277,7 +277,7 @@ class ControlLoop:
             self._losses += 1
 
     def _collect_until(self, deadline_ns: int) -> None:
-        """Take states as they arrive, so that each carries its own receive stamp; repeat the command."""
+        """Take states as they arrive, so that each has its own receive stamp; repeat the command."""
         while (now_ns := self._clock.now_ns()) < deadline_ns:
             left_ns = max(self._repeater.wake_ns(deadline_ns) - now_ns, 0)
             with contextlib.suppress(TransportTimeoutError):
@@ -312,14 +312,15 @@ class ControlLoop:
     def _make_passive(self) -> bool:
         """Send the passive command until the robot confirms it; return whether it did.
 
-        A robot that this run never commanded may stand under its own controller: it is left alone.
+        A robot that this run never commanded may stand under its own controller, so nothing is sent.
         """
         if self._safety.state.armed:
             self._safety.stop("the run ended")
         if not self._commanding:
             return True
         self._phase(MAKING_PASSIVE, 2.0)
-        # What it reads is not recorded: nobody knows which of the samples the passive command found.
+        # Samples read here are not recorded, since it is unknown which of them came after the passive
+        # command.
         return make_passive(
             self._robot,
             self._clock,
@@ -336,10 +337,10 @@ class ControlLoop:
             self._robot.hand_back(timeout_s)
             self.note("handed back", "the robot's own controller has the robot again")
         except (DealHwError, OSError) as err:
-            self.note("warning", f"the robot was not handed back: {err}")
+            self.note("warning", f"the robot did not return to its own controller: {err}")
 
     def _close(self, reason: str) -> None:
-        """Hand over what is left, then disconnect."""
+        """Send the remaining records, then disconnect."""
         try:
             now = self._clock.now_ns()
             self.note("ended", reason or "the run ended")
@@ -363,7 +364,7 @@ class ControlLoop:
 
 
 def _newest(wire: Sequence[Message]) -> tuple[Message, ...]:
-    """Return what fits a record: setting up a robot may take long, and what does not fit is the oldest."""
+    """Return the newest raw bytes that fit into a record; setting up a robot may produce more."""
     left = _MOST_WIRE_BYTES
     for count, message in enumerate(reversed(wire)):
         left -= len(message.payload) + len(message.channel) + 16
@@ -373,7 +374,7 @@ def _newest(wire: Sequence[Message]) -> tuple[Message, ...]:
 
 
 def _newest_states(states: Sequence[RobotState]) -> tuple[RobotState, ...]:
-    """Return what fits a record; what does not is the oldest, and shows as a gap in the states' numbers."""
+    """Return the newest states that fit into a record; dropped ones show as a gap in the states' numbers."""
     if not states:
         return ()
     newest = states[-1]
@@ -384,6 +385,6 @@ def _newest_states(states: Sequence[RobotState]) -> tuple[RobotState, ...]:
 
 
 def _is_finite(state: RobotState) -> bool:
-    """Say whether all that a behaviour computes with is a number."""
+    """Return whether all inputs of a behaviour are finite."""
     body = () if state.body is None else (state.body.orientation, state.body.angular_velocity)
     return all(bool(np.isfinite(part).all()) for part in (state.position, state.velocity, *body))

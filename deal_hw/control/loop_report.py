@@ -1,4 +1,4 @@
-"""What a run of the control loop is told, and what it reports."""
+"""Settings and report of a run of the control loop."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Outcome(enum.Enum):
 
     FINISHED = "finished"
     STOPPED = "stopped"
-    """By the operator."""
+    """Ended by the operator."""
     TRIPPED = "tripped"
-    """By the safety module."""
+    """Ended by the safety module."""
     FAILED = "failed"
-    """By an error."""
+    """Ended by an error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +30,7 @@ class LoopConfig:
     duration_s: float
     """Length of the run, counted in control periods [s]."""
     dry_run: bool = False
-    """Compute everything and send nothing: the robot is neither homed nor armed."""
+    """Compute everything but send no command: the robot is neither homed nor armed."""
     home: bool = True
     """Bring the robot to its start pose first."""
     home_timeout_s: float = 20.0
@@ -38,31 +38,31 @@ class LoopConfig:
     state_timeout_s: float = 1.0
     """How long to wait for the first state sample [s]."""
     passive: PassiveConfig = field(default_factory=PassiveConfig)
-    """How long the passive command is repeated at the end, until the robot shows it."""
+    """How the passive command is repeated at the end, until the robot confirms it."""
     record_wire: bool = True
-    """Hand the raw bytes to the recorder, too."""
+    """Also record the raw bytes."""
     hand_back: bool = False
-    """At the end, return the robot to the controller that it came with."""
+    """At the end, return the robot to its own controller."""
     hand_back_timeout_s: float = 10.0
 
     def __post_init__(self) -> None:
         if not self.duration_s > 0:
-            raise ConfigurationError(f"a run must last longer than 0 s, not {self.duration_s!r}")
+            raise ConfigurationError(f"a run of {self.duration_s!r} s is too short; give a length above 0 s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopReport:
-    """What came out of one run.
+    """Result of one run.
 
     Attributes:
         outcome: How it ended.
-        reason: In words, for the operator.
-        passive_confirmed: Whether the robot itself said that its motors no longer follow commands; also True
-            where it was never commanded.
+        reason: The reason, for the operator.
+        passive_confirmed: Whether the robot itself reported that its motors no longer follow commands; also
+        True if it was never commanded.
         loop_timing: How regular it was.
-        clipped: Cycles in which each limit changed the command, by limit.
+        clipped: Number of cycles in which a limit changed the command, by limit.
         cycles_sent: Commands sent.
-        error: Name of the error's class where it failed.
+        error: Name of the error's class, after a failure.
     """
 
     outcome: Outcome

@@ -1,4 +1,4 @@
-"""Pacing on absolute deadlines, and the report on how well it went. One class."""
+"""Pacing on absolute deadlines, and the report on its regularity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deal_hw.errors import ConfigurationError
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Median, 99th percentile and largest of a set of durations [s]; NaN of none."""
+    """Median, 99th percentile and maximum of a set of durations [s]; NaN for an empty set."""
 
     p50_s: float
     p99_s: float
@@ -37,7 +37,7 @@ class LoopTimingReport:
     """How regular a run was.
 
     Attributes:
-        rate_hz: The rate asked for [Hz].
+        rate_hz: The requested rate [Hz].
         cycles: Cycles run.
         period: Time from one cycle's start to the next.
         lateness: Time from a cycle's deadline to its start.
@@ -48,7 +48,7 @@ class LoopTimingReport:
         sections: Time spent in each part of a cycle.
         states: State samples received.
         cycles_without_state: Cycles in which no new state had arrived.
-        losses: Hand-overs that the recorder refused.
+        losses: Records that the recorder refused.
         transport_errors: Corrupt frames and gaps in the state's sequence numbers.
         scheduling: What the operating system granted.
     """
@@ -69,7 +69,7 @@ class LoopTimingReport:
     scheduling: str = "default"
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; None for what was never measured."""
+        """Return plain JSON values; None for a value that was never measured."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, dict):
@@ -103,19 +103,19 @@ class LoopTimingReport:
             f"state age   {ms(self.state_age)}",
             f"states      {self.states}, cycles without {self.cycles_without_state}",
             f"link        {self.transport_errors} errors",
-            f"losses      {self.losses} hand-overs to the recorder refused",
+            f"losses      {self.losses} records refused by the recorder",
         ]
 
 
 class LoopTiming:
-    """Paces a loop on absolute deadlines: lateness never adds up, lost periods are skipped.
+    """Paces a loop on absolute deadlines: lateness does not accumulate, lost periods are skipped.
 
     Call :meth:`begin` once a cycle, after :attr:`deadline_ns`; the first call sets the grid of deadlines.
     """
 
     def __init__(self, clock: Clock, rate_hz: float) -> None:
         if not rate_hz > 0:
-            raise ConfigurationError(f"the rate of a loop must be above 0 Hz, not {rate_hz!r}")
+            raise ConfigurationError(f"a loop rate of {rate_hz!r} Hz: give a rate above 0 Hz")
         self._clock = clock
         self._rate_hz = rate_hz
         self._period_ns = round(1e9 / rate_hz)
@@ -135,7 +135,7 @@ class LoopTiming:
 
     @property
     def deadline_ns(self) -> int:
-        """When the next cycle is due [ns]; now before the first."""
+        """Deadline of the next cycle [ns]; before the first one the current time."""
         if self._first_ns is None:
             return self._clock.now_ns()
         return self._first_ns + (self._index + 1) * self._period_ns

@@ -1,7 +1,7 @@
-"""The passive command, repeated until the robot shows it or a stated time is over: the last thing of any run.
+"""Repeats the passive command, at the end of every run, until the robot confirms it or a time limit is over.
 
-It works against a clock, not a count of attempts: a link that is gone as the run ends may come back, and a
-robot that holds its last command would stay stiff for ever.
+The limit is a time, not a number of attempts: a connection that is lost when the run ends may come back, and
+a robot that holds its last command would stay stiff for ever.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from deal_hw.types import Status
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PassiveConfig:
-    """How hard to try."""
+    """Settings of repeating the passive command."""
 
     timeout_s: float = 30.0
-    """How long the command is repeated without a sign of the robot [s]: longer than a network takes to come
-    back (Zenoh goes to its end point once a second; a switch that restarts takes some 20 s)."""
+    """How long the command is repeated without an answer of the robot [s]. This must be longer than a network
+    takes to come back: Zenoh tries its end point once a second, a restarting switch takes about 20 s."""
     confirm_s: float = 0.05
-    """How long to wait for the robot to show each one, and at most to read what waited from before [s]."""
+    """How long to wait for the robot's confirmation of a command, and at most to read older samples [s]."""
     confirmations: int = 3
-    """Commands in a row that the robot must show. A stiff robot that carries nothing looks damped: one state
-    that comes as the link returns, before any command has got through, is no proof (2 of 40 link cuts over
-    DDS left a Go2 on the floor stiff)."""
+    """Number of successive commands that the robot must confirm. A stiff robot without load looks damped, so
+    one state that arrives when the connection returns, before any command, is no proof: with one
+    confirmation, 2 of 40 cuts over DDS left a Go2 on the floor stiff."""
     reopen_s: float = 0.5
-    """Time between two tries to open a transport that is lost [s]."""
+    """Time between two attempts to open a lost transport [s]."""
     silent_s: float = 3.0
-    """Without a state for this long the transport is opened again, even where it reports no error [s]."""
+    """Without a state for this long, the transport is opened again even if it reports no error [s]."""
 
     def __post_init__(self) -> None:
         for field in ("timeout_s", "confirm_s", "reopen_s", "silent_s"):
@@ -61,15 +61,15 @@ def make_passive(
 ) -> bool:
     """Send the passive command until the robot reports that its motors no longer follow commands.
 
-    A send that raises is one failed attempt; the transport is then opened again. Never raises: whoever calls
-    it has something worse at hand.
+    A send that raises is one failed attempt; the transport is then opened again. Never raises, since its
+    callers already handle a worse problem.
 
     Args:
         robot: Connected, or at least with a transport that was open.
         clock: For the waiting.
-        config: How hard to try.
-        progress: Called after each attempt that failed, with what the operator should read, which changes
-            once a second, and with the longest time until the next call [s].
+        config: Settings.
+        progress: Called after each failed attempt, with a text for the operator, which changes once a second,
+        and with the longest time until the next call [s].
         abandoned: Whether the operator gave up; asked after each attempt.
 
     Returns:
@@ -84,7 +84,7 @@ def make_passive(
 
 
 class _Endeavour:
-    """The attempts at making one robot passive, and what is known of the link between them."""
+    """The attempts at making one robot passive, and the state of the connection between them."""
 
     _next_ns: int
     _trouble: Exception | None
@@ -103,11 +103,11 @@ class _Endeavour:
         return self._clock.now_ns() - self._begin_ns >= round(self._config.timeout_s * 1e9)
 
     def attempt(self) -> bool:
-        """Send the command once; return whether the robot has shown often enough that it is passive."""
+        """Send the command once; return whether the robot has confirmed often enough that it is passive."""
         self._next_ns = self._until_ns()
-        # Even a bug in a driver must not keep the next attempt from being made.
+        # Even a bug in a driver must not prevent the next attempt.
         try:
-            # First of all the command: a path that cannot be read may still be written.
+            # The command comes first, since a connection that cannot be read may still be written.
             self._robot.passive()
             confirmed = self._drained() and self._confirmed()
             self._trouble = None
@@ -117,15 +117,15 @@ class _Endeavour:
         return self._shown >= self._config.confirmations
 
     def prepare_next(self) -> None:
-        """Tell, open the transport again where it seems lost, and wait where the attempt took no time.
+        """Report, open the transport again if it seems lost, and wait if the attempt took no time.
 
-        After a command that the robot showed the next one follows at once.
+        After a confirmed command the next one follows at once.
         """
         if self._shown:
             return
         silent = self._clock.now_ns() - self._heard_ns >= round(self._config.silent_s * 1e9)
         if (self._trouble is not None or silent) and self._clock.now_ns() >= self._reopen_ns:
-            # Opening may take seconds where something listens and does not answer.
+            # Opening may take seconds if the other side listens but does not answer.
             self._tell(silence_s=10.0)
             with contextlib.suppress(Exception):
                 self._robot.reopen()
@@ -135,24 +135,24 @@ class _Endeavour:
         self._clock.sleep_until_ns(self._next_ns)
 
     def _until_ns(self) -> int:
-        """Return when the robot has had the time that it is given to show one command."""
+        """Return the end of the robot's time to confirm one command."""
         return self._clock.now_ns() + round(self._config.confirm_s * 1e9)
 
     def _tell(self, silence_s: float) -> None:
         passed_s = (self._clock.now_ns() - self._begin_ns) // 10**9
         left_s = max(round(self._config.timeout_s) - passed_s, 0)
         why = (
-            f"the link is down ({self._trouble})"
+            f"the connection is lost ({self._trouble})"
             if self._trouble is not None
-            else "the robot does not show it"
+            else "the robot does not confirm it"
         )
         text = f"{why}; passive command repeated for {passed_s} s, {left_s} s left"
         self._progress(text, silence_s)
 
     def _drained(self) -> bool:
-        """Forget the samples that waited; return whether the next one comes from after the command.
+        """Drop the waiting samples; return whether the next one is newer than the command.
 
-        A robot that sends faster than it is read must not keep the next command from being sent.
+        A robot that sends faster than it is read must not block the next command.
         """
         until_ns = self._until_ns()
         while self._clock.now_ns() < until_ns:

@@ -1,7 +1,7 @@
 """Standing up before a behaviour and lying down after it, for robots with legs; the safety filter judges it.
 
-A robot with legs starts and ends lying: limp legs then change nothing. Targets move between poses along a
-smooth curve, from the pose that is measured at the first cycle, so that nothing depends on how it lies.
+A robot with legs starts and ends lying, so that limp legs are harmless. Targets move between poses along a
+smooth curve. It starts at the measured pose of the first cycle, so any lying pose is fine.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from deal_hw.types import FloatArray, JointCommand, RobotState
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureConfig:
-    """How long each part takes."""
+    """Durations of the parts."""
 
     fold_s: float = 1.5
     """From the measured pose to the rest pose [s]."""
     rise_s: float = 1.5
     """From the rest pose to the default pose [s]."""
     settle_s: float = 0.5
-    """Held in the default pose before the behaviour begins [s]."""
+    """Time in the default pose before the behaviour begins [s]."""
     lie_s: float = 2.0
-    """From where the behaviour ends to the rest pose [s]."""
+    """From the behaviour's last pose to the rest pose [s]."""
 
     def __post_init__(self) -> None:
         for name in ("fold_s", "rise_s", "settle_s", "lie_s"):
@@ -41,18 +41,18 @@ class PostureConfig:
 
     @property
     def added_s(self) -> float:
-        """Time that standing up and lying down add to the behaviour's [s]."""
+        """Total time of standing up and lying down [s]."""
         return self.before_s + self.lie_s
 
 
 class PostureBehaviour:
-    """Stands up, does what it is given, lies down.
+    """Stands up, runs another behaviour, lies down.
 
     Args:
-        inner: What to do while standing.
+        inner: The behaviour while standing.
         description: The robot; it must have a rest pose.
         seconds: How long ``inner`` runs [s].
-        config: The times of the rest.
+        config: Durations of the other parts.
 
     Raises:
         ConfigurationError: The robot has no rest pose.
@@ -62,7 +62,9 @@ class PostureBehaviour:
         self, inner: Behaviour, description: RobotDescription, seconds: float, config: PostureConfig
     ) -> None:
         if not description.rest_position:
-            raise ConfigurationError(f"robot {description.name!r} has no rest pose to stand up from")
+            raise ConfigurationError(
+                f"robot {description.name!r} has no rest pose to stand up from; use --stand False"
+            )
         index = list(description.actuated_index)
         self._inner, self._description, self._seconds, self._config = inner, description, seconds, config
         self._rest = np.array(description.rest_position)[index]
@@ -82,12 +84,12 @@ class PostureBehaviour:
         return self._seconds + self._config.added_s
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Restart from the beginning."""
         self._inner.reset()
         self._start, self._last = None, self._default
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
-        """Return the command of the part that it is time for."""
+        """Return the command of the current part."""
         c = self._config
         if self._start is None:
             self._start = state.position[self._index]
@@ -98,7 +100,7 @@ class PostureBehaviour:
         since_s = time_s - c.before_s
         if since_s < self._seconds:
             command = self._inner.command(state, since_s)
-            # A target that is not a number trips the safety module; lying down must not begin at it.
+            # A NaN target trips the safety module; lying down must not start from it.
             if np.isfinite(command.position_target).all():
                 self._last = command.position_target
             return command

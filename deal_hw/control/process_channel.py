@@ -1,7 +1,7 @@
 """Channels out of the control process: cycles to the recorder, heartbeats and the report to the supervisor.
 
-Both are Unix sockets of whole datagrams (SOCK_SEQPACKET). The control process never waits on them: what the
-peer does not take at once is refused and counted.
+Both are Unix sockets of whole datagrams (SOCK_SEQPACKET). The control process never waits for them: a
+datagram that the peer does not take at once is refused and counted.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.errors import ConfigurationError, DatasetError
 
 BUFFER_BYTES = 1 << 20
-"""Asked of the kernel for the recorder's socket; it grants up to net.core.wmem_max, twice 208 kB by
+"""Requested buffer of the recorder's socket; the kernel grants up to net.core.wmem_max, twice 208 kB by
 default."""
 _MOST_REFUSED = 50
-"""So many refusals in a row (one second at 50 Hz) mean that nobody records: the run ends."""
+"""After this many successive refusals (one second at 50 Hz) the recorder is considered dead, and the run
+ends."""
 _MOST_WORD = 256
 STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, MAKING_PASSIVE, HANDING_BACK = (
     "starting",
@@ -32,9 +33,9 @@ STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, MAKING_PASSIVE, HANDING_
     "making passive",
     "handing back",
 )
-"""Phases of a run, in order; cycles run in RUNNING. A phase is told before what it names happens."""
+"""Phases of a run, in order; cycles run in RUNNING. A phase is reported before it begins."""
 HEARTBEAT = "\0"
-"""The word by which the supervisor says that it lives."""
+"""The supervisor's heartbeat."""
 _BEAT = struct.Struct("<cqdI")
 
 
@@ -54,10 +55,10 @@ class RecordSender:
         self._refused_in_a_row = 0
 
     def __call__(self, record: CycleRecord) -> bool:
-        """Send a record; return False where the recorder's queue is full.
+        """Send a record; return False if the recorder's queue is full.
 
         Raises:
-            DatasetError: The recorder is gone, or has taken nothing for a second.
+            DatasetError: The recorder has ended, or has taken no record for a second.
         """
         try:
             self._socket.send(encode(record))
@@ -65,13 +66,14 @@ class RecordSender:
             self._refused_in_a_row += 1
             if self._refused_in_a_row >= _MOST_REFUSED:
                 raise DatasetError(
-                    f"the recorder has refused the last {self._refused_in_a_row} cycles: "
-                    "the disk is too slow or hangs"
+                    f"the recorder has refused the last {self._refused_in_a_row} cycles: the disk is too "
+                    "slow or hangs; record to another disk"
                 ) from None
             return False
         except OSError as err:
             raise DatasetError(
-                f"the recorder is gone ({err.strerror}); what it had written is whole"
+                f"the recorder has ended ({err.strerror}); its recording up to then is complete; check "
+                "disk and memory, then record again"
             ) from err
         self._refused_in_a_row = 0
         return True
@@ -82,9 +84,9 @@ class Beat:
     """One heartbeat.
 
     Attributes:
-        stamp_ns: When it was sent, on the machine's monotonic clock, which all processes share [ns].
+        stamp_ns: Send time on the machine's monotonic clock, which all processes share [ns].
         silence_s: The longest time until the next one [s].
-        phase: What the control process is doing.
+        phase: Phase of the control process.
         count: Heartbeats before this one in the same phase.
     """
 
@@ -108,7 +110,7 @@ class StatusSender:
         self._count = 0
 
     def beat(self, stamp_ns: int, phase: str, silence_s: float) -> None:
-        """Send a heartbeat; without a supervisor there is nobody to tell."""
+        """Send a heartbeat; without a supervisor it is dropped."""
         self._count = self._count + 1 if phase == self._phase else 0
         self._phase = phase
         try:
@@ -121,7 +123,7 @@ class StatusSender:
         return self._socket.fileno()
 
     def heard(self) -> list[str]:
-        """Return what the supervisor told since the last call; never waits."""
+        """Return the supervisor's messages since the last call; never waits."""
         words: list[str] = []
         try:
             while word := self._socket.recv(_MOST_WORD, socket.MSG_DONTWAIT):
@@ -131,7 +133,7 @@ class StatusSender:
         return words
 
     def result(self, values: dict[str, Any]) -> None:
-        """Send the run's result as JSON; may wait a second, for the robot is passive by then."""
+        """Send the run's result as JSON; may wait a second, since the robot is already passive."""
         self._socket.settimeout(1.0)
         try:
             self._socket.send(b"R" + json.dumps(values).encode())
@@ -158,17 +160,18 @@ class StatusReceiver:
         self._socket.close()
 
     def tell(self, text: str) -> None:
-        """Send a word to the control process; what it does not take at once is lost."""
+        """Send a message to the control process; one that it does not take at once is lost."""
         with contextlib.suppress(OSError):
             self._socket.send(text.encode()[:_MOST_WORD], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
     def receive(self) -> Beat | dict[str, Any] | None:
-        """Return the next heartbeat or result; None when there is none at hand."""
+        """Return the next heartbeat or result; None if none is waiting."""
         try:
             try:
                 datagram = self._socket.recv(1 << 18)
             except ConnectionResetError:
-                # It closed with words of ours unread: the kernel says so once, ahead of its last words.
+                # It closed without reading all our messages; the kernel reports that once, before its last
+                # messages.
                 datagram = self._socket.recv(1 << 18)
         except BlockingIOError:
             return None

@@ -1,4 +1,4 @@
-"""What a process with a deadline asks of the operating system."""
+"""Real-time scheduling and memory locking for a process with deadlines."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
-"""Sent by the kernel when the parent dies; nobody else sends it, so the record names the true reason."""
+"""Sent by the kernel when the parent dies; no other sender exists, so the recorded reason is true."""
 FIFO_PRIORITY = 50
 SUPERVISOR_PRIORITY = FIFO_PRIORITY + 1
-"""Above the control process, which it must be able to kill when that one does not let go of a processor."""
+"""Above the control process, since it must be able to kill one that blocks a processor."""
 TRANSPORT_PRIORITY = FIFO_PRIORITY - 10
-"""Of the threads of a supervisor's transport: its damping must go out on a busy machine, too."""
+"""Priority of the supervisor's transport threads, since its damping must be sent on a busy machine, too."""
 _MCL_ONFAULT = 4
 
 
@@ -28,8 +28,8 @@ class Granted:
     """What the operating system granted.
 
     Attributes:
-        scheduling: Scheduling and memory, in words for the report on loop timing.
-        warnings: What it refused, with the remedy; empty where all was granted.
+        scheduling: Scheduling and memory, as text for the report on loop timing.
+        warnings: Refused requests with their remedy; empty if all were granted.
     """
 
     scheduling: str
@@ -39,13 +39,14 @@ class Granted:
 def become_realtime() -> Granted:
     """Ask for SCHED_FIFO and locked memory and freeze the garbage collector; call once, after all imports.
 
-    What is refused is a warning, never an error: the loop still runs, only less regularly.
+    A refusal is a warning, not an error: the loop still runs, but less regularly.
     """
     words: list[str] = []
     warnings: list[str] = []
     gc.collect()
     gc.freeze()
-    # Before SCHED_FIFO: locking reads in every page of every library and must hold up nobody with a deadline.
+    # Before SCHED_FIFO: locking reads every page of every library, which must not delay a process with a
+    # deadline.
     memory_refused = _lock_memory()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
@@ -53,27 +54,27 @@ def become_realtime() -> Granted:
     except OSError as err:
         words.append("default")
         warnings.append(
-            f"SCHED_FIFO was refused ({err.strerror}); expect late cycles under load. "
-            "Remedy: an rtprio line for this user in /etc/security/limits.conf, or CAP_SYS_NICE"
+            f"SCHED_FIFO was refused ({err.strerror}): expect late cycles under load. Remedy: an rtprio "
+            "line for this user in /etc/security/limits.conf, or CAP_SYS_NICE"
         )
     if memory_refused is None:
         words.append("mlockall")
     else:
         warnings.append(
-            f"mlockall was refused ({memory_refused}); a page fault may delay a cycle. "
-            "Remedy: a memlock line for this user in /etc/security/limits.conf, or CAP_IPC_LOCK"
+            f"mlockall was refused ({memory_refused}): a page fault may delay a cycle. Remedy: a memlock "
+            "line for this user in /etc/security/limits.conf, or CAP_IPC_LOCK"
         )
     return Granted(" + ".join(words), tuple(warnings))
 
 
 @contextlib.contextmanager
 def priority(level: int, *, children: bool = False, lock: bool = False) -> Iterator[None]:
-    """Run the calling thread under SCHED_FIFO inside the block where permitted; quietly not elsewhere.
+    """Run the calling thread under SCHED_FIFO inside the block if permitted; otherwise do nothing.
 
     Args:
         level: The priority.
-        children: Whether threads and processes that are started inside get it, too.
-        lock: Whether the pages that are in memory stay there, so that the process is not swapped out.
+        children: Whether threads and processes started inside inherit it.
+        lock: Whether to keep the process's pages in memory, so that it is not swapped out.
     """
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     policy = os.SCHED_FIFO | (0 if children else os.SCHED_RESET_ON_FORK)
@@ -92,10 +93,10 @@ def priority(level: int, *, children: bool = False, lock: bool = False) -> Itera
 
 
 def hurry(pid: int) -> None:
-    """Let the threads of a process run ahead of ordinary ones where permitted: a killed one is gone sooner.
+    """Give the threads of a process real-time priority if permitted, so that a killed process ends sooner.
 
-    It is gone only once each of its threads has run once more. On a busy machine those of ordinary priority,
-    as a network's runtime has some, take hundreds of ms for that.
+    It ends only after each of its threads has run once more. On a busy machine threads of ordinary priority,
+    such as those of a network's runtime, take hundreds of ms.
     """
     with contextlib.suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):
@@ -104,7 +105,7 @@ def hurry(pid: int) -> None:
 
 
 def _lock_memory() -> str | None:
-    """Lock the process's memory; return why not."""
+    """Lock the process's memory; return the reason of a refusal."""
     # With MCL_FUTURE under a finite limit, a later allocation beyond it fails and kills the loop in the
     # middle of a run; so future pages are locked only where there is no limit.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or os.geteuid() == 0
@@ -117,19 +118,19 @@ def _lock_memory() -> str | None:
 def die_with_parent(parent_pid: int) -> None:
     """Have the kernel send ``PARENT_DIED`` when the parent dies, so that the loop ends by its passive route.
 
-    The signal's number is the only safe news: where the parent has several threads, the first of them to end
-    sends it, and ``getppid`` still names the parent then.
+    Only the signal's number is reliable: with several threads in the parent, the first one to end sends it,
+    and ``getppid`` still names the parent.
 
     Args:
         parent_pid: The parent's process id, as the parent gave it.
 
     Raises:
-        ProcessLookupError: The parent is gone already.
+        ProcessLookupError: The parent has already ended.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, PARENT_DIED, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    # The parent may have died before the call above: then no signal ever comes.
+    # The parent may have died before the call above; then no signal ever comes.
     if os.getppid() != parent_pid:
         raise ProcessLookupError(f"the parent process {parent_pid} is gone")
 

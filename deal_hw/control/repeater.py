@@ -1,4 +1,4 @@
-"""Sends the command in force again and again, for robots that want it faster than it changes."""
+"""Repeats the current command, for robots that need it at a higher rate than it changes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from deal_hw.robot import Robot
 
 
 class Repeater:
-    """Knows when the command in force is due again; in the same thread as the loop, between its cycles.
+    """Repeats the current command when it is due; in the loop's thread, between its cycles.
 
-    A robot's drives follow the last command for ever, but want to hear it often: what is repeated is the same
-    command, so that recording and calibration see one command a cycle.
+    A robot's drives hold the last command for ever, but need it often. The same command is repeated, so
+    recording and calibration have one command per cycle.
 
     Attributes:
-        sent_ns: When a command was last sent, new or again [ns]; -1 before the first.
+        sent_ns: Time of the last sent command, new or repeated [ns]; -1 before the first.
 
     Args:
         robot: The robot; ``description.repeat_rate_hz`` 0 means that nothing is repeated.
@@ -28,7 +28,7 @@ class Repeater:
         self.sent_ns = -1
 
     def note_sent(self, now_ns: int) -> None:
-        """A new command went out."""
+        """Note that a new command was sent."""
         self.sent_ns = now_ns
         self._due_ns = now_ns + self._period_ns if self._period_ns else -1
 
@@ -37,11 +37,11 @@ class Repeater:
         self._due_ns = -1
 
     def wake_ns(self, deadline_ns: int) -> int:
-        """Return when to wake up at the latest, at most ``deadline_ns`` [ns]."""
+        """Return the latest wake-up time, at most ``deadline_ns`` [ns]."""
         return deadline_ns if self._due_ns < 0 else min(deadline_ns, self._due_ns)
 
     def repeat_if_due(self) -> None:
-        """Send the command again if its time has come; periods that were missed are skipped."""
+        """Send the command again if it is due; missed periods are skipped."""
         now_ns = self._clock.now_ns()
         if self._due_ns < 0 or now_ns < self._due_ns:
             return

@@ -1,4 +1,4 @@
-"""How far a replayed recording's motion is from the recorded one."""
+"""Difference between a replayed motion and the recorded one."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def replay_error(recorded: Trajectory, replayed: Trajectory, before_s: float = 0
     """Compare positions from the first command on, by the host's clock.
 
     Args:
-        recorded: What was replayed.
+        recorded: The original recording.
         replayed: The recording of the replay.
-        before_s: Time that standing up took in the replay [s].
+        before_s: Duration of standing up in the replay [s].
 
     Returns:
-        None where the two have fewer than two samples in common.
+        None if the two have fewer than two samples in common.
     """
     if not recorded.sent_s.size or not replayed.sent_s.size:
         return None

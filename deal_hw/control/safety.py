@@ -1,7 +1,8 @@
 """Safety between policy and motors: checks each cycle, clips what can be clipped, trips on the rest.
 
 Pure: no I/O, no torch, and time is an argument. Limits are data of the robot (``description.limits``).
-Clipping changes a command and says so; a trip sends nothing more, latches and gives its reason in words.
+Clipping changes a command and reports it. A trip sends no more commands, latches and gives its reason as
+text.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ _DRIFT = 5e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyConfig:
-    """What the safety module allows beyond the limits of the robot."""
+    """Limits of the safety module beside those of the robot."""
 
     clock_jump_s: float = 0.1
     """A device clock that runs ahead of the host's by this much has jumped [s]."""
     transport_error_window_s: float = 1.0
     """Time over which transport errors are counted [s]."""
     link_error_share: float = 0.3
-    """Errors in the window over state frames due in it that trip; a corrupt frame counts twice (itself, its
-    gap)."""
+    """Share of errors among the state frames due in the window that trips; a corrupt frame counts twice
+    (itself and its gap)."""
     confirm_s: float = 0.2
     """The device must report itself armed within this time after arming [s]."""
 
@@ -47,17 +48,17 @@ class SafetyConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CycleInput:
-    """What the safety module needs to know about one cycle.
+    """Inputs of the safety module in one cycle.
 
     Attributes:
         now_ns: Host clock [ns].
         state: The newest state; None before the first.
         action_age_ns: How long the policy took [ns].
-        transport_errors: Link errors since the connection, as the robot counts them.
-        stop_reason: Why the operator, or somebody for them, asked to stop; "" where nobody did.
-        fault: What the driver saw that forbids going on; "" for nothing.
-        command_age_ns: Time since a command was last sent, a repeated one included [ns]; -1: none yet. It
-            counts on robots with legs only.
+        transport_errors: Transport errors since the connection, as the robot counts them.
+        stop_reason: Reason of a requested stop, by the operator or on their behalf; "" without one.
+        fault: A problem seen by the driver that forbids to continue; "" for none.
+        command_age_ns: Time since the last sent or repeated command [ns]; -1: none yet. Used on robots with
+        legs only.
     """
 
     now_ns: int
@@ -71,14 +72,14 @@ class CycleInput:
 
 @dataclass(frozen=True, slots=True)
 class SafetyDecision:
-    """What the safety module decided in one cycle.
+    """Decision of the safety module in one cycle.
 
     Attributes:
         state: The state after the cycle.
-        command: What may be sent; None where nothing may be (not finite, or passive).
+        command: The command that may be sent; None if none may be (not finite, or passive).
         clipped: Names of the limits that changed the command.
-        flags: What was wrong, whether it tripped or, while disarmed, only would have.
-        reason: Why it is passive, in words; "" otherwise.
+        flags: Failed checks. While disarmed they do not trip.
+        reason: Why it is passive, as text; "" otherwise.
     """
 
     state: SafetyState
@@ -97,7 +98,7 @@ class Safety:
     """Checks and filters the commands for one robot."""
 
     _start: FloatArray
-    """Where easing in starts, (A,); from arming on."""
+    """Start of easing in, (A,); set at arming."""
 
     def __init__(self, description: RobotDescription, config: SafetyConfig | None = None) -> None:
         self._description = description
@@ -128,14 +129,14 @@ class Safety:
 
     @property
     def state(self) -> SafetyState:
-        """Where the state machine stands."""
+        """State of the state machine."""
         return self._machine.state
 
     def arm(self, cycle: CycleInput) -> None:
         """Allow commands from now on; the measured position is the first target.
 
         Raises:
-            SafetyError: Not DISARMED, or something is wrong already; the message says what.
+            SafetyError: Not DISARMED, or a check failed already; the message names it.
         """
         self._reset(cycle.now_ns)
         wrong = self._failures(cycle, None, arming=True)
@@ -148,8 +149,8 @@ class Safety:
         """Judge one cycle.
 
         Args:
-            cycle: What is known.
-            wanted: The command asked for; None where there is none yet.
+            cycle: The cycle's inputs.
+            wanted: The requested command; None if there is none yet.
         """
         self._begin(cycle)
         failures = self._failures(cycle, wanted)
@@ -165,7 +166,7 @@ class Safety:
         return SafetyDecision(state, command, clipped, flags.raised, self.reason)
 
     def stop(self, reason: str) -> None:
-        """Go passive for a reason that is no failure of a check, such as the end of the run."""
+        """Go passive without a failed check, such as at the end of the run."""
         if self.state is not SafetyState.PASSIVE:
             self.reason = reason
         self._machine.stop()
@@ -180,8 +181,8 @@ class Safety:
         self.reason = ""
 
     def _begin(self, cycle: CycleInput) -> None:
-        # To arm a robot with legs takes seconds, in which it may sink: easing in starts where it is found in
-        # the first cycle after that.
+        # Arming a robot with legs takes seconds, in which it may sink. Easing in therefore starts from its
+        # pose in the first cycle after that.
         if self._legs is None or not self.state.armed or self._first_ns is not None:
             return
         self._first_ns = cycle.now_ns
@@ -205,7 +206,7 @@ class Safety:
     def _failures(
         self, cycle: CycleInput, wanted: JointCommand | None, *, arming: bool = False
     ) -> dict[str, str]:
-        """Return flag name -> reason in words for all that is wrong."""
+        """Return flag name -> reason as text for each failed check."""
         found: dict[str, str] = {}
         limits = self._description.limits
         if cycle.stop_reason:
@@ -230,8 +231,8 @@ class Safety:
         return found
 
     def _check_age(self, now_ns: int, state: RobotState, found: dict[str, str]) -> None:
-        # Data that waited in a buffer carry a fresh receive stamp: only the device's clock gives them away.
-        # So the age counts from the least transit time seen, which may creep up by the clocks' drift.
+        # Data that waited in a buffer have a new receive stamp; only the device's clock shows their age. The
+        # age therefore counts from the smallest transit time so far, which may rise by the clocks' drift.
         offset = state.receive_ns - state.device_ns
         if self._offset_ns is None:
             self._offset_ns, self._offset_at_ns = offset, state.receive_ns
@@ -249,11 +250,12 @@ class Safety:
 
     def _check_status(self, now_ns: int, status: Status, found: dict[str, str]) -> None:
         if Status.FAULT in status:
-            # What the driver saw says more.
+            # The driver's own text is more precise.
             found.setdefault("device_fault", "the device reports a fault")
         if not self.state.armed:
             return
-        # Samples from before the arming may still be under way: its status counts once it has confirmed.
+        # Samples from before the arming may still arrive, so the status counts only after the device has
+        # confirmed the arming.
         self._seen_armed = self._seen_armed or (Status.ARMED in status and Status.WATCHDOG not in status)
         if not self._seen_armed and now_ns - self._armed_ns < self._config.confirm_s * 1e9:
             return
@@ -292,8 +294,8 @@ class Safety:
             )
 
     def _check_command_age(self, cycle: CycleInput, found: dict[str, str]) -> None:
-        # A robot that holds its last command for ever must not be left with one. Counted from the first cycle
-        # after arming at the earliest: what was sent before that is another run's.
+        # A robot that holds its last command for ever must not be left with one. The time counts from the
+        # first cycle after arming at the earliest, since earlier commands belong to another run.
         if self._first_ns is None or not self.state.armed:
             return
         age_ns = cycle.now_ns - self._first_ns

@@ -1,4 +1,4 @@
-"""The safety filter: clips a command to the robot's limits and says what it clipped. Pure, no I/O."""
+"""The safety filter: clips a command to the robot's limits and reports the clipping. Pure, no I/O."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ def keep_effort(
     most: FloatArray,
     span: tuple[FloatArray, FloatArray],
 ) -> tuple[JointCommand, tuple[str, ...]]:
-    """Return a command whose predicted effort is at most ``most``, and the names of what was changed.
+    """Return a command whose predicted effort is at most ``most``, and the names of the changed parts.
 
-    Predicted is what the drive would do now: kp (q* - q) + kd (dq* - dq) + feed-forward. What exceeds the
-    limit is taken from the parts that push that way, one after another and none past zero: the position
-    target moves towards the measured position, then feed-forward and velocity target shrink, then, for the
-    spring of a joint that is outside ``span`` and for the braking of a fast joint, the gains. The velocity
-    target is never moved towards a measured velocity: a joint that has slowed down would still be driven.
+    The predicted effort is that of the drive now: kp (q* - q) + kd (dq* - dq) + feed-forward. The excess is
+    removed from the parts that push in its direction, one after another and none past zero. First the
+    position target moves towards the measured position, then feed-forward and velocity target shrink. Last,
+    for the spring of a joint outside ``span`` and for the braking of a fast joint, the gains shrink. The
+    velocity target never moves towards a measured velocity: it would still drive a joint that has slowed
+    down.
 
     Args:
         command: A finite command, its target inside ``span``; arrays (A,).
@@ -58,11 +59,11 @@ def keep_effort(
     if not (np.abs(total) > most).any():
         return command, ()
     sign = np.sign(total)
-    # A little less than the limit: rounding must not make a second part pay for the first.
+    # Slightly below the limit, so that rounding does not reduce a second part.
     goal = most * (1.0 - 1e-9)
 
     def share(part: FloatArray) -> FloatArray:
-        """Return how much of a part of the effort may stay, 0..1."""
+        """Return the share of a part of the effort that may stay, 0..1."""
         part, now = sign * part, sign * effort()
         taken = np.minimum(now - goal, part)
         return np.divide(part - taken, part, out=np.ones_like(part), where=(now > most) & (part > 0.0))
@@ -101,7 +102,7 @@ class SafetyFilter:
         self._effort = None if legs is None else np.asarray(legs.effort)
 
     def accepts(self, command: JointCommand) -> bool:
-        """Return whether every number is finite, but for limits of speed and effort that a robot lacks."""
+        """Return whether every number is finite, except the speed or effort limits a robot lacks."""
         limited = {
             name: np.where(sent == self._maxima[name], 0.0, sent)
             for name in ("speed_limit", "effort_limit")
@@ -114,8 +115,8 @@ class SafetyFilter:
     ) -> tuple[JointCommand, tuple[str, ...]]:
         """Return the command inside all limits, and the names of the limits that changed it.
 
-        The absolute limit is applied after step and distance, so that it holds whatever they ask for; the
-        limit of the predicted effort (robots with legs) comes last and leaves no other but the step's.
+        The absolute limit is applied after step and distance, so that it always holds. The limit of the
+        predicted effort (robots with legs) comes last; after it all others hold except that of the step.
 
         Args:
             wanted: A finite command.

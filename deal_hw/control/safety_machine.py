@@ -1,11 +1,10 @@
-"""The safety state machine: pure, with settable time, on flags whose False means no failure.
+"""The safety state machine: pure, with time as an argument, on flags whose False means no failure.
 
     DISARMED --arm--> EASING_IN --time--> ACTIVE
                           |                  |
                           +--- any flag -----+--> PASSIVE (latched) --rearm--> DISARMED
 
-Nothing leaves PASSIVE but an explicit re-arm, and a re-arm leads to DISARMED only: arming is a second
-decision.
+Only an explicit re-arm leaves PASSIVE. It leads to DISARMED, so arming is a second decision.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from deal_hw.errors import SafetyError
 
 
 class SafetyState(enum.Enum):
-    """Whether commands may reach the robot, and how."""
+    """Whether commands may reach the robot."""
 
     DISARMED = "disarmed"
-    """Nothing is sent."""
+    """No command is sent."""
     EASING_IN = "easing in"
     """Targets move from the measured pose towards the policy's."""
     ACTIVE = "active"
@@ -36,34 +35,34 @@ class SafetyState(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyFlags:
-    """What can be wrong in one cycle; False means no failure. Reasons are named in this order.
+    """Possible failures in one cycle; False means no failure. Reasons are listed in this order.
 
     Attributes:
         operator_stop: The operator asked to stop.
         no_state: No state sample has arrived yet.
-        state_stale: The newest state is too old, or was held up on its way.
+        state_stale: The newest state is too old, or was delayed on its way.
         clock_jump: The device's clock jumped, as after a restart.
-        device_fault: The device reports a fault, or the driver saw what forbids going on.
-        device_watchdog: The device stopped its motors because commands stayed away.
-        device_disarmed: The device says that its motors do not follow commands.
+        device_fault: The device reports a fault, or the driver saw a problem that forbids to continue.
+        device_watchdog: The device stopped its motors because no commands arrived.
+        device_disarmed: The device reports that its motors do not follow commands.
         position: A joint is outside its trip range.
         velocity: A joint is faster than its trip speed.
-        state_not_finite: The state holds NaN or infinity.
-        body_missing: A robot with legs reports nothing of its body.
+        state_not_finite: The state contains NaN or infinity.
+        body_missing: A robot with legs reports no state of its body.
         body_not_finite: The inertial sensor reports NaN or infinity.
         orientation: The orientation is no unit quaternion.
         tilt: The base leans too far.
         tumble: The base turns too fast.
         free_fall: The robot has been falling for too long.
         flail: A joint has been fast for too long.
-        motor_temperature: A motor is too hot, or does not know.
+        motor_temperature: A motor is too hot, or its temperature is unknown.
         lost_commands: A motor misses too many commands.
         battery_low: The battery is too empty; arming asks for more.
         voltage_low: The supply voltage is too low; arming asks for more.
-        action_not_finite: The command asked for holds NaN or infinity.
+        action_not_finite: The requested command contains NaN or infinity.
         action_late: The policy took too long.
         transport_errors: Too large a share of the state frames is corrupt or lost.
-        command_stale: A robot with legs has not been sent a command for too long.
+        command_stale: No command has been sent to a robot with legs for too long.
     """
 
     operator_stop: bool = False
@@ -99,7 +98,7 @@ class SafetyFlags:
 
 
 class SafetyMachine:
-    """The state machine alone: it knows no robot and reads no clock.
+    """The state machine alone, without a robot or a clock.
 
     Args:
         ease_in_ns: Time from arming to full authority [ns].
@@ -117,16 +116,16 @@ class SafetyMachine:
             SafetyError: The machine is not DISARMED.
         """
         if self.state is not SafetyState.DISARMED:
-            raise SafetyError(f"cannot arm while {self.state.value}: re-arm explicitly first")
+            raise SafetyError(f"cannot arm in state {self.state.value}: re-arm explicitly first")
         self._armed_ns = now_ns
         self.state = SafetyState.EASING_IN
 
     def restart(self, now_ns: int) -> None:
-        """Count the time of easing in from now on."""
+        """Restart the time of easing in."""
         self._armed_ns = now_ns
 
     def update(self, now_ns: int, flags: SafetyFlags) -> SafetyState:
-        """Move on by one cycle: trip on any flag, else finish easing in when its time is over."""
+        """Advance by one cycle: trip on any flag, else finish easing in after its time."""
         if self.state.armed and flags.raised:
             self.state = SafetyState.PASSIVE
         elif self.state is SafetyState.EASING_IN and now_ns - self._armed_ns >= self._ease_in_ns:
@@ -134,7 +133,7 @@ class SafetyMachine:
         return self.state
 
     def authority(self, now_ns: int) -> float:
-        """Return the share of the policy's wish that is granted: 0 at arming, 1 once ACTIVE."""
+        """Return the share of the policy's command that is applied: 0 at arming, 1 in ACTIVE."""
         if self.state is SafetyState.EASING_IN:
             return (now_ns - self._armed_ns) / self._ease_in_ns
         return 1.0
@@ -144,11 +143,11 @@ class SafetyMachine:
         self.state = SafetyState.PASSIVE
 
     def rearm(self) -> None:
-        """Leave PASSIVE for DISARMED; the one way out of the latch.
+        """Leave PASSIVE for DISARMED, the only way out of the latch.
 
         Raises:
             SafetyError: The machine is armed.
         """
         if self.state.armed:
-            raise SafetyError(f"cannot re-arm while {self.state.value}: stop first")
+            raise SafetyError(f"cannot re-arm in state {self.state.value}: stop first")
         self.state = SafetyState.DISARMED

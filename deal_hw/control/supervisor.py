@@ -1,9 +1,9 @@
-"""The supervisor: starts the control process, watches it, and makes the robot passive where it no longer can.
+"""The supervisor: starts and watches the control process, and makes the robot passive if that one cannot.
 
-It owns the port for as long as it lives, so that nobody else takes the robot, and so that the passive command
-can still be sent once the control process is dead. It never sends while the control process lives: two
-writers on one port would tear each other's frames. It sends nothing at all where the control process had not
-set out to command the robot. The control process watches it in turn (:mod:`deal_hw.control.vigil`).
+It owns the port as long as it lives. No other program can then take the robot, and the passive command can
+still be sent after the control process has died. It never sends while the control process lives: two writers
+on one port would corrupt each other's frames. It sends nothing if the control process had not begun to
+command the robot. The control process also watches the supervisor ( :mod:`deal_hw.control.vigil`).
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ OPERATOR = "stopped by the operator"
 SUSPENDED = "suspended by the operator (Ctrl-Z)"
 _POLL_S = 0.05
 _MOST_STOPS = 3
-"""After so many wishes of the operator to stop, the next one ends the repeating of the passive command."""
+"""After this many stop requests of the operator, the next one ends the repeating of the passive command."""
 _GRACE_S = 3.0
-"""How long a control process may take to exit after it closed its end [s]."""
+"""How long a control process may take to exit after it closed its end of the channel [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +51,13 @@ class ChildEnd:
     """How the control process ended.
 
     Attributes:
-        result: What it reported; None where it died without a word.
-        exit_code: As ``subprocess`` gives it: negative for a signal.
-        killed: Why the supervisor killed it; "" where it did not.
-        stop_cause: Why the supervisor asked it to stop; "" where it did not.
+        result: Its report; None if it died without one.
+        exit_code: As in ``subprocess``: negative for a signal.
+        killed: Why the supervisor killed it; "" if it did not.
+        stop_cause: Why the supervisor asked it to stop; "" if it did not.
         passive_confirmed: Whether the robot itself confirmed that it is passive.
         recorder: How the recording ended; None without a recorder.
-        signal: Name of the signal by which the operator ended it, such as "SIGINT"; "" where there was none.
+        signal: Name of the signal by which the operator ended it, such as "SIGINT"; "" without one.
     """
 
     result: dict[str, Any] | None
@@ -75,10 +75,10 @@ class Supervisor:
     Args:
         module: The control process's module, run with ``python -m``.
         plan: Its orders, as plain JSON values; it reads them from its standard input.
-        port_fd: The open port, which it inherits; None where each process opens its own path.
+        port_fd: The open port, which it inherits; None if each process opens its own connection.
         passive: Sends the passive command through the port and returns whether the robot confirmed it. Called
-            only once the control process is dead, with the phase in which it died and with whether it tried
-            the same in vain; whether anything is to be sent is for the function to say.
+        only after the control process has died, with its last phase and whether it tried the same in vain.
+        The function decides whether to send.
         recorder: The recorder, ready; None to record nothing.
         on_beat: Called with each heartbeat.
         clock: For heartbeats; the machine's monotonic clock by default.
@@ -110,7 +110,7 @@ class Supervisor:
         self._phase = STARTING
 
     def run(self) -> ChildEnd:
-        """Start the control process, watch it to its end, see to the robot and to the recording."""
+        """Run the control process to its end, then make the robot passive and close the recording."""
         with self._operator_stops(), priority(SUPERVISOR_PRIORITY, lock=True):
             child, status = self._start()
             try:
@@ -119,7 +119,7 @@ class Supervisor:
                 self._kill(child, "the supervisor failed")
                 raise
             finally:
-                # Whatever went wrong up here: no control process is left alone, and the robot comes first.
+                # After any error here: no control process may stay alone, and the robot comes first.
                 exit_code = self._reap(child)
                 confirmed = bool(self._result and self._result.get("passive_confirmed"))
                 confirmed = confirmed or self._passive(self._phase, self._result is not None)
@@ -131,11 +131,11 @@ class Supervisor:
 
     @property
     def abandoned(self) -> bool:
-        """Whether the operator has asked so often that even the passive command is given up."""
+        """Whether the operator has asked so often that even the passive command ends."""
         return self._stops > _MOST_STOPS
 
     def stop(self, cause: str) -> None:
-        """Ask the control process to end by its passive route; the operator's second wish kills it."""
+        """Ask the control process to end by its passive route; the operator's second request kills it."""
         self._stops += 1
         again, self._stop_cause = bool(self._stop_cause), self._stop_cause or cause
         child = self._child
@@ -147,7 +147,7 @@ class Supervisor:
             self._kill(child, "the operator asked twice")
 
     def tell(self, text: str) -> None:
-        """Pass a word of the operator on to the control process, such as a key; safe from another thread."""
+        """Pass a message of the operator to the control process, such as a key; safe from another thread."""
         if self._status is not None:
             self._status.tell(text)
 
@@ -166,7 +166,7 @@ class Supervisor:
             inherited.append(record.fileno())
             plan["record_fd"] = record.fileno()
         with sender:
-            # A process group of its own: Ctrl-C in the terminal reaches the supervisor alone, which passes it
+            # In its own process group: Ctrl-C in the terminal reaches only the supervisor, which passes it
             # on.
             child = subprocess.Popen(
                 [sys.executable, "-m", self._module],
@@ -187,7 +187,7 @@ class Supervisor:
         return child, self._status
 
     def _watch(self, child: subprocess.Popen[bytes], status: StatusReceiver) -> None:
-        """Return when the control process has said its last word, has died or was killed."""
+        """Return after the control process has sent its last message, has died or was killed."""
         while status.open:
             if (now_ns := self._clock.now_ns()) >= self._beat_ns:
                 status.tell(HEARTBEAT)
@@ -196,10 +196,10 @@ class Supervisor:
             if select.select([status], [], [], min(_POLL_S, max(left_s, 0.0) + 1e-3))[0]:
                 while (message := status.receive()) is not None:
                     self._take(message)
-            # Only after a wait that brought nothing: a supervisor that was itself held up finds old beats
+            # Only after a wait without messages: a supervisor that was itself delayed finds old heartbeats
             # first.
             elif self._clock.now_ns() > self._stale_ns:
-                self._kill(child, f"it gave no sign of life while {self._phase}")
+                self._kill(child, f"it sent no heartbeat while {self._phase}")
                 return
             if self._recorder is not None and not self._stop_cause and (errors := self._recorder.errors()):
                 self.stop(f"the recorder failed: {errors[0]}")
@@ -212,23 +212,23 @@ class Supervisor:
             self._result = message
 
     def _kill(self, child: subprocess.Popen[bytes], why: str) -> None:
-        # SIGKILL also ends a process that was stopped by SIGSTOP.
+        # SIGKILL also ends a process stopped by SIGSTOP.
         self._killed = self._killed or why
         child.kill()
         hurry(child.pid)
 
     def _reap(self, child: subprocess.Popen[bytes]) -> int:
-        """Return the exit code of the control process, which has said its last word or never will."""
+        """Return the exit code of the control process, which sends no more messages."""
         try:
-            # A wait with a limit polls with pauses of up to 50 ms: a robot may be stiff meanwhile.
+            # A wait with a limit polls with pauses of up to 50 ms, in which a robot may be stiff.
             return child.wait() if self._killed else child.wait(_GRACE_S)
         except subprocess.TimeoutExpired:
-            self._kill(child, "it did not end after its last word")
+            self._kill(child, "it did not end after its last message")
             return child.wait()
 
     @contextlib.contextmanager
     def _operator_stops(self) -> Iterator[None]:
-        """Pass Ctrl-C, SIGTERM and Ctrl-Z on as the operator's stop."""
+        """Pass on Ctrl-C, SIGTERM and Ctrl-Z as the operator's stop."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return

@@ -1,4 +1,4 @@
-"""Where a walking policy gets its wanted velocity from: fixed, a script, the robot's remote, a keyboard."""
+"""Sources of a walking policy's requested velocity: fixed, a script, the robot's remote, a keyboard."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from deal_hw.types import FloatArray, RobotState
 
 AXES = ("x", "y", "yaw")
 LARGEST = (1.0, 0.5, 1.0)
-"""Fastest velocity that may be asked for: ahead, to the left [m/s], turning left [rad/s]."""
+"""Largest velocity that may be requested: ahead, to the left [m/s], turning left [rad/s]."""
 KEY_LIFE_S = 0.6
-"""A key that is not pressed again counts for this long [s]: longer than the first pause of a key repeat."""
+"""How long a key counts after its last press [s]; longer than the first pause of a key repeat."""
 KEYS = {
     "w": (0.5, 0.0, 0.0),
     "s": (-0.5, 0.0, 0.0),
@@ -29,23 +29,23 @@ KEYS = {
     "e": (0.0, 0.0, -0.6),
     " ": (0.0, 0.0, 0.0),
 }
-"""Keys and the velocities that they ask for while they are held."""
+"""Keys and the velocities that they request while held."""
 _DEAD_ZONE = 0.05
 
 
 class VelocitySource(Protocol):
-    """Says how fast the base shall move."""
+    """A source of the base's requested velocity."""
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return the wanted velocity of the base in its own frame: ahead, left [m/s], turn [rad/s], (3,)."""
+        """Return the requested velocity in the base's frame: ahead, left [m/s], turn [rad/s], (3,)."""
         ...
 
 
 class BoundedSource(VelocitySource, Protocol):
-    """A source that knows how far it goes."""
+    """A source with known bounds."""
 
     def reach(self) -> FloatArray:
-        """Return the lowest and the highest velocity that it may ask for, (2, 3)."""
+        """Return the lowest and the highest velocity that it may request, (2, 3)."""
         ...
 
 
@@ -69,7 +69,7 @@ class FixedVelocity:
 
 
 class ScriptVelocity:
-    """Velocities from a CSV file with the columns time_s, x, y, yaw; each holds until the next line's time.
+    """Velocities from a CSV file with columns time_s, x, y, yaw; each is valid until the next line's.
 
     Raises:
         ConfigurationError: The file cannot be read, or a line is wrong; the message names the line.
@@ -81,23 +81,23 @@ class ScriptVelocity:
         self._velocity = np.stack([_checked(row[1:], f"{path}: line {i + 2}") for i, row in enumerate(rows)])
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return the velocity of the last line whose time has come; zero before the first."""
+        """Return the velocity of the last line up to this time; zero before the first."""
         row = int(np.searchsorted(self._time_s, time_s, side="right")) - 1
         return self._velocity[row] if row >= 0 else np.zeros(3)
 
     def reach(self) -> FloatArray:
-        """Return the ends of what its lines ask for, (2, 3)."""
+        """Return the lowest and highest velocity of its lines, (2, 3)."""
         return np.stack([self._velocity.min(axis=0), self._velocity.max(axis=0)])
 
 
 class RemoteVelocity:
     """The sticks of the robot's own remote: left for ahead and sideways, right for turning.
 
-    Without a remote the robot is asked to stand still.
+    Without a remote the requested velocity is zero.
     """
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return what the sticks ask for."""
+        """Return the velocity that the sticks request."""
         body = state.body
         if body is None or body.buttons < 0 or not np.isfinite(body.sticks).all():
             return np.zeros(3)
@@ -106,16 +106,16 @@ class RemoteVelocity:
         return np.asarray(np.where(np.abs(wish) < _DEAD_ZONE, 0.0, wish) * LARGEST)
 
     def reach(self) -> FloatArray:
-        """Return what the sticks ask for at their ends, (2, 3)."""
+        """Return the velocities at the sticks' ends, (2, 3)."""
         return np.outer([-1.0, 1.0], LARGEST)
 
 
 @dataclass(slots=True)
 class KeyboardVelocity:
-    """Keys held on the operator's terminal; a key that is let go of counts for :data:`KEY_LIFE_S`.
+    """Keys held on the operator's terminal; a released key counts for :data:`KEY_LIFE_S`.
 
-    The terminal belongs to another process, which passes keys on: :meth:`press`. What was pressed before
-    anybody asked for a velocity, as while the robot stood up, does not count.
+    The terminal belongs to another process, which passes keys on: :meth:`press`. Keys pressed before the
+    first request for a velocity, such as while the robot stood up, do not count.
     """
 
     _wish: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -123,26 +123,26 @@ class KeyboardVelocity:
     _now_s: float = -math.inf
 
     def press(self, key: str) -> None:
-        """A key was pressed, or repeats because it is held; keys without a meaning are ignored."""
+        """Note a pressed or repeating key; unknown keys are ignored."""
         if key in KEYS:
             self._wish, self._since_s = KEYS[key], self._now_s
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return what the last key asks for while it counts."""
+        """Return the velocity of the last key while it counts."""
         self._now_s = time_s
         return np.array(self._wish if time_s - self._since_s <= KEY_LIFE_S else (0.0, 0.0, 0.0))
 
     def reach(self) -> FloatArray:
-        """Return the ends of what the keys ask for, (2, 3)."""
+        """Return the lowest and highest velocity of the keys, (2, 3)."""
         keys = np.array(list(KEYS.values()))
         return np.stack([keys.min(axis=0), keys.max(axis=0)])
 
 
 class NotedVelocity:
-    """A source whose changes are told.
+    """A source whose changes are reported.
 
     Args:
-        source: It.
+        source: The source.
         note: Called with each velocity that differs from the one before, (3,).
     """
 
@@ -160,11 +160,11 @@ class NotedVelocity:
 
 
 def limited_axes(source: BoundedSource, command_range: Sequence[tuple[float, float]]) -> list[str]:
-    """Return in words which axes of a source a policy's range limits.
+    """Return a text for each axis of a source that a policy's range limits.
 
     Args:
-        source: What asks for velocities.
-        command_range: Lowest and highest velocity that the policy was trained for, each axis; () for all.
+        source: The source.
+        command_range: Lowest and highest velocity in the policy's training, for each axis; () for no limit.
     """
     asked = source.reach().T
     return [
@@ -175,7 +175,7 @@ def limited_axes(source: BoundedSource, command_range: Sequence[tuple[float, flo
 
 
 def make_source(text: str) -> BoundedSource:
-    """Return the source that a command line names.
+    """Return the source that an option names.
 
     Args:
         text: "remote", "keyboard", three numbers "x,y,yaw", or the path of a script (.csv).
@@ -228,9 +228,10 @@ def _read_script(path: Path) -> list[list[float]]:
             row = []
         if len(row) != len(names) or not math.isfinite(row[0]) or (rows and row[0] <= rows[-1][0]):
             raise ConfigurationError(
-                f"{path}: line {number} is {shown(','.join(line))}; expected four numbers, times growing"
+                f"{path}: line {number} is {shown(','.join(line))}; expected four numbers, with increasing "
+                "times"
             )
         rows.append(row)
     if not rows:
-        raise ConfigurationError(f"{path} holds no line but its head")
+        raise ConfigurationError(f"{path} contains no line after its header; add lines of time_s,x,y,yaw")
     return rows

@@ -1,4 +1,4 @@
-"""How well a robot followed the velocity that it was told, from where its base was; numpy only."""
+"""How well a robot followed its requested velocity, from the positions of its base; numpy only."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from deal_hw.control.velocity import AXES
 from deal_hw.types import Event, FloatArray, Trajectory
 
 VELOCITY_EVENT = "velocity"
-"""Kind of the event that says which velocity is wanted from its moment on."""
+"""Kind of the event that sets the requested velocity from its time on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Where a base was at T times, seen from above.
+    """Positions of a base at T times, seen from above.
 
     Attributes:
         time_s: (T,) [s], growing.
@@ -32,12 +32,12 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wanted:
-    """E wanted velocities, each from its time on until the next one's.
+    """E requested velocities, each valid from its time until the next one's.
 
     Attributes:
         time_s: (E,) [s], on the track's time.
         velocity: Ahead, left [m/s], turn [rad/s], (E, 3).
-        end_s: Until when the last one holds [s].
+        end_s: End of the last one [s].
     """
 
     time_s: FloatArray
@@ -50,9 +50,9 @@ class VelocityErrorSettings:
     """How velocities are compared.
 
     Attributes:
-        step_s: Velocities are means over one step of the gait: within it the base sways [s].
-        settle_s: Not judged after a change of what is wanted [s].
-        every_s: From one comparison to the next [s].
+        step_s: Velocities are averaged over this time, one step of the gait, within which the base sways [s].
+        settle_s: Time after a change of the requested velocity that is not judged [s].
+        every_s: Time between two comparisons [s].
     """
 
     step_s: float = 0.4
@@ -65,11 +65,11 @@ class VelocityError:
     """Mean errors of a walk.
 
     Attributes:
-        velocity_m_s: Of the horizontal velocity while something else than standing is wanted [m/s].
-        yaw_rad_s: Of the yaw rate then [rad/s].
-        seconds: Time that was compared, standing aside [s].
-        parts: For each wanted velocity (its three numbers): both errors, and the mean velocity ahead, left
-            and turning.
+        velocity_m_s: Error of the horizontal velocity, without times of requested standing [m/s].
+        yaw_rad_s: Error of the yaw rate in the same times [rad/s].
+        seconds: Compared time, without standing [s].
+        parts: For each requested velocity (its three numbers): both errors, and the mean velocity ahead, left
+        and turning.
     """
 
     velocity_m_s: float
@@ -83,17 +83,17 @@ class VelocityError:
 
 
 def velocity_data(velocity: FloatArray) -> dict[str, float]:
-    """Return what the event of a wanted velocity, (3,), carries."""
+    """Return the event data of a requested velocity, (3,)."""
     return dict(zip(AXES, map(float, velocity), strict=True))
 
 
 def wanted_in(events: Sequence[Event], start_ns: int, seconds: float) -> Wanted | None:
-    """Return the velocities that a recording's events tell; None where none does.
+    """Return the requested velocities in a recording's events; None if there are none.
 
     Args:
-        events: What happened.
+        events: The events.
         start_ns: Host time of the recording's time 0 [ns].
-        seconds: For how long the policy ran [s].
+        seconds: How long the policy ran [s].
     """
     told = [event for event in events if event.kind == VELOCITY_EVENT]
     if not told:
@@ -104,7 +104,7 @@ def wanted_in(events: Sequence[Event], start_ns: int, seconds: float) -> Wanted 
 
 
 def wanted_velocity(trajectory: Trajectory) -> Wanted | None:
-    """Return the velocities that a recording was told, on the time base of ``receive_s``; None for none."""
+    """Return a recording's requested velocities, on the time base of ``receive_s``; None for none."""
     start_ns, seconds = trajectory.metadata.get("start_ns", 0), trajectory.metadata.get("seconds", np.inf)
     return wanted_in(trajectory.events, start_ns, seconds)
 
@@ -112,15 +112,15 @@ def wanted_velocity(trajectory: Trajectory) -> Wanted | None:
 def velocity_error(
     track: Track, wanted: Wanted, settings: VelocityErrorSettings | None = None
 ) -> VelocityError | None:
-    """Compare what a base did with what was wanted of it.
+    """Compare the motion of a base with the requested velocities.
 
     Args:
-        track: What it did.
-        wanted: What was wanted.
+        track: The motion.
+        wanted: The requested velocities.
         settings: How they are compared.
 
     Returns:
-        The errors; None where no wanted velocity lasted long enough to be judged.
+        The errors; None if no requested velocity lasted long enough to be judged.
     """
     settings = settings or VelocityErrorSettings()
     begin = np.arange(track.time_s[0], track.time_s[-1] - settings.step_s, settings.every_s)

@@ -1,4 +1,4 @@
-"""The control process watches its supervisor: one that is stopped or hangs could not act for the operator."""
+"""The control process watches its supervisor, since a stopped or hanging one cannot act for the operator."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from deal_hw.clock import Clock
 from deal_hw.control.process_channel import HEARTBEAT, StatusSender
 
 SUPERVISOR_SILENCE_S = 1.0
-"""A supervisor that has said nothing for this long is taken for stopped [s]. It beats every 50 ms; without a
-real-time priority a busy machine may hold it up for some 0.4 s."""
+"""A supervisor without a heartbeat for this long counts as stopped [s]. It sends one every 50 ms; without
+real-time priority a busy machine may delay it by about 0.4 s."""
 
 
 class SupervisorVigil:
-    """Listens to the supervisor in a thread, because the control process may wait for the robot for seconds.
+    """Listens to the supervisor in a thread, since the control process may wait for the robot for seconds.
 
     Args:
         status: The channel to the supervisor.
         clock: Measures the silence.
-        on_silence: Called once, in the thread, where the supervisor is silent for too long.
-        silence_s: How long that is [s].
+        on_silence: Called once, in the thread, after the supervisor was silent for ``silence_s``.
+        silence_s: Longest allowed silence [s].
     """
 
     def __init__(
@@ -38,11 +38,11 @@ class SupervisorVigil:
         self._thread = threading.Thread(target=self._listen, name="supervisor vigil", daemon=True)
 
     def start(self) -> None:
-        """Listen from now on; the thread has the priority of the one that calls."""
+        """Listen from now on; the thread has the caller's priority."""
         self._thread.start()
 
     def messages(self) -> list[str]:
-        """Return what the supervisor told since the last call, heartbeats left out."""
+        """Return the supervisor's messages since the last call, without heartbeats."""
         return [self._words.popleft() for _ in range(len(self._words))]
 
     def _listen(self) -> None:
@@ -54,7 +54,7 @@ class SupervisorVigil:
                 heard_ns = self._clock.now_ns()
                 self._words.extend(word for word in words if word != HEARTBEAT)
             elif ready:
-                # Closed: the supervisor is dead, and the kernel says so by a signal.
+                # Closed: the supervisor is dead, which the kernel reports by a signal.
                 return
             elif self._clock.now_ns() - heard_ns >= self._silence_ns:
                 self._on_silence()

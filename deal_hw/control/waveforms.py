@@ -1,7 +1,7 @@
 """Excitation signals: sums of sines, sweeps and random steps, as small tables that any process can evaluate.
 
 A signal is an offset from the centre of each actuated joint (A), a function of the time since it began. Numpy
-only: what a table holds may be chosen by an optimiser, but the control process that plays it needs none.
+only: an optimiser may fill the tables, but the control process that plays them needs none.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ class Tones:
 class Sweep:
     """A sine whose frequency runs from low to high.
 
-    The same sweep on all joints, or sweeps that differ in phase only, would span one or two directions of the
-    joints' space whatever their number. So the joints either move one by one, or each runs through the band
-    from another place on, and round (``staggered``).
+    The same sweep on all joints, or sweeps that differ in phase only, would span only one or two directions
+    of the joint space. So the joints move one by one, or each starts at another frequency and wraps around in
+    the band (``staggered``).
 
     Attributes:
         amplitude: (A,) [m or rad].
         duration_s: Length of the signal [s].
-        low_hz: Least frequency.
-        high_hz: Greatest frequency.
-        law: Whether the frequency grows by equal differences or by equal ratios.
+        low_hz: Lowest frequency.
+        high_hz: Highest frequency.
+        law: Whether the frequency grows linearly or exponentially.
         arrangement: How several joints share the time.
     """
 
@@ -91,7 +91,7 @@ class Sweep:
         if not (self.duration_s > 0 and 0 < self.low_hz <= self.high_hz and self.amplitude):
             raise ConfigurationError(
                 f"not a usable sweep: {self.low_hz:g} to {self.high_hz:g} Hz in {self.duration_s:g} s; "
-                "wanted: 0 < low <= high, a duration above 0"
+                "needed: 0 < low <= high, and a duration above 0 s"
             )
         if self.law not in get_args(Law):
             raise UnknownNameError("sweep law", self.law, get_args(Law))
@@ -105,7 +105,7 @@ class Sweep:
         for a, amplitude in enumerate(self.amplitude):
             if self.arrangement == "staggered":
                 begin = a / A * T
-                # The band ends at another frequency than it begins: the phase runs on over the seam.
+                # The band ends at another frequency than it begins, so the phase continues over the wrap.
                 lap = self._phase(np.array([T]), T)[0]
                 moved = time_s + begin
                 phase = (
@@ -142,7 +142,7 @@ class Steps:
     """Offsets that are held.
 
     Attributes:
-        begin_s: From when on each holds, rising, the first 0, (S,).
+        begin_s: Start time of each, increasing from 0, (S,).
         value: (S, A) [m or rad].
     """
 
@@ -155,7 +155,7 @@ class Steps:
     def __post_init__(self) -> None:
         rising = all(a < b for a, b in zip(self.begin_s, self.begin_s[1:], strict=False))
         if not self.begin_s or len(self.begin_s) != len(self.value) or self.begin_s[0] != 0 or not rising:
-            raise ConfigurationError("steps need one value for each time, and rising times from 0 on")
+            raise ConfigurationError("steps need one value for each time, and times that increase from 0")
         if len({len(row) for row in self.value}) != 1:
             raise ConfigurationError("steps need as many values at each time")
 
@@ -171,7 +171,7 @@ class Steps:
 
 
 Wave = Annotated[Tones | Sweep | Steps, Tagged("wave")]
-"""One of them; in JSON the field ``wave`` says which."""
+"""Any of the signals; in JSON the field ``wave`` names it."""
 
 
 def ease(time_s: FloatArray, duration_s: float, ease_s: float) -> FloatArray:
@@ -193,14 +193,14 @@ def schroeder_phases(power: FloatArray) -> FloatArray:
     """Return phases that keep the peak of a sum of harmonics low, (F,) [rad].
 
     Schroeder (1970), "Synthesis of low-peak-factor signals and binary sequences with low autocorrelation":
-    the phase of tone k falls by the power of the tones before it, weighted by how far back they are.
+    the phase of tone k decreases by the power of the tones before it, weighted by their distance.
 
     Args:
         power: Power of each tone, in the order of frequency, (F,).
     """
     share = power / np.sum(power)
     before = np.concatenate([[0.0], np.cumsum(share)[:-1]])
-    # sum over l < k of (k - l) p_l is the cumulated cumulated power.
+    # The sum over l < k of (k - l) p_l is the power, cumulated twice.
     return np.asarray(-2 * math.pi * np.cumsum(before))
 
 
@@ -222,19 +222,19 @@ def multisine(
 ) -> Tones:
     """Return a multisine with Schroeder phases, other harmonics for each joint.
 
-    What is random is where on its period the signal begins and its sign: neither touches spectrum or peak.
+    Random are the start within the period and the sign; neither changes spectrum or peak.
 
     Args:
         amplitude: Peak of each joint's sum over its period, (A,) [m or rad].
-        low_hz: Least frequency.
-        high_hz: Greatest frequency.
+        low_hz: Lowest frequency.
+        high_hz: Highest frequency.
         base_hz: All frequencies are multiples of it; one over the signal's length, so that joints differ.
         tilt: Amplitudes fall with frequency to this power; 0 is flat, 1 equal speeds.
         rng: Draws beginning and sign of each joint.
         most: Most tones of a joint.
 
     Raises:
-        ConfigurationError: The band holds fewer harmonics than there are joints.
+        ConfigurationError: The band contains fewer harmonics than there are joints.
     """
     A = len(amplitude)
     harmonics = np.arange(math.ceil(low_hz / base_hz - 1e-9), math.floor(high_hz / base_hz + 1e-9) + 1)
@@ -242,8 +242,8 @@ def multisine(
     count = min(len(harmonics) // A, most)
     if count < 1:
         raise ConfigurationError(
-            f"the band {low_hz:g} to {high_hz:g} Hz holds {len(harmonics)} multiples of {base_hz:.3g} Hz, at "
-            f"least {A} are needed, one for each joint; widen the band or record for longer"
+            f"the band {low_hz:g} to {high_hz:g} Hz contains {len(harmonics)} multiples of {base_hz:.3g} "
+            f"Hz, but each joint needs one, {A} in total; widen the band or record longer"
         )
     frequency, height, phase = [], [], []
     for a in range(A):
@@ -273,7 +273,7 @@ def random_steps(
     """
     low, high = hold_s
     if not 0 < low <= high:
-        raise ConfigurationError(f"holds of {low!r} to {high!r} s: 0 < shortest <= longest")
+        raise ConfigurationError(f"hold times of {low!r} to {high!r} s: needed is 0 < shortest <= longest")
     begin, value = [0.0], [tuple(map(float, rng.uniform(-1.0, 1.0, len(amplitude)) * amplitude))]
     while begin[-1] < duration_s:
         begin.append(begin[-1] + float(rng.uniform(low, high)))

@@ -1,1 +1,1 @@
-"""Recordings: our own episodes, those of others as they are imported, checks of both, and export."""
+"""Recordings: our own episodes, imports from other formats, checks of both, and export."""

@@ -1,4 +1,4 @@
-"""Writes files so that a crash leaves no half of them; finds episodes, and reads them up to a size."""
+"""Writes files completely or not at all; finds episodes, and reads them up to a maximum size."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from deal_hw.errors import DatasetError, EmptyRecordingError
 from deal_hw.reading import read_bytes, reading
 
 INDEX_NAME = "dataset.json"
-"""Of a dataset's index, in its folder."""
+"""File name of a dataset's index."""
 MAX_EPISODE_BYTES = 4 << 30
-"""An episode is read into memory as a whole; a Go2 with its raw bytes records 0.7 MB/s at most [B]."""
+"""Largest episode, since it is read into memory as a whole; a Go2 with its raw bytes records at most 0.7 MB/s
+[B]."""
 
 
 def sha256_of(path: Path) -> hashlib._Hash:
@@ -49,7 +50,7 @@ def read_episode_bytes(path: Path) -> bytes:
         data = read_bytes(Path(path), MAX_EPISODE_BYTES)
     if not data:
         raise EmptyRecordingError(
-            f"{path} is empty (0 bytes); nothing was recorded, there is nothing to repair"
+            f"{path} is empty (0 bytes): nothing was recorded, so it cannot be repaired; record again"
         )
     if not data.startswith(MCAP0_MAGIC[: len(data)]):
         raise DatasetError(
@@ -81,19 +82,19 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def published_together(folder: Path) -> Iterator[Path]:
-    """Yield a folder to write into; at the end all that was written moves to another one.
+    """Yield a folder to write into; at the end its files move to another one.
 
-    Where the block raises, nothing moves and the other folder stays as it was. The folder stands beside the
-    other, so that relative paths from one are right from the other. Files of the same name are replaced,
-    other files stay. Ctrl-C during the moves takes effect after them.
+    If the block raises, nothing moves and the other folder stays unchanged. Both folders have the same
+    parent, so relative paths are the same in both. Files of the same name are replaced, other files stay.
+    Ctrl-C during the moves takes effect after them.
 
     Args:
-        folder: Where the files go; made if need be.
+        folder: Destination of the files; made if missing.
 
     Raises:
         OSError: A folder or a file cannot be written.
     """
-    # Links are followed first: what is beside a link lies elsewhere than what is beside its folder.
+    # Links are followed first, since the parent of a link is not the parent of its folder.
     folder = Path(os.path.realpath(folder))
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as waiting:
@@ -102,17 +103,17 @@ def published_together(folder: Path) -> Iterator[Path]:
             _sync(file)
         with interrupts_deferred():
             for file in sorted(Path(waiting).iterdir()):
-                # Not os.replace: the folder may be a file system of its own.
+                # Not os.replace, since the folder may be on another file system.
                 shutil.move(file, folder / file.name)
     _sync_folder(folder)
 
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Let Ctrl-C take effect at the end of the block; only the main thread can, others run on as they do.
+    """Let Ctrl-C take effect at the end of the block. Works in the main thread only; no effect in others.
 
     Raises:
-        KeyboardInterrupt: At the end, where there was one.
+        KeyboardInterrupt: At the end, if there was a Ctrl-C.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -124,7 +125,7 @@ def interrupts_deferred() -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, before)
         if pressed:
-            # To who waited for it before: that may be a block of this kind around ours.
+            # Passed to the previous handler, which may be another block of this kind.
             signal.raise_signal(signal.SIGINT)
 
 
@@ -143,17 +144,17 @@ def _sync_folder(folder: Path) -> None:
 
 
 def dataset_of(folder: Path | str) -> Path:
-    """Return the dataset's folder, where a dataset or a run that holds one is named; else what was named."""
+    """Return the folder of a named dataset, or of a named run's dataset; else the name itself."""
     folder = Path(folder)
     inside = folder / "dataset"
     return inside if not (folder / INDEX_NAME).exists() and (inside / INDEX_NAME).is_file() else folder
 
 
 def episode_of(path: Path | str) -> Path:
-    """Return the recording, where it, or a dataset or a run with this one episode, is named.
+    """Return the named recording, or the only episode of a named dataset or run.
 
     Raises:
-        DatasetError: It is a folder of another number of episodes.
+        DatasetError: It is a folder without an episode, or with several.
     """
     path = Path(path)
     if not path.is_dir():

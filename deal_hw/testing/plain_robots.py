@@ -32,7 +32,11 @@ FAULTS: Mapping[Fault, str] = {
 """Faults by name, with their descriptions."""
 
 SHARED: Mapping[SharedFault, tuple[str, ...]] = {
-    "mirrored": ("the last joint has the other sign", "the sign of {last}", "{last} hangs against gravity"),
+    "mirrored": (
+        "the last joint has the other sign",
+        "the sign of {last}",
+        "{last} deviates from its command against gravity",
+    ),
     "swapped": ("the last two joints are swapped", "{before} and {last} were swapped"),
     "fast-clock": ("the clock runs twice as fast", "the clock were 2 times too fast"),
     "slow-clock": ("the clock runs half as fast", "the clock were 2 times too slow"),

@@ -1,1 +1,1 @@
-"""What verbs do, as functions that return objects; the command line adds settings and printing."""
+"""The work of the verbs, as functions that return objects; the command line adds settings and printing."""

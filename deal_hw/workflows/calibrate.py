@@ -35,7 +35,7 @@ class Calibration:
 
     Attributes:
         result: Estimates, intervals, verdicts, alarms.
-        inputs: What was calibrated.
+        inputs: The robot, recordings and parameters.
         threads: Simulation threads of the report.
     """
 
@@ -45,7 +45,7 @@ class Calibration:
 
     @property
     def distribution(self) -> ParameterDistribution:
-        """What is known of the parameters now; a policy is trained under it."""
+        """The calibrated distribution of the parameters, for training a policy."""
         return self.result.distribution()
 
     @property
@@ -56,7 +56,7 @@ class Calibration:
         return trust(self.result).colour
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row a parameter, and the latency: name, unit, nominal, estimate, low, high, verdict."""
+        """Return one row per parameter and the latency: name, unit, nominal, estimate, low, high, verdict."""
         result = self.result
         verdicts = result.verdicts or ("",) * len(result.space)
         rows: list[dict[str, Any]] = [
@@ -78,11 +78,11 @@ class Calibration:
         return [*rows, {**latency, "low": low, "high": high, "verdict": ""}]
 
     def table(self) -> str:
-        """Return the parameters with their 90 % intervals, and what to think of them, as text."""
+        """Return the parameters with their 90 % intervals and verdicts, as text."""
         return "\n".join([text_table(_HEAD, map(_cells, self.rows())), "", *self._words()])
 
     def report(self, path: Path | str) -> Path:
-        """Write everything on one HTML page and return its path; takes some seconds.
+        """Write all results to one HTML page and return its path; takes some seconds.
 
         Args:
             path: The file; a folder gets ``report.html``.
@@ -120,7 +120,7 @@ class Calibration:
         return path
 
     def save(self, folder: Path | str) -> dict[str, Path]:
-        """Write what ``deal-hw calibrate`` writes, but for the report, and return the files by name."""
+        """Write the files of ``deal-hw calibrate`` except the report; return them by name."""
         from deal_hw.calib.report.page import write_result
 
         return write_result(Path(folder), self.inputs.robot, self.result)
@@ -129,7 +129,7 @@ class Calibration:
         from deal_hw.calib.validation.verdict import trust
 
         found = trust(self.result)
-        told = [f"the data cannot tell: {words}" for words in self.result.null_directions]
+        told = [f"the data do not determine: {words}" for words in self.result.null_directions]
         alarms = [f"alarm: {alarm}" for alarm in self.result.alarms]
         return [f"{found.colour}: {found.sentence}", *told, *alarms]
 
@@ -196,47 +196,48 @@ def calibrate(
         model: The robot's MJCF (path), ``mujoco.MjSpec`` or last compiled ``mujoco.MjModel``.
         data: Recordings to fit: files (CSV, NPZ, MCAP, LeRobot folders), mappings of names to arrays, or data
             frames. Positions [rad or m] (T, J), commands (T, A), time [s] (T,).
-        dataset: Instead of both, a dataset that ``deal-hw collect`` recorded, or ``data import`` made.
-        holdout: What only judges the result: recordings, or episodes of the dataset.
+        dataset: A dataset of ``deal-hw collect`` or ``data import``, instead of model and data.
+        holdout: Held-out data, which only test the result: recordings, or episodes of the dataset.
         episodes: Episodes of the dataset to fit; all but the held-out ones by default.
         columns: Column map (YAML) of the recordings.
-        parameters: What to search (YAML); friction, damping, armature and gains by default.
+        parameters: Parameters to search (YAML); friction, damping, armature and gains by default.
         space: Parameter set of the dataset's robot.
-        free: Search exactly these.
+        free: Search exactly these parameters.
         known: Values measured by other means, by name (SI).
         ranges: Search ranges, low and high by name (SI).
-        range_ratio: Search a factor this to either side of the nominal values; by default as the parameter
-            set says, mostly 5.
-        latency_s: Total latency where it is known [s].
-        latency_range_s: Latencies that are searched otherwise [s].
-        residual_std: What a prediction may be off [rad, m], for all or by joint; the sensor noise by default.
+        range_ratio: Search from nominal / range_ratio to nominal * range_ratio; by default as the parameter
+            set defines, mostly 5.
+        latency_s: Total latency if it is known [s].
+        latency_range_s: Range of the latency search otherwise [s].
+        residual_std: Expected standard deviation of the prediction error [rad, m], for all joints or by
+            joint; the sensor noise by default.
         feet: Sphere geoms of a floating robot's feet.
-        holdout_part: Without ``holdout`` this last share of each recording only judges; 0.25 by default.
-        leave_out: Stretches of files that the model has no part for, such as a contact: file name, from, to
+        holdout_part: Without ``holdout`` this last share of each recording is held out; 0.25 by default.
+        leave_out: Parts of recordings that the model cannot explain, such as a contact: file name, from, to
             [s from its start].
-        fit_seconds: Most to fit, spread evenly over the recordings [s].
-        window_s: Length of the search's longest windows of prediction [s].
-        physics_step_s: Wanted physics step [s]; the MJCF's timestep by default.
+        fit_seconds: Most seconds to fit, spread evenly over the recordings [s].
+        window_s: Length of the longest prediction windows of the search [s].
+        physics_step_s: Requested physics step [s]; the MJCF's timestep by default.
         force: Use recordings although a plausibility check failed.
-        sample_hz: States a second of a dataset that are fitted to [Hz]; four a control period by default.
-        spike_ratio: How many times farther than the joint's fastest motion a sample must jump away and back
-            to be left out.
-        heldout_window_s: Held-out predictions restart this often [s].
-        method: Name of the method; the one that suits the recordings by default.
+        sample_hz: Rate of the fitted states of a dataset [Hz]; by default four per control period.
+        spike_ratio: A sample is left out if it jumps away and back by more than this multiple of the joint's
+            fastest motion.
+        heldout_window_s: Held-out predictions restart from the measured state after this time [s].
+        method: Name of the method; by default chosen from the recordings.
         refine: Follow the search by multiple shooting on prediction error.
         population: Members of the search; the method's usual number by default.
         generations: Most generations of the search.
         policy: The policy that moved the robot, for methods that run it (``deal-paper``).
-        seed: Fixes everything random.
+        seed: Seed of all random numbers.
         threads: Simulation threads; all processors by default.
         progress: Called with each :class:`~deal_hw.calibration.Progress`.
-        say: Called with sentences on what was guessed and found; ``print`` shows them.
+        say: Called with sentences on guesses and findings; ``print`` shows them.
 
     Returns:
         Estimates with intervals and verdicts; see :class:`Calibration`.
 
     Raises:
-        DealHwError: A setting or a recording is unusable; nothing long was begun.
+        DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     check_source(dataset=dataset is not None, model=model is not None)
     fit, judges = _listed(data), _listed(holdout)
@@ -288,7 +289,7 @@ def calibrate(
         result = calibrate_inputs(settings, inputs, chosen, progress=progress, say=say)
         result, _ = judged(inputs, result, settings.provenance, page=False, advise=False, threads=threads)
         found = Calibration(result=result, inputs=inputs, threads=threads)
-        # The model's file is read again when the calibrated one is written.
+        # Writing the calibrated model reads the model's file again.
         weakref.finalize(found, kept.pop_all().close)
     return found
 

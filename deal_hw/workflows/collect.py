@@ -1,4 +1,4 @@
-"""``deal_hw.collect``: record the robot while it moves in an informative way."""
+"""``deal_hw.collect``: record the robot during an informative motion."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.shipped import shipped_policy
 
 EXCITATION_FILE = "excitation.json"
-"""Where the excitation of `--excite optimal` is kept, in the run folder."""
+"""File of the excitation of `--excite optimal`, in the run folder."""
 SHORT_S = 1.5 * SHORTEST_S
-"""Recordings below this are told to be short: not every sample is usable [s]."""
+"""Shorter recordings give a warning, since not every sample is usable [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,43 +36,43 @@ class CollectSettings(RunOptions):
     """Settings of :func:`collect`."""
 
     robot: str = field(kw_only=False)
-    """The robot, such as cartpole; with --simulated a robot.yaml, or a dataset that carries its robot."""
+    """The robot, such as cartpole. With --simulated a robot.yaml, or a dataset with its own robot.yaml."""
 
     port: str = ""
-    """Where the robot is: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
-    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
+    """The robot's port: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
+    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds), or an end point such as
     tcp/127.0.0.1:7447 (zenoh)."""
 
     simulation: Annotated[SimulationOptions, OWN_ROBOT] = field(default_factory=SimulationOptions)
-    """A robot of your own, in simulation."""
+    """Your own robot, in simulation."""
 
     motion: Literal["rich", "chirp", "balance", "hold"] = "rich"
-    """rich: balance, then random set-points (with --simulated these alone, with the robot's own gains);
-    chirp: a sine sweep (for held-out data); balance: the policy all the time; hold: the start pose."""
+    """rich: balance, then random set-points (with --simulated only set-points, with the robot's own gains);
+    chirp: a sine sweep, for held-out data; balance: the policy all the time; hold: the start pose."""
 
     excite: str = ""
-    """Play this instead of MOTION: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
-    file that `deal-hw design-excitation` wrote, which says how long it is."""
+    """Play this excitation instead of MOTION: multisine, chirp, optimal (computed first; needs
+    deal-hw[calib]), or a file of `deal-hw design-excitation`, which also sets the length."""
 
     policy: File | None = None
-    """Policy that balances (.onnx); by default the one shipped for the robot."""
+    """Policy that balances the robot (.onnx); by default the shipped one."""
 
     seconds: RunSeconds = 4.0
     """Length of an episode [s]."""
 
     episodes: Annotated[int, Range(1, 10_000)] = 1
-    """How many episodes."""
+    """Number of episodes."""
 
     excitation_level: Annotated[float, Range(LOWEST_LEVEL, HIGHEST_LEVEL)] = 0.0
-    """Start motion rich stronger (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
-    the safety limits."""
+    """Start motion rich stronger (1 to 3) or gentler (-1 to -3). Changes amplitude, hold times, gains and
+    limits, within the safety limits."""
 
     attempts: Annotated[int, Range(1, 100)] = ATTEMPTS
-    """How often an episode of motion rich is recorded at most: one that hardly moves is repeated stronger.
-    After a trip nothing is repeated; look at the robot first."""
+    """Most recordings of an episode of motion rich. An episode that hardly moves is repeated with a stronger
+    motion. After a trip nothing is repeated: check the robot first."""
 
     seed: Seed = 0
-    """Fixes the random set-points; episode k uses SEED + k."""
+    """Seed of the random set-points; episode k uses SEED + k."""
 
     rich: RichConfig = field(default_factory=RichConfig)
     """Settings of the motion `rich`; its length is SECONDS."""
@@ -80,17 +80,17 @@ class CollectSettings(RunOptions):
 
 @from_settings(CollectSettings)
 def collect(settings: CollectSettings) -> RunReport:
-    """Record the robot while it moves in an informative way; what ``deal-hw collect`` does.
+    """Record the robot during an informative motion, as ``deal-hw collect``.
 
-    The arguments are those of :class:`CollectSettings`, which has a text under each, and ``deal-hw collect
-    --help`` shows them: ``collect("cartpole", port="/dev/ttyUSB0", out="runs/first")``.
+    :class:`CollectSettings` and ``deal-hw collect --help`` describe the arguments: ``collect("cartpole",
+    port="/dev/ttyUSB0", out="runs/first")``.
 
     Returns:
         How the episodes went, with the paths of the recordings.
 
     Raises:
-        DealHwError: A setting is unusable, or what made it fail; the robot is passive and what was recorded
-            is whole.
+        DealHwError: A setting is unusable, or the run failed; the robot is passive and the recordings are
+            complete.
         InterruptedRunError: Ctrl-C; the robot is passive.
     """
     return run(settings, RunView.of_python(settings.say))
@@ -106,8 +106,8 @@ def run(config: CollectSettings, view: RunView) -> RunReport:
     excite, seconds = _excitation(config, view)
     if seconds * config.episodes < SHORT_S:
         view.note(
-            f"warning: {seconds * config.episodes:g} s in all is too short for `deal-hw calibrate`, which "
-            f"needs {SHORTEST_S:g} s of usable samples; 4 s are enough (--seconds 4)"
+            f"warning: {seconds * config.episodes:g} s in total are too short: `deal-hw calibrate` needs "
+            f"{SHORTEST_S:g} s of usable samples; record 4 s (--seconds 4)"
         )
     walks = config.motion == "balance" and not excite
     plan = RunPlan(
@@ -176,16 +176,16 @@ def _refuse_ignored(config: CollectSettings) -> None:
 
 
 def _excitation(config: CollectSettings, view: RunView) -> tuple[str, float]:
-    """Return what the control process is told to play, and for how long [s]; compute what is optimal."""
+    """Return the excitation for the control process and its length [s]; an optimal one is computed here."""
     if not config.excite or config.excite in FAMILIES:
         return config.excite, config.seconds
     if config.excite != "optimal":
         path = Path(config.excite)
         plan = read_plan(path)
         if config.seconds not in (plan.seconds, CollectSettings.seconds):
-            refuse(["--seconds"], f"{path} says that it is {plan.seconds:g} s long; leave it out")
+            refuse(["--seconds"], f"{path} sets the length, {plan.seconds:g} s; leave it out")
         return str(path), plan.seconds
-    # Only here: the rest of this verb runs on computers without the extras.
+    # Imported here, since the rest of this verb runs without the extras.
     from deal_hw.workflows import design_excitation
 
     path = dataset_folder(config.out, config.dataset).parent / EXCITATION_FILE

@@ -22,29 +22,29 @@ class DeploySettings(RunOptions):
     """The robot, such as cartpole."""
 
     policy: File | None = None
-    """The policy (.onnx); by default the one shipped for the robot."""
+    """The policy (.onnx); by default the robot's shipped one."""
 
     seconds: RunSeconds = 10.0
     """Length of an episode [s]."""
 
     episodes: Annotated[int, Range(1, 10_000)] = 1
-    """How many episodes."""
+    """Number of episodes."""
 
     seed: Seed = 0
-    """Noted in the recording; the policy itself is not random."""
+    """Only noted in the recording, since the policy is not random."""
 
     task: str = ""
-    """What the policy is to do, in words, for the recording."""
+    """Description of the task, for the recording."""
 
     trust_calibration: bool = False
-    """Run a policy that was trained under a calibration whose verdict is red, without asking."""
+    """Run a policy without asking even if its calibration has a red verdict."""
 
     record: bool = True
     """Record the episodes."""
 
     dry_run: bool = False
-    """Compute everything and send nothing: the robot is neither homed nor armed. Recorded only with --out or
-    --dataset."""
+    """Compute everything but send no command: the robot is neither homed nor armed. Recorded only with --out
+    or --dataset."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,18 +53,18 @@ class DeploySettings(RunOptions):
 
 @from_settings(DeploySettings)
 def deploy(settings: DeploySettings) -> RunReport:
-    """Run a policy on the robot behind the safety filter, and record it; what ``deal-hw deploy`` does.
+    """Run a policy on the robot behind the safety filter, and record it, as ``deal-hw deploy``.
 
-    The arguments are those of :class:`DeploySettings`, which has a text under each, and ``deal-hw deploy
-    --help`` shows them: ``deploy("cartpole", port="/dev/ttyUSB0", policy="policy.onnx", out="runs/first")``.
+    :class:`DeploySettings` and ``deal-hw deploy --help`` describe the arguments: ``deploy("cartpole",
+    port="/dev/ttyUSB0", policy="policy.onnx", out="runs/first")``.
 
     Returns:
         How the episodes went, with the paths of the recordings.
 
     Raises:
         PolicyMismatchError: The policy was made for another robot; the message names what differs.
-        DealHwError: A setting is unusable, or what made it fail; the robot is passive and what was recorded
-            is whole.
+        DealHwError: A setting is unusable, or the run failed; the robot is passive and the recordings are
+            complete.
         InterruptedRunError: Ctrl-C; the robot is passive.
     """
     return run(settings, RunView.of_python(settings.say))

@@ -50,65 +50,66 @@ class ExcitationSettings:
     """Settings of :func:`design_excitation`."""
 
     robot: str = field(kw_only=False)
-    """The robot, such as cartpole; or a robot.yaml, or a dataset that carries its robot."""
+    """The robot, such as cartpole, or a robot.yaml, or a dataset with its own robot.yaml."""
 
     out: File
     """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
 
     family: Literal["optimal", "multisine", "chirp", "steps", "sway"] = "optimal"
-    """optimal: the most informative of many of the others, by simulation; multisine: a sum of sines with a
-    low peak; chirp: a sweep; steps: random set-points; sway: the body moves over standing feet (go2)."""
+    """optimal: the most informative of many candidates of the other families, found by simulation; multisine:
+    a sum of sines with a low peak; chirp: a sine sweep; steps: random set-points; sway: the body moves over
+    standing feet (go2)."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 4.0
     """Length of the recording [s]."""
 
     amplitude: Annotated[float, Range(1e-3, 1)] = 1.0
-    """Not for optimal: share of the largest amplitude that the safety limits allow."""
+    """Not for optimal: amplitude, as a share of the largest one within the safety limits."""
 
     low_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 0.3
-    """Least frequency of multisine, chirp and sway."""
+    """Lowest frequency of multisine, chirp and sway [Hz]."""
 
     high_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 5.0
-    """Greatest frequency of multisine, chirp and sway."""
+    """Highest frequency of multisine, chirp and sway [Hz]."""
 
     effort: Annotated[float, Range(1e-3, 1000)] = 1.0
-    """Not for optimal: factor on the effort limit that is sent from SPLIT on."""
+    """Not for optimal: factor on the commanded effort limit, after SPLIT."""
 
     speed: Annotated[float, Range(1e-3, 1000)] = 1.0
-    """Not for optimal: factor on the speed limit that is sent from SPLIT on."""
+    """Not for optimal: factor on the commanded speed limit, after SPLIT."""
 
     split: Annotated[float, Range(0, 1)] = 0.5
-    """Not for optimal: fraction of the run from which on the two factors hold; 0 for all of it."""
+    """Not for optimal: fraction of the run after which EFFORT and SPEED hold; 0: all the time."""
 
     policy: File | None = None
-    """Policy that balances at first (.onnx); by default the one shipped for the robot, if any."""
+    """Policy that balances the robot first (.onnx); by default the shipped one, if any."""
 
     calibration: File | None = None
-    """distribution.json of a calibration: robots are drawn from it instead of the whole ranges."""
+    """distribution.json of a calibration, from which robots are drawn instead of the whole ranges."""
 
     space: str = ""
-    """Parameters to tell, such as k9; by default the robot's first set."""
+    """Parameter set to identify, such as k9; by default the robot's first set."""
 
     range_ratio: Annotated[float, Ratio] = 5.0
-    """Ranges reach a factor RANGE-RATIO to either side of nominal."""
+    """Ranges go from nominal / RANGE-RATIO to nominal * RANGE-RATIO."""
 
     criterion: Literal["determinant", "mean"] = "determinant"
-    """determinant: most information in all; mean: least mean standard deviation."""
+    """determinant: smallest volume of the uncertainty; mean: smallest mean standard deviation."""
 
     draws: Annotated[int, Range(1, 10_000)] = 24
-    """Robots that each candidate is tried on."""
+    """Number of drawn robots on which each candidate is tried."""
 
     confirm: Annotated[int, Range(1, 10_000)] = 24
-    """Other robots on which the best candidates are judged in the end."""
+    """Number of other robots on which the best candidates are compared at the end."""
 
     candidates: Annotated[int, Range(1, 100_000)] = 40
-    """Random candidates."""
+    """Number of random candidates."""
 
     rounds: Annotated[int, Range(0, 100_000)] = 24
-    """Changes that are tried on the best of them."""
+    """Number of changes that are tried on the best candidate."""
 
     seed: Seed = 0
-    """Fixes everything random."""
+    """Seed of all random numbers."""
 
     threads: Threads = None
     """Simulation threads; by default all CPUs."""
@@ -124,10 +125,10 @@ class ExcitationReport:
     """What was computed.
 
     Attributes:
-        plan: What will be played.
-        path: Where it was written.
-        optimum: How it was found; None where it was not searched.
-        space: The parameters that the search was to tell; None where there was none.
+        plan: The motion.
+        path: Its file.
+        optimum: How it was found; None without a search.
+        space: The parameters to identify; None without a search.
         refused: Draws of parameters that the model refused.
     """
 
@@ -140,10 +141,10 @@ class ExcitationReport:
 
 @from_settings(ExcitationSettings)
 def design_excitation(settings: ExcitationSettings) -> ExcitationReport:
-    """Compute the most informative motion to play on a robot; what ``deal-hw design-excitation`` does.
+    """Compute the most informative motion to play on a robot, as ``deal-hw design-excitation``.
 
-    The arguments are those of :class:`ExcitationSettings`, which has a text under each, and
-    ``deal-hw design-excitation --help`` shows them: ``design_excitation("cartpole", out="excitation.json")``.
+    :class:`ExcitationSettings` and ``deal-hw design-excitation --help`` describe the arguments:
+    ``design_excitation("cartpole", out="excitation.json")``.
 
     Returns:
         The motion, and how it was found.
@@ -159,7 +160,7 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
 
     Args:
         config: Settings.
-        notify: Called with candidates done, candidates in all, and what is going on.
+        notify: Called with candidates done, candidates in total, and a text on the current step.
     """
     default = ExcitationSettings(robot=config.robot, out=config.out)
     if config.family == "optimal":
@@ -168,7 +169,7 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
             "--family optimal searches it; name another",
         )
         if config.calibration is not None:
-            refuse(given(config, default, ("space", "range_ratio")), "--calibration says what is known")
+            refuse(given(config, default, ("space", "range_ratio")), "--calibration gives the ranges")
     else:
         refuse(
             given(config, default, (*SEARCH, "threads")),
@@ -178,15 +179,18 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
             ("low_hz", "high_hz", "seed") if config.family == "sway" else (*LIMITS, *OF_FAMILY[config.family])
         )
         others = [name for name in (*GIVEN_DESIGN[1:], "seed") if name not in own]
-        refuse(given(config, default, others), f"--family {config.family} has nothing of it")
+        refuse(given(config, default, others), f"--family {config.family} does not use it")
         if config.effort == default.effort and config.speed == default.speed:
-            refuse(given(config, default, ("split",)), "it says from when on --effort or --speed holds")
+            refuse(
+                given(config, default, ("split",)),
+                "it is the time after which --effort or --speed holds, and neither is given",
+            )
     description = described(config.robot)
     most_hz = description.control_rate_hz / 2
     if config.family in ("multisine", "chirp", "sway") and config.high_hz > most_hz:
         raise ConfigurationError(
-            f"--high-hz {config.high_hz:g}: {config.robot} takes {description.control_rate_hz:g} commands a "
-            f"second, which carry up to {most_hz:g} Hz"
+            f"--high-hz {config.high_hz:g}: {config.robot} takes {description.control_rate_hz:g} commands "
+            f"per second, so a motion may have up to {most_hz:g} Hz; lower --high-hz"
         )
     balance = balancer(description, None if config.policy is None else Path(config.policy))
     path = Path(config.out)

@@ -1,4 +1,4 @@
-"""``deal_hw.emulate``: a robot on the wire without a robot."""
+"""``deal_hw.emulate``: a simulated robot that speaks the real robot's protocol."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from deal_hw.workflows.options import from_settings, refuse
 
 
 class EmulatedRobot(EmulatorProcess):
-    """A robot that is emulated in a process of its own; a context manager.
+    """A robot that is emulated in its own process; a context manager.
 
     Args:
         settings: What to emulate.
 
     Attributes:
         robot: Its name.
-        port: Where it is, while it is emulated.
-        truth: Its hidden parameters and what happened, by name; empty until the end.
+        port: Its port, while it is emulated.
+        truth: Its hidden parameters and the events, by name; empty until the end.
     """
 
     def __init__(self, settings: EmulateSettings) -> None:
@@ -29,7 +29,7 @@ class EmulatedRobot(EmulatorProcess):
         self.truth: dict[str, Any] = {}
 
     def stop(self, timeout_s: float = 10.0) -> tuple[str, str]:
-        """Stop it; return what it printed since its first line, and its messages."""
+        """Stop the emulator; return its output after the first line, and its messages."""
         out, errors = super().stop(timeout_s)
         revealed = [line for line in out.splitlines() if line.startswith("{")]
         if revealed:
@@ -42,17 +42,16 @@ class EmulatedRobot(EmulatorProcess):
 
 @from_settings(EmulateSettings)
 def emulate(settings: EmulateSettings) -> EmulatedRobot:
-    """Emulate a robot in real time on a port of its own, with hidden physics; what ``deal-hw emulate`` does.
+    """Emulate a robot in real time on its own port, with hidden physics, as ``deal-hw emulate``.
 
-    The arguments are those of :class:`EmulateSettings`, which has a text under each, and ``deal-hw emulate
-    --help`` shows them::
+    :class:`EmulateSettings` and ``deal-hw emulate --help`` describe the arguments::
 
         with deal_hw.emulate("cartpole", seed=1) as robot:
             deal_hw.collect("cartpole", port=robot.port, out="runs/first")
         print(robot.truth["parameters"])
 
     Returns:
-        The robot; it starts with the block and ends with it.
+        The robot, which runs from the start to the end of the ``with`` block.
 
     Raises:
         UnknownNameError: There is no such robot or wire.

@@ -1,7 +1,7 @@
 """The training tasks as Gymnasium environments; importing this module registers them.
 
 ``gymnasium.make("deal_hw/CartPole-v0", distribution="runs/first/calibration/distribution.json")`` and
-``gymnasium.make_vec("deal_hw/CartPole-v0", num_envs=32)``. Gymnasium imports it itself where a name says so:
+``gymnasium.make_vec("deal_hw/CartPole-v0", num_envs=32)``. With the module in the name, Gymnasium imports it:
 ``gymnasium.make("deal_hw.workflows.environments:deal_hw/CartPole-v0")``.
 """
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 def make_vector(
     num_envs: int, robot: str, distribution: Path | str | ParameterDistribution | None = None, **more: Any
 ) -> ServoVectorEnv:
-    """Return a batch of robots with physics of their own.
+    """Return a batch of robots, each with its own physics.
 
     Args:
-        num_envs: How many.
+        num_envs: Number of robots.
         robot: The robot.
-        distribution: What parameters and latency are drawn from: ``distribution.json`` of a calibration, or a
-            distribution; None: uniform domain randomisation, as with ``deal-hw train --udr``.
+        distribution: ``distribution.json`` of a calibration, or a distribution, from which parameters and
+        latency are drawn. None: uniform domain randomisation, as with ``deal-hw train --udr``.
         **more: Passed on to the environment, such as ``task``.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What ``deal-hw data import`` and ``data export`` do: recordings in and out of our own files."""
+"""The work of ``deal-hw data import`` and ``data export``: convert recordings to and from our files."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ class ImportSettings(Checked):
     """Settings of :func:`import_recordings`."""
 
     paths: tuple[Path, ...]
-    """CSV, NPZ or MCAP files, folders of LeRobot datasets or ROS 2 bags; episodes and datasets of deal-hw; of
-    one robot."""
+    """Recordings of one robot: CSV, NPZ or MCAP files, folders of LeRobot datasets or ROS 2 bags, episodes
+    and datasets of deal-hw."""
     out: Path
-    """The dataset to make or add to."""
+    """The dataset to make, or to add to."""
     columns: Path | None = None
-    """A column map (YAML); without it the meaning of the channels is guessed from their names and said."""
+    """A column map (YAML). Without it the channels' meaning is guessed from their names, and printed."""
     model: Path | None = None
-    """The robot's MJCF: joint names, order and limits come from it, and the dataset keeps it."""
+    """The robot's MJCF, which gives joint names, order and limits. The dataset keeps a copy."""
     robot: Path | None = None
-    """Instead of --model a robot.yaml (`deal-hw robot new`), which the dataset keeps with its MJCF: later
-    verbs know the robot from it."""
+    """A robot.yaml (`deal-hw robot new`) instead of --model. The dataset keeps a copy with its MJCF, so later
+    verbs know the robot."""
     description: Path | None = None
     """A robot description (JSON, as in dataset.json) to use instead of a minimal one."""
     name: str = ""
-    """The robot's name; by default that of the model's or the first recording's file."""
+    """The robot's name; by default the file name of the model, or of the first recording."""
     device_periods: Annotated[int, Range(1, 100_000)] = 1
-    """Device periods between two samples: the robot's own control rate over the recording's."""
+    """Device periods between two samples: the robot's control rate divided by the recording's rate."""
     force: bool = False
-    """Take recordings in although a check failed; what failed stays with them."""
+    """Import recordings although a check failed; the failed checks are noted in the dataset."""
     dry_run: bool = False
-    """Check and tell, but write nothing."""
+    """Check and print the findings, but write nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,18 +64,18 @@ class ExportSettings(Checked):
     """The layout: LeRobot v3.0 (Parquet; needs the extra lerobot), or episodes (MCAP) with the robot in 3D
     for Foxglove (needs the extra sim)."""
     task: str = "deal-hw"
-    """What the robot did, in words; of LeRobot."""
+    """Description of the robot's task, for LeRobot."""
 
 
 def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | None:
-    """Make a dataset of recordings of any robot, or add to one; refuse what is not plausible.
+    """Make a dataset from recordings of any robot, or add to one; refuse implausible recordings.
 
     Args:
         config: Settings.
-        say: Called with sentences on what was guessed, found and resampled.
+        say: Called with sentences on guesses, findings and resampling.
 
     Returns:
-        The dataset; None where nothing was to be written.
+        The dataset; None with ``dry_run``.
 
     Raises:
         DatasetError: A recording cannot be read, understood or trusted.
@@ -150,7 +150,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
 
 
 def _as_recorded(config: ImportSettings, say: Say) -> tuple[list[Episode], list[Path]]:
-    """Return the episodes of ours, which are copied as they are, and the files that are to be interpreted."""
+    """Return our own episodes, which are copied unchanged, and the files to interpret."""
     from deal_hw.data.importing.load import own_episodes
     from deal_hw.data.recording.reader import read_episode
 
@@ -164,16 +164,18 @@ def _as_recorded(config: ImportSettings, say: Say) -> tuple[list[Episode], list[
     for episode in found:
         if episode.description != found[0].description:
             raise DatasetError(
-                f"{episode.path} has another description of its robot than {found[0].path}; import them apart"
+                f"{episode.path} describes another robot than {found[0].path}; import them into two datasets"
             )
     if found:
         default = ImportSettings(paths=config.paths, out=config.out)
-        refuse(given(config, default, ("name", "device_periods")), "the episodes' own description says it")
+        refuse(
+            given(config, default, ("name", "device_periods")), "the episodes contain their own description"
+        )
     return found, foreign
 
 
 def _refuse_ignored(config: ImportSettings) -> None:
-    """Refuse options that another one makes needless.
+    """Refuse options that have no effect beside another one.
 
     Raises:
         ConfigurationError: There is one.
@@ -187,7 +189,7 @@ def _refuse_ignored(config: ImportSettings) -> None:
 
 
 def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
-    """Return whether commands are to be positions: without a model, or where any actuator takes them."""
+    """Return whether commands must be positions: without a model, or if any actuator takes positions."""
     if facts is None:
         return True
     at = [facts.names.index(name) for name in table.actuated]
@@ -199,10 +201,10 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
 
     Args:
         config: Settings.
-        say: Called with sentences on what was mended in the dataset, and what was filled.
+        say: Called with sentences on repairs of the dataset, and on filled samples.
 
     Returns:
-        How many episodes, and the robot's name.
+        The number of episodes, and the robot's name.
 
     Raises:
         DatasetError: It cannot be read, or the folder cannot be written.
@@ -220,14 +222,14 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
     if config.format == "foxglove":
         refuse(
             given(config, ExportSettings(path=config.path, out=config.out), ("task",)),
-            "--format lerobot has it",
+            "only --format lerobot stores it",
         )
         return len(paths), _with_scene(paths, config.out, say)
     trajectories = [read_trajectory(path) for path in paths]
     robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
     frames, filled = export_lerobot(trajectories, config.out, robot, config.task)
     if filled:
-        say(f"{filled} of {frames} frames stand for lost samples: interpolated, and `filled` is true there")
+        say(f"{filled} of {frames} frames replace lost samples: they are interpolated and marked by `filled`")
     return len(trajectories), robot
 
 
@@ -266,7 +268,7 @@ def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:
     facts = joint_facts(model)
     if facts.left_out:
         say(
-            f"{model.name}: joints of several coordinates are not read from recordings: "
+            f"{model.name}: joints with several coordinates are not read from recordings: "
             f"{', '.join(facts.left_out)}"
         )
     return facts
@@ -280,7 +282,7 @@ def _description(path: Path) -> dict[str, Any]:
     with reading(path, what, advice, error=ConfigurationError):
         missing = [key for key in ("name", "joint_names", "actuated", "state_rate_hz") if key not in values]
         if missing:
-            raise ConfigurationError(f"it lacks {', '.join(missing)}; {advice}")
+            raise ConfigurationError(f"{', '.join(missing)} missing; {advice}")
         check_description(values)
         number(values["state_rate_hz"], "state_rate_hz", 1e-3, 1e6)
     return values

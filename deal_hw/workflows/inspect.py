@@ -22,11 +22,11 @@ from deal_hw.workflows.say import html_table
 
 
 class HasResult(Protocol):
-    """What a calibration has to be shown; :class:`~deal_hw.workflows.calibrate.Calibration`."""
+    """The attribute of a calibration that is shown; :class:`~deal_hw.workflows.calibrate.Calibration`."""
 
     @property
     def result(self) -> CalibrationResult:
-        """What was found."""
+        """The result."""
         ...
 
 
@@ -38,8 +38,8 @@ class InspectSettings(Checked):
     """The recording, such as runs/first/dataset/episodes/000000.mcap."""
 
     calibration: File | CalibrationResult | HasResult | None = None
-    """Result of `deal-hw calibrate` to show beside it: the folder, or its result.json. From Python also what
-    :func:`deal_hw.calibrate` returned."""
+    """Result of `deal-hw calibrate` to compare with: the folder, or its result.json. From Python also the
+    return value of :func:`deal_hw.calibrate`."""
 
     window: Annotated[float, Range(1e-3, 600, "s")] = DEFAULT_WINDOW_S
     """Predictions restart from the measured state after this time [s]."""
@@ -54,11 +54,11 @@ class Inspection:
 
     Attributes:
         path: The recording.
-        episode: What is in it.
+        episode: Its contents.
         description: The robot.
-        result: The calibration that is shown; None where none is.
-        overlay: The predictions; None where the recording allows none.
-        note: Why there is none; empty otherwise.
+        result: The shown calibration, or None.
+        overlay: The predictions; None if the recording allows none.
+        note: Why there is no prediction; empty otherwise.
     """
 
     path: Path
@@ -69,7 +69,7 @@ class Inspection:
     note: str
 
     def rows(self) -> list[dict[str, str | float]]:
-        """Return a row a model: its name, and each joint's RMSE of position over the signal's range."""
+        """Return one row per model: its name, and each joint's position RMSE over the signal's range."""
         if self.overlay is None:
             return []
         return [
@@ -81,7 +81,7 @@ class Inspection:
         ]
 
     def table(self) -> str:
-        """Return what the predictions are off, as text."""
+        """Return the prediction errors as text."""
         if self.overlay is None:
             return self.note
         lines = []
@@ -95,7 +95,7 @@ class Inspection:
         return "\n".join(lines)
 
     def verdict(self) -> str:
-        """Return whether the calibration can be used, as markdown; empty where none is shown."""
+        """Return the calibration's verdict as markdown; empty without a calibration."""
         if self.result is None:
             return ""
         from deal_hw.calib.validation.verdict import trust
@@ -107,7 +107,7 @@ class Inspection:
         """Write a rerun recording (.rrd) and return its path.
 
         Raises:
-            ConfigurationError: The path is a folder, or ends otherwise.
+            ConfigurationError: The path is a folder, or has another suffix.
         """
         from deal_hw.viz.episode_log import write_episode
 
@@ -132,11 +132,11 @@ class Inspection:
 
         Args:
             path: The file.
-            at_s: Device time that it shows [s]; by default where the nominal model errs most.
-            rrd: What :meth:`save` wrote, where that was called.
+            at_s: Shown device time [s]; by default the moment of the nominal model's largest error.
+            rrd: The file that :meth:`save` wrote, if any.
 
         Raises:
-            ConfigurationError: The path is a folder, or ends otherwise; or there is no renderer.
+            ConfigurationError: The path is a folder, or has another suffix; or there is no renderer.
         """
         from deal_hw.viz.screenshot import save_screenshot
 
@@ -175,14 +175,14 @@ class Inspection:
 
 
 def check_file(path: Path, suffix: str) -> None:
-    """Check that a file of a kind can be written there.
+    """Check that a path can be the file to write.
 
     Args:
         path: The file.
-        suffix: What it must end in, such as ".png".
+        suffix: The required suffix, such as ".png".
 
     Raises:
-        ConfigurationError: It is a folder, or ends in something else.
+        ConfigurationError: It is a folder, or has another suffix.
     """
     if path.is_dir():
         raise ConfigurationError(f"{path} is a folder; name a file, such as {path / ('episode' + suffix)}")
@@ -192,13 +192,13 @@ def check_file(path: Path, suffix: str) -> None:
 
 @from_settings(InspectSettings)
 def inspect(settings: InspectSettings) -> Inspection:
-    """Predict a recording with the nominal and the calibrated model; what ``deal-hw inspect`` does.
+    """Predict a recording with the nominal and the calibrated model, as ``deal-hw inspect``.
 
-    The arguments are those of :class:`InspectSettings`, which has a text under each: ``inspect(episode,
+    :class:`InspectSettings` describes the arguments: ``inspect(episode,
     calibration="runs/first/calibration")``.
 
     Returns:
-        The predictions; it shows, saves and pictures them.
+        The predictions, with methods to show and save them.
 
     Raises:
         DatasetError: The recording cannot be read.

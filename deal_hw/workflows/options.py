@@ -1,12 +1,12 @@
-"""What all settings share: ranges of numbers, choices, and options that have no effect where they are given.
+"""Checks that all settings share: ranges of numbers, choices, and options without effect.
 
 A number of a settings dataclass carries its range in its type::
 
     seconds: Annotated[float, Range(0.1, 3600, "s")] = 4.0
 
-and :func:`check_ranges`, called in ``__post_init__``, refuses what lies outside, and what is none of a
-``Literal``. So the command line and Python refuse the same with the same words. A test sweeps over all verbs,
-so a number without a range does not pass.
+and :func:`check_ranges`, called in ``__post_init__``, refuses a number outside its range, and a name that is
+none of a ``Literal``. The command line and Python thus refuse the same values with the same words. A test
+checks that every number of every verb has a range.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class Range:
     unit: str = ""
 
     def check(self, option: str, value: Any) -> None:
-        """Check a value; None is one that was not given, and text is not looked at.
+        """Check a value. None (not given) and text pass.
 
         Raises:
-            ConfigurationError: A number lies outside, or is none.
+            ConfigurationError: A number is outside the range, or is not a number.
         """
         if isinstance(value, tuple):
             for part in value:
                 self.check(option, part)
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            # Whatever compares with nothing (NaN) lies outside, too.
+            # Written so that NaN, for which every comparison is false, is refused, too.
             if not self.low <= value <= self.high:
                 raise ConfigurationError(f"{option} {short(repr(value), 30)}{self._unit}: allowed are {self}")
 
@@ -63,10 +63,10 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class Only:
-    """Marks an option, or a group of options, that only some robots or benches take.
+    """Marks an option, or a group of options, of some robots or benches only.
 
-    A help page shows it where one of them is named on the line. The settings, or what runs the verb, refuse
-    it for others.
+    The help shows the option if one of these names is on the command line. For other names the settings, or
+    the verb, refuse it.
 
     Attributes:
         names: Names of robots or benches.
@@ -95,7 +95,7 @@ Ratio = Range(1.001, 1000)
 
 
 class Checked:
-    """A settings dataclass without checks of its own beside its ranges."""
+    """A settings dataclass with no checks beside its ranges."""
 
     __slots__ = ()
 
@@ -104,7 +104,7 @@ class Checked:
 
 
 def option(name: str) -> str:
-    """Return a field's name as it is typed."""
+    """Return a field's name as on the command line."""
     return "--" + name.replace("_", "-")
 
 
@@ -112,8 +112,8 @@ def check_ranges(settings: Any) -> None:
     """Check the numbers and choices of a settings dataclass against their types.
 
     Raises:
-        ConfigurationError: A number lies outside its range, or is none; the message names option, value and
-            range.
+        ConfigurationError: A number is outside its range, or is not a number; the message names option, value
+            and range.
         UnknownNameError: A name is none of the choices.
     """
     for name, hint in get_type_hints(type(settings), include_extras=True).items():
@@ -129,7 +129,7 @@ def check_ranges(settings: Any) -> None:
 
 
 def _check_number(option: str, value: Any, kinds: set[Any], allowed: Range) -> None:
-    """Refuse what Python can give for a number, and a command line cannot."""
+    """Refuse a value that is no number, which only Python can pass."""
     if isinstance(value, str | Path):
         fine = bool({str, Path} & kinds)
     elif isinstance(value, float):
@@ -157,8 +157,8 @@ def given(settings: Any, default: Any, names: Iterable[str] | None = None) -> li
 
     Args:
         settings: A settings dataclass.
-        default: The same as it is without options.
-        names: The fields to look at; all by default.
+        default: The same dataclass without options.
+        names: The fields to compare; all by default.
     """
     fields = [f.name for f in dataclasses.fields(settings)] if names is None else names
     found: list[str] = []
@@ -172,14 +172,14 @@ def given(settings: Any, default: Any, names: Iterable[str] | None = None) -> li
 
 
 def refuse(options: Iterable[str], reason: str) -> None:
-    """Refuse options that would be ignored.
+    """Refuse options that would have no effect.
 
     Args:
-        options: Those that were given.
-        reason: Where they have an effect, or what to use instead.
+        options: The given options.
+        reason: When they have an effect, or what to use instead.
 
     Raises:
-        ConfigurationError: There is one.
+        ConfigurationError: At least one option was given.
     """
     if found := list(options):
         raise ConfigurationError(f"{', '.join(found)} would have no effect: {reason}")
@@ -189,12 +189,12 @@ def refuse_others(settings: Any, verb: str, name: str) -> None:
     """Refuse options that are marked as :class:`Only` for other robots or benches.
 
     Args:
-        settings: A settings dataclass, or one inside it that is marked as a whole.
-        verb: As it is typed before the name.
-        name: The robot or bench that was asked for.
+        settings: A settings dataclass, or a marked group inside it.
+        verb: The verb, as on the command line.
+        name: The robot or bench.
 
     Raises:
-        ConfigurationError: One was given.
+        ConfigurationError: Such an option was given.
     """
     hints = get_type_hints(type(settings), include_extras=True)
     found: dict[Only, list[str]] = {}
@@ -211,7 +211,7 @@ def refuse_others(settings: Any, verb: str, name: str) -> None:
 
 
 def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Callable[P, R]]:
-    """Let a function of settings take them as arguments: what a verb refuses, the function refuses.
+    """Let a function of settings take them as arguments, with the same checks as the verb.
 
     Args:
         settings: The settings' class; the function gets its signature, and refuses unknown names by

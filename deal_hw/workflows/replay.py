@@ -35,16 +35,16 @@ class ReplaySettings(RunOptions):
     """The recording (.mcap)."""
 
     robot: str = ""
-    """The robot; by default the one that was recorded."""
+    """The robot; by default the recorded one."""
 
     port: str = ""
-    """Where the robot is, as for `deal-hw collect`."""
+    """The robot's port, as for `deal-hw collect`."""
 
     record: bool = True
-    """Record what happens."""
+    """Record the replayed motion."""
 
     simulation: Annotated[SimulationOptions, OWN_ROBOT] = field(default_factory=SimulationOptions)
-    """A robot of your own, in simulation: by default the one that the episode's dataset carries."""
+    """Your own robot, in simulation; by default the one that the episode's dataset contains."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,18 +53,18 @@ class ReplaySettings(RunOptions):
 
 @from_settings(ReplaySettings)
 def replay(settings: ReplaySettings) -> RunReport:
-    """Send a recording's commands again, from the robot's start pose; what ``deal-hw replay`` does.
+    """Send a recording's commands again, from the robot's start pose, as ``deal-hw replay``.
 
-    The arguments are those of :class:`ReplaySettings`, which has a text under each, and ``deal-hw replay
-    --help`` shows them: ``replay("runs/first/dataset/episodes/000000.mcap", port="/dev/ttyUSB0")``.
+    :class:`ReplaySettings` and ``deal-hw replay --help`` describe the arguments:
+    ``replay("runs/first/dataset/episodes/000000.mcap", port="/dev/ttyUSB0")``.
 
     Returns:
-        How it went, with the path of the new recording.
+        How the replay went, with the path of the new recording.
 
     Raises:
         DatasetError: The recording cannot be read or holds no command.
-        DealHwError: A setting is unusable, or what made it fail; the robot is passive and what was recorded
-            is whole.
+        DealHwError: A setting is unusable, or the run failed; the robot is passive and the recording is
+            complete.
         InterruptedRunError: Ctrl-C; the robot is passive.
     """
     return run(settings, RunView.of_python(settings.say))
@@ -106,7 +106,7 @@ def _rehearse(
     behaviour = ReplayBehaviour(trajectory, description)
     folder = recording_folder(config.out, config.dataset, "replay", description.name, record=config.record)
     if folder is None:
-        raise ConfigurationError("--no-record: a rehearsal is there to be recorded; leave the option out")
+        raise ConfigurationError("--no-record: a simulated replay is always recorded; leave the option out")
     plan = RunPlan(robot=robot, motion="replay", recording=str(path.resolve()), seconds=behaviour.duration_s)
     return run_simulated(
         plan, robot, config.simulation, dataset=folder, episodes=1, purpose="replay", view=view

@@ -1,4 +1,4 @@
-"""Robots of users: ``deal-hw robot new`` and ``check``, and who a robot is that a verb is told of."""
+"""Robots of users: ``deal-hw robot new`` and ``check``, and the robot that a verb's argument names."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ class NewRobotSettings(Checked):
     """The file to write; by default robot.yaml beside the MJCF."""
 
     name: str = ""
-    """The robot's name; by default that of the MJCF's file."""
+    """The robot's name; by default the file name of the MJCF."""
 
     control_rate: Annotated[float, Range(0.001, 1e5, "Hz")] = 50.0
-    """Commands a second [Hz]; no MJCF says it."""
+    """Commands per second [Hz]; an MJCF does not define it."""
 
     state_rate: Annotated[float | None, Range(0.001, 1e5, "Hz")] = None
-    """State samples a second [Hz], a whole multiple of the control rate; by default as many as commands."""
+    """State samples per second [Hz], a whole multiple of the control rate; by default the control rate."""
 
     feet: tuple[str, ...] = ()
-    """Sphere geoms of the feet of a robot whose base floats."""
+    """Sphere geoms of the feet of a robot with a floating base."""
 
     several_trees: bool = False
-    """Driven joints in several trees of bodies, such as two arms, are one robot."""
+    """Accept driven joints in several trees of bodies, such as two arms, as one robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class RobotCheck:
 
     Attributes:
         robot: The robot.
-        findings: What was looked at.
+        findings: The findings.
     """
 
     robot: UserRobot
@@ -72,11 +72,11 @@ class RobotCheck:
 
     @property
     def exit_code(self) -> int:
-        """For the shell: 0, or 1 where something does not work."""
+        """For the shell: 0, or 1 if a check failed."""
         return int(any(finding.level is Level.FAIL for finding in self.findings))
 
     def table(self) -> str:
-        """Return a line a finding, as text."""
+        """Return one line per finding, as text."""
         return "\n".join(
             f"{level:<4} {area}: {'; '.join(filter(None, words))}" for level, area, *words in self._cells()
         )
@@ -90,10 +90,9 @@ class RobotCheck:
 
 @from_settings(NewRobotSettings)
 def new_robot(settings: NewRobotSettings) -> Path:
-    """Write a robot.yaml with what an MJCF tells; what ``deal-hw robot new`` does.
+    """Write a robot.yaml from an MJCF, as ``deal-hw robot new``.
 
-    The arguments are those of :class:`NewRobotSettings`, which has a text under each:
-    ``new_robot("robot.xml", control_rate=100.0)``.
+    :class:`NewRobotSettings` describes the arguments: ``new_robot("robot.xml", control_rate=100.0)``.
 
     Returns:
         The file.
@@ -126,15 +125,15 @@ def new_robot(settings: NewRobotSettings) -> Path:
 
 @from_settings(CheckRobotSettings)
 def check_robot(settings: CheckRobotSettings) -> RobotCheck:
-    """Compare a robot.yaml with its MJCF and simulate a second of holding; what ``deal-hw robot check`` does.
+    """Compare a robot.yaml with its MJCF and simulate a second of holding, as ``deal-hw robot check``.
 
-    The arguments are those of :class:`CheckRobotSettings`: ``check_robot("robot.yaml")``.
+    The argument is the file: ``check_robot("robot.yaml")``.
 
     Returns:
         What was found.
 
     Raises:
-        ConfigurationError: A file cannot be used, or both contradict each other.
+        ConfigurationError: A file cannot be used, or the two contradict each other.
     """
     robot = load_robot(Path(settings.robot))
     return RobotCheck(robot=robot, findings=(*_agreement(robot), *_missing(robot), *_held(robot)))
@@ -148,26 +147,26 @@ def load_robot(path: Path) -> UserRobot:
 
 
 def is_ours(name: str) -> bool:
-    """Say whether a name is that of a robot of deal-hw."""
+    """Return whether a name is that of a robot of deal-hw."""
     return name in ROBOTS or name in DESCRIPTIONS
 
 
 def is_user_robot(robot: str) -> bool:
-    """Say whether a verb's robot is a file or a folder, and no robot of deal-hw by its name."""
+    """Return whether a verb's robot is a file or a folder, and not the name of a robot of deal-hw."""
     return not is_ours(robot) and (Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir())
 
 
 def user_robot(robot: str) -> UserRobot:
-    """Return the robot of a robot.yaml, or the one that a dataset carries.
+    """Return the robot of a robot.yaml, or of a dataset with its own robot.yaml.
 
     Raises:
         ConfigurationError: It is neither, or cannot be used.
-        DatasetError: The dataset's robot is gone or changed.
+        DatasetError: The dataset's robot is missing or changed.
     """
     if not is_user_robot(robot):
         raise ConfigurationError(
             f"--simulated takes a robot.yaml (`deal-hw robot new robot.xml` writes one), not {robot!r}; "
-            "robots of deal-hw have emulators on their wire: deal-hw emulate"
+            "for a robot of deal-hw start its emulator: deal-hw emulate"
         )
     if not Path(robot).is_dir():
         return load_robot(Path(robot))
@@ -181,7 +180,7 @@ def described(robot: str) -> RobotDescription:
     Raises:
         UnknownNameError: There is no such robot.
         ConfigurationError: The robot.yaml or its MJCF cannot be used.
-        DatasetError: The dataset cannot be read, or its robot is gone or changed.
+        DatasetError: The dataset cannot be read, or its robot is missing or changed.
     """
     if not is_user_robot(robot):
         return recorded_description(robot)
@@ -194,14 +193,14 @@ def described(robot: str) -> RobotDescription:
 
 
 def described_spaces(robot: str) -> Mapping[str, Callable[[], ParameterSpace]]:
-    """Return a robot's parameter sets by name, the first is the default; errors as :func:`described`."""
+    """Return a robot's parameter sets by name, the default first; errors as :func:`described`."""
     if not is_user_robot(robot):
         return parameter_spaces(robot)
     return {"default": lambda: default_space(described(robot))}
 
 
 def default_space(description: RobotDescription) -> ParameterSpace:
-    """Return what is searched of a user's robot: friction, damping, armature and gains of the MJCF."""
+    """Return the default parameters of a user's robot: friction, damping, armature and gains of the MJCF."""
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.parameters.template import template
     from deal_hw.sim.parameters.yaml_space import parse_space
@@ -211,13 +210,13 @@ def default_space(description: RobotDescription) -> ParameterSpace:
 
 
 def carries_robot(dataset: File | None) -> bool:
-    """Say whether a dataset carries a user's robot."""
-    # As deal_hw.sim.robots.carried, which needs mujoco; this is asked where nothing is simulated, too.
+    """Return whether a dataset contains a user's robot."""
+    # The same as deal_hw.sim.robots.carried, which needs mujoco; this one also runs without it.
     return dataset is not None and (Path(dataset) / "robot" / "files.json").is_file()
 
 
 def carried_problems(dataset: Path) -> list[str]:
-    """Return what is wrong with the robot that a dataset carries; nothing where it carries none."""
+    """Return the problems of a dataset's own robot; empty if the dataset has none."""
     if not carries_robot(dataset) or not (Path(dataset) / "dataset.json").is_file():
         return []
     from deal_hw.data.recording.dataset import Dataset
@@ -230,14 +229,14 @@ def carried_problems(dataset: Path) -> list[str]:
 
 
 def recorded_robot(values: Mapping[str, Any], dataset: Path) -> RobotDescription:
-    """Return the robot that recordings are of: the one that their dataset carries, or one of deal-hw's own.
+    """Return the recorded robot: the dataset's own one, or a robot of deal-hw.
 
     Args:
         values: The description in the dataset's index, or in an episode.
         dataset: The dataset's folder.
 
     Raises:
-        DatasetError: The robot is none of ours, and the dataset's is not there or was changed.
+        DatasetError: The robot is not one of deal-hw, and the dataset's own one is missing or changed.
     """
     if not carries_robot(dataset) and is_ours(str(values["name"])):
         return recorded_description(str(values["name"]))
@@ -258,7 +257,7 @@ def _sim() -> Any:
 
 def _check_name(name: str, where: str) -> None:
     if is_ours(name):
-        raise ConfigurationError(f"{where} {name!r} is that of a robot of deal-hw; choose another name")
+        raise ConfigurationError(f"{where} {name!r} is the name of a robot of deal-hw; choose another name")
 
 
 def _relative(model: Path, folder: Path) -> str:
@@ -277,14 +276,14 @@ def _agreement(robot: UserRobot) -> list[Finding]:
 
 
 def _missing(robot: UserRobot) -> list[Finding]:
-    """Return what robot.yaml leaves open, and which verbs would want it."""
+    """Return the missing fields of robot.yaml, and the verbs that need them."""
     joints = robot.file.joints
     driven = [joint for joint in joints if joint.actuator is not None]
     rows = (
         (
             "position_range",
             [j.name for j in driven if j.position_range is None and robot.file.actuation == "position"],
-            "collect and design-excitation need it: how far targets may go",
+            "collect and design-excitation need it, as the limit of position targets",
         ),
         (
             "velocity_limit",
@@ -294,7 +293,7 @@ def _missing(robot: UserRobot) -> list[Finding]:
         (
             "effort_limit",
             [j.name for j in driven if j.actuator and j.actuator.effort_limit is None],
-            "the simulated motor is endlessly strong; give the MJCF a forcerange",
+            "the simulated motor has no torque limit; give the MJCF a forcerange",
         ),
         (
             "sensor_noise",
@@ -303,7 +302,7 @@ def _missing(robot: UserRobot) -> list[Finding]:
         ),
     )
     return [
-        Finding(name, Level.NOTE, f"not said for {', '.join(found)}", f"{why}")
+        Finding(name, Level.NOTE, f"missing for {', '.join(found)}", f"{why}")
         for name, found, why in rows
         if found
     ]
@@ -321,13 +320,13 @@ def _held(robot: UserRobot) -> list[Finding]:
             Finding(
                 what,
                 Level.FAIL,
-                f"{', '.join(found.unstable)} moves faster and faster",
-                "reduce stiffness, or raise damping or armature, in the MJCF and here",
+                f"the speed of {', '.join(found.unstable)} keeps growing",
+                "reduce stiffness, or raise damping or armature, in the MJCF and in robot.yaml",
             )
         ]
     names = robot.description().actuated
     worst = int(np.argmax(np.abs(found.sag)))
     unit = robot.file.joints[robot.joint_names.index(names[worst])].unit
     moved = "moved, without effort, by" if robot.file.actuation == "motor" else "is off by"
-    message = f"stable; {names[worst]} {moved} {found.sag[worst]:.3g} {unit}, more than the others"
+    message = f"stable; largest offset: {names[worst]} {moved} {found.sag[worst]:.3g} {unit}"
     return [Finding(what, Level.OK, message)]

@@ -1,4 +1,4 @@
-"""A user's robot and its recordings: who it is, and at which rates it was recorded."""
+"""The robot and the sampling rates of a user's recordings."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 
 def derived_robot(model: Path, name: str, tables: Sequence[Table], say: Say) -> UserRobot | None:
-    """Return the robot that a model tells; None, and say why, where no later verb could use it.
+    """Return the robot that a model describes; None, with a reason, if no later verb could use it.
 
     Args:
         model: The MJCF.
-        name: The robot's name; "" for that of the file.
+        name: The robot's name; "": the file's name.
         tables: Its recordings.
         say: Called with the reason.
     """
@@ -39,16 +39,16 @@ def derived_robot(model: Path, name: str, tables: Sequence[Table], say: Say) -> 
         for table in tables:
             _check_joints(robot, table)
     except ConfigurationError as err:
-        say(f"the dataset keeps no robot, so that `inspect` and `calibrate` cannot use it: {err}")
+        say(f"the dataset keeps no robot, so `inspect` and `calibrate` cannot use it: {err}")
         return None
     return robot
 
 
 def _check_joints(robot: UserRobot, table: Table) -> None:
-    """Check that a recording has the joints of a robot, and commands of those that are driven.
+    """Check that a recording has the joints of a robot, and the commands of its driven joints.
 
     Raises:
-        ConfigurationError: It has not.
+        ConfigurationError: A joint or a command is missing.
     """
     driven = tuple(joint.name for joint in robot.file.joints if joint.actuator is not None)
     for what, has, wants in (
@@ -57,20 +57,20 @@ def _check_joints(robot: UserRobot, table: Table) -> None:
     ):
         if has != wants:
             raise ConfigurationError(
-                f"{table.name} has {what} of {', '.join(has) or 'no joint'}, robot {robot.file.name!r} of "
-                f"{', '.join(wants)}; name its columns in a column map (--columns)"
+                f"{table.name} has {what} of {', '.join(has) or 'no joint'}, but robot {robot.file.name!r} "
+                f"needs those of {', '.join(wants)}; name the columns in a column map (--columns)"
             )
 
 
 def at_recorded_rates(
     robot: UserRobot, tables: Sequence[Table], device_periods: int = 1
 ) -> tuple[RobotModel, Sampling]:
-    """Return the robot's model at the rates of recordings, and these.
+    """Return the robot's model at the recordings' rates, and the rates.
 
     Args:
         robot: The robot.
         tables: The recordings.
-        device_periods: Physics steps between two samples; 1: as the MJCF's timestep has it.
+        device_periods: Physics steps between two samples; 1: as the MJCF's timestep requires.
 
     Raises:
         ConfigurationError: The recordings have other joints than the robot.

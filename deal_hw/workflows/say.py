@@ -1,4 +1,4 @@
-"""How a workflow tells its user something while it runs: it calls what it was given with a sentence."""
+"""Messages of a running workflow: it passes each sentence to a function."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Say = Callable[[str], None]
 
 
 def silent(text: str) -> None:
-    """Say nothing."""
+    """Drop the sentence."""
 
 
 def aloud(text: str) -> None:
-    """Say it on standard error."""
+    """Print the sentence on standard error."""
     print(text, file=sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""Policies that are shipped with the package, and what balances a robot with one."""
+"""Policies that are shipped with the package, and balancing by them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 
 SHIPPED: Final[Mapping[str, str]] = {"go2": "go2_walk"}
-"""Shipped policies that are not called ROBOT_udr: the Go2's of that name is what benches excite it with."""
+"""Shipped policies not named ROBOT_udr. The Go2's policy of that name only excites it in benches."""
 
 
 def shipped_policy(robot: str) -> Path | None:
-    """Return the policy that is shipped for a robot; None where there is none."""
+    """Return the policy that is shipped for a robot, or None."""
     name = SHIPPED.get(robot, f"{robot}_udr")
     path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{name}.onnx"))
     return path if path.is_file() else None
@@ -31,12 +31,12 @@ def required_policy(robot: str) -> Path:
     path = shipped_policy(robot)
     if path is None:
         tool = "train_udr_policy.py" if robot == "cartpole" else "train_demo_policy.py"
-        raise ConfigurationError(f"no policy is shipped for robot {robot!r}; tools/{tool} makes it")
+        raise ConfigurationError(f"no policy is shipped for robot {robot!r}; tools/{tool} trains one")
     return path
 
 
 def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
-    """Return what makes a robot's balancing behaviour; None where the robot has no policy."""
+    """Return a function that makes a robot's balancing behaviour; None if the robot has no policy."""
     path = policy or shipped_policy(description.name)
     if path is None:
         return None

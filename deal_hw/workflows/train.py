@@ -28,21 +28,21 @@ POLICY_FILE = Path("policies") / "policy.onnx"
 
 
 class Calibrated(Protocol):
-    """What a calibration has to train a policy under; :class:`~deal_hw.workflows.calibrate.Calibration`."""
+    """What training uses of a calibration; :class:`~deal_hw.workflows.calibrate.Calibration`."""
 
     @property
     def distribution(self) -> ParameterDistribution:
-        """What is known of the parameters."""
+        """The calibrated distribution."""
         ...
 
     @property
     def colour(self) -> str:
-        """Whether it can be used."""
+        """Colour of the verdict."""
         ...
 
 
 def unseen(status: TrainingStatus) -> None:
-    """Show nothing of a training."""
+    """Show no progress."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class TrainSettings(Checked):
     """Settings of :func:`train`."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """The robot; with --env a robot.yaml, or a dataset that carries its robot."""
+    """The robot; with --env a robot.yaml, or a dataset with its own robot.yaml."""
 
     env: str = ""
     """A Gymnasium environment of your own, module:ENV_ID, for a robot that is a robot.yaml or a dataset that
@@ -58,40 +58,40 @@ class TrainSettings(Checked):
 
     distribution: File | ParameterDistribution | Calibrated | None = None
     """distribution.json of a calibration: parameters, their uncertainty, latency. From Python also a
-    distribution or what :func:`deal_hw.calibrate` returned."""
+    distribution or the return value of :func:`deal_hw.calibrate`."""
 
     udr: bool = False
-    """Train under uniform domain randomisation instead: every parameter within a factor of its nominal value
-    (5; for the Go2 1.75)."""
+    """Train under uniform domain randomisation (UDR) instead: every parameter within a factor 5 of its
+    nominal value (Go2: 1.75)."""
 
     nominal: bool = False
-    """Train under the model's own values instead; latency as with --udr."""
+    """Train under the model's nominal values instead; latency as with --udr."""
 
     trainer: str | None = None
-    """ppo or sac; by default what the robot's shipped policy was trained with."""
+    """ppo or sac; by default that of the robot's shipped policy."""
 
     out: File = Path("runs") / "train"
-    """The .onnx file to write, or a run folder, which gets policies/policy.onnx. Checkpoint (.safetensors),
-    record (.json) and TensorBoard's files go beside it."""
+    """The .onnx file to write, or a run folder, in which the file is policies/policy.onnx. Checkpoint
+    (.safetensors), record (.json) and TensorBoard's files are written beside the policy."""
 
     start: File | None = None
-    """A checkpoint (.safetensors) to fine-tune: its networks are where training starts. SAC also takes a
-    model of stable-baselines3 (.zip), whose tensors alone are read."""
+    """A checkpoint (.safetensors) to fine-tune. SAC also takes a model of stable-baselines3 (.zip); only its
+    tensors are read."""
 
     resume: bool = False
-    """Go on where the training that wrote this --out was stopped."""
+    """Continue the stopped training that wrote to this --out."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
-    """Environment steps; by default what the shipped policy was trained with."""
+    """Environment steps; by default as many as for the shipped policy."""
 
     members: Annotated[int | None, Range(1, 100_000)] = None
-    """Robots simulated at once; by default what the shipped policy was trained with."""
+    """Robots simulated at once; by default as many as for the shipped policy."""
 
     seed: Seed = 0
-    """Decides everything random."""
+    """Seed of all random numbers."""
 
     progress: TrainingProgress = unseen
-    """From Python: called with how far it is, after each update."""
+    """From Python: called with the progress after each update."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +101,9 @@ class Training:
     Attributes:
         policy: The policy, read back from its file.
         path: The .onnx file.
-        record: The .json file of how it was made.
-        checkpoint: The .safetensors file that a training can go on from.
-        status: How far it came; None where it ended before the first update.
+        record: The .json file with the settings of the training.
+        checkpoint: The .safetensors file from which a training can continue.
+        status: Progress at the end; None if it ended before the first update.
     """
 
     policy: OnnxPolicy
@@ -113,7 +113,7 @@ class Training:
     status: TrainingStatus | None
 
     def table(self) -> str:
-        """Return how far the training came and its files, as text."""
+        """Return the training's progress and files, as text."""
         return text_table(("training", ""), self._cells())
 
     def _repr_html_(self) -> str:
@@ -130,12 +130,12 @@ class Training:
 
 
 class InterruptedTrainingError(KeyboardInterrupt):
-    """Ctrl-C, or a request to end; what there is of the policy was written.
+    """Ctrl-C, or a request to end; the policy so far was written.
 
-    A ``KeyboardInterrupt``: who trains must not go on to deploy what is half trained.
+    A ``KeyboardInterrupt``, so that a script does not go on and deploy a half-trained policy.
 
     Attributes:
-        training: What was written.
+        training: The files so far.
     """
 
     def __init__(self, training: Training) -> None:
@@ -145,18 +145,18 @@ class InterruptedTrainingError(KeyboardInterrupt):
 
 @from_settings(TrainSettings)
 def train(settings: TrainSettings) -> Training:
-    """Train a policy under a calibrated distribution; what ``deal-hw train`` does.
+    """Train a policy under a calibrated distribution, as ``deal-hw train``.
 
-    The arguments are those of :class:`TrainSettings`, which has a text under each, and ``deal-hw train
-    --help`` shows them: ``train("cartpole", distribution=deal_hw.calibrate(...), out="runs/first")``.
+    :class:`TrainSettings` and ``deal-hw train --help`` describe the arguments: ``train("cartpole",
+    distribution=deal_hw.calibrate(...), out="runs/first")``.
 
     Returns:
         The policy and its files.
 
     Raises:
-        InterruptedTrainingError: Ctrl-C, or a request to end: what there is was written.
-        ConfigurationError: Not exactly one distribution was asked for, it cannot be read, or there is nothing
-            to go on from.
+        InterruptedTrainingError: Ctrl-C, or a request to end; the policy so far was written.
+        ConfigurationError: Not exactly one distribution was named, it cannot be read, or there is no training
+        to continue.
         UnknownNameError: There is no such robot or trainer.
         TrainingError: The training diverged, or a checkpoint does not fit.
     """
@@ -164,7 +164,7 @@ def train(settings: TrainSettings) -> Training:
 
 
 def run(config: TrainSettings, progress: TrainingProgress) -> Training:
-    """Train a policy, as :func:`train`, and show how far it is."""
+    """Train a policy, as :func:`train`, and show the progress."""
     out = Path(config.out)
     path = out if out.suffix == ".onnx" else out / POLICY_FILE
     distribution, verdict = _distribution(config)
@@ -233,15 +233,15 @@ def train_policy(
 
     Args:
         robot: The robot's name.
-        distribution: What parameters and latency are drawn from.
-        path: The .onnx file; the record goes beside it.
+        distribution: Distribution of parameters and latency.
+        path: The .onnx file; the record is written beside it.
         trainer: The trainer's name; None for the robot's usual one.
-        seed: Decides everything random.
+        seed: Seed of all random numbers.
         steps: Environment steps; None for the default.
         members: Robots simulated at once; None for the default.
-        progress: Called as the training goes on.
-        files: Checkpoint, TensorBoard files, and the word to stop.
-        verdict: Colour of the calibration that the distribution is of; "" where it is of none.
+        progress: Called during the training.
+        files: Checkpoint, TensorBoard files, and the request to stop.
+        verdict: Colour of the distribution's calibration; "" if it is of none.
         env: Environment of a user, module:ENV_ID; "" for the robot's own task.
 
     Returns:
@@ -257,7 +257,7 @@ def train_policy(
     teacher, config = task.trainer_and_config(trainer, steps)
     own = (env,) if env else ()
     world = task.make(*own, described(robot), distribution, members or task.members[teacher.name])
-    # Where it cannot be written that is known now and not after the training.
+    # An unwritable path is reported now and not after the training.
     path.parent.mkdir(parents=True, exist_ok=True)
     started, cpu = time.monotonic(), time.process_time()
     reached: list[TrainingStatus] = []
@@ -285,13 +285,13 @@ def train_policy(
         "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
         "resumed": bool(spent),
     }
-    # Who deploys the policy is told what the calibration's verdict was.
+    # `deploy` reads the calibration's verdict from the policy.
     training = {**policy.spec.training, **({VERDICT: verdict} if verdict else {})}
     return export_network(policy.network, dataclasses.replace(policy.spec, training=training), path, record)
 
 
 def _spent(record: Path) -> dict[str, float]:
-    """Return what the training that is resumed had taken, by its record; nothing where there is none."""
+    """Return wall-clock and CPU seconds of the resumed training from its record; empty without one."""
     if not record.exists():
         return {}
     values = read_json(
@@ -301,7 +301,7 @@ def _spent(record: Path) -> dict[str, float]:
 
 
 def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
-    """Return what to train under, and the colour of the calibration that it is of; "" where it is of none."""
+    """Return the distribution, and the colour of its calibration; "" if it is of none."""
     wanted = {
         "--distribution": config.distribution is not None,
         "--udr": config.udr,
@@ -309,16 +309,18 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
     }
     given = [name for name, is_given in wanted.items() if is_given]
     if len(given) > 1:
-        raise ConfigurationError(f"{' and '.join(given)} exclude each other: leave one of them")
+        raise ConfigurationError(f"{' and '.join(given)} exclude each other: keep one of them")
     if not given:
         raise ConfigurationError(
-            "say under what to train: --distribution FILE (`deal-hw calibrate` writes it), --udr or --nominal"
+            "no distribution is named: give --distribution FILE (`deal-hw calibrate` writes it), --udr or "
+            "--nominal"
         )
     source = config.distribution
     if config.env:
         if config.udr:
             raise ConfigurationError(
-                "--env takes --distribution or --nominal, not --udr: what ranges would hold?"
+                "--udr does not go with --env, whose parameters have no known ranges; use --distribution or "
+                "--nominal"
             )
         if not is_user_robot(config.robot):
             raise ConfigurationError(
@@ -349,7 +351,7 @@ def udr_distribution(robot: str) -> ParameterDistribution:
 
 
 def nominal_distribution(robot: str) -> ParameterDistribution:
-    """Return the distribution of the model's own values; only the latency is drawn.
+    """Return the distribution of the model's nominal values; only the latency is drawn.
 
     Raises:
         UnknownNameError: There is no such robot.
@@ -364,7 +366,7 @@ def nominal_distribution(robot: str) -> ParameterDistribution:
 
 
 def read_distribution(path: Path) -> ParameterDistribution:
-    """Read what a calibration wrote.
+    """Read a calibration's distribution.
 
     Raises:
         ConfigurationError: There is no such file, or it holds no distribution.
@@ -376,7 +378,7 @@ def read_distribution(path: Path) -> ParameterDistribution:
 
 
 def _verdict(path: Path) -> str:
-    """Return the colour that the calibration noted beside its distribution; "" where there is none."""
+    """Return the colour of the verdict in the distribution's file; "" if there is none."""
     what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
     return str(values.get("verdict", ""))
@@ -390,7 +392,7 @@ def _space(robot: str) -> ParameterSpace:
 
 @contextlib.contextmanager
 def _stopped_by_signal() -> Iterator[list[int]]:
-    """Yield a list that the first SIGINT or SIGTERM goes into; a second one acts as usual."""
+    """Yield a list that gets the first SIGINT or SIGTERM; a second one acts as usual."""
     seen: list[int] = []
     try:
         before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -402,7 +404,7 @@ def _stopped_by_signal() -> Iterator[list[int]]:
         for number in before:
             signal.signal(number, note)
     except ValueError:
-        # Not the main thread: signals are somebody else's.
+        # Only the main thread may set signal handlers.
         before = {}
     try:
         yield seen

@@ -1,6 +1,6 @@
 """Facts about the Allegro hand: 16 servos, palm up, and a cube that lies on it.
 
-The cube is what moves freely, so it is the floating base of this robot; the hand's joints do not hang on it.
+The cube moves freely, so it is the floating base of this robot; the hand's joints are not attached to it.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ RANGE_RAD: Final = (
 HOLDING_RAD: Final = (*(0.0, 0.3, 0.7, 0.7) * 3, 0.9, 0.5, 0.3, 0.6)
 """Bent enough that the cube stays on the palm."""
 CUBE_M: Final = (0.02, 0.0, 0.05)
-"""Where the cube begins, in the world; the palm's top is at a height of 0.011 m."""
+"""Start position of the cube in the world; the palm's top is at a height of 0.011 m."""
 PRESS_RAD: Final = 0.3
-"""Targets may lie so far beyond a joint's end: fingers press there."""
+"""Targets may lie this far beyond a joint's end, where fingers press [rad]."""
 EFFORT_LIMIT_NM: Final = 0.7
 
 JOINT_VALUES: Final[Mapping[str, tuple[str, str, float]]] = {
@@ -41,7 +41,8 @@ FINGER_MASS_KG: Final = (0.012, 0.065, 0.036, 0.031)
 THUMB_MASS_KG: Final = (0.018, 0.012, 0.038, 0.060)
 FRICTION: Final = 1.0
 RESTITUTION: Final = 0.04
-"""Table 10 has 0.01, which nothing tells from 0.002 (see ``drivers.ant.description.paper_space``)."""
+"""Table 10 has 0.01, which cannot be distinguished from 0.002 (see
+``drivers.ant.description.paper_space``)."""
 PAPER_RESTITUTION: Final = 0.01
 
 DESCRIPTION: Final = RobotDescription(
@@ -127,15 +128,15 @@ def _alike(names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
 
 
 def parameter_space() -> ParameterSpace:
-    """Return 42 parameters: the three fingers alike, all shapes of the hand alike, not the palm's mass."""
+    """Return 42 parameters: the three fingers alike, all shapes of the hand alike, no palm mass."""
     return _parameters({"hand": GEOMS}, _alike(JOINTS), _alike(LINKS), RESTITUTION)
 
 
 def paper_space() -> ParameterSpace:
     """Return 122 of the 125 parameters of DEAL's Table 10, each for itself.
 
-    Its 22nd contact (friction and restitution) is the cube's, which the hand's overrule here: MuJoCo takes
-    the shape of higher priority. No motion tells the mass of the palm, which is fixed.
+    Its 22nd contact (friction and restitution) is the cube's, but MuJoCo uses the shape of higher priority,
+    here the hand's. No motion shows the mass of the palm, which is fixed.
     """
     contacts, joints, links = ({name: (name,) for name in names} for names in (GEOMS, JOINTS, LINKS))
     return _parameters(contacts, joints, links, PAPER_RESTITUTION)

@@ -1,6 +1,6 @@
 """Facts about gymnasium's ant: a free torso and eight joints with torque motors.
 
-:data:`DESCRIPTION` is made when it is first asked for, because it needs the model of the installed gymnasium.
+:data:`DESCRIPTION` is made on first use, since it needs the model of the installed gymnasium.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DEFAULT: Final[Mapping[str, float]] = {
     "leg.mass": 0.2,
     "torso.mass": 1.0,
 }
-"""The default preset: the paper's values, friction and restitution apart (see :func:`paper_space`)."""
+"""The default preset: the paper's values, except friction and restitution (see :func:`paper_space`)."""
 
 PAPER: Final[Mapping[str, float]] = {**DEFAULT, "contact.friction": 1.5, "contact.restitution": 0.01}
 """DEAL, Table 7."""
@@ -69,7 +69,7 @@ def description() -> RobotDescription:
     """Return the facts about the ant.
 
     Raises:
-        MissingExtraError: gymnasium, which carries the model, is not installed.
+        MissingExtraError: gymnasium, which contains the model, is not installed.
     """
     restitution = math.log(DEFAULT["contact.restitution"])
     damping_ratio = -restitution / math.hypot(math.pi, restitution)
@@ -117,7 +117,7 @@ def _space(values: Mapping[str, float]) -> ParameterSpace:
 def parameter_space() -> ParameterSpace:
     """Return the 11 parameters of DEAL's Table 7; the four legs are alike.
 
-    Contact friction and restitution are the floor's, which rules every contact (geom priority). "Motor
+    Contact friction and restitution are the floor's, which determines every contact (geom priority). "Motor
     friction" is dry friction of the joint. "Leg" is the link between hip and ankle, "foot" the one after it.
     """
     return _space(DEFAULT)
@@ -126,9 +126,9 @@ def parameter_space() -> ParameterSpace:
 def paper_space() -> ParameterSpace:
     """Return the same with the values of DEAL's Table 7.
 
-    Two of them are odd. A restitution of 0.01 bounces to 1/10000 of the height: nothing tells it from 0.002
-    or 0.05 but the small change of the contact's damping, and MuJoCo has no restitution at all (see
-    ``geom_restitution``); the default preset has 0.04, so that a factor 20 to either side stays below 1. A
+    Two of them are odd. A restitution of 0.01 bounces to 1/10000 of the height. Only a small change of the
+    contact's damping distinguishes it from 0.002 or 0.05, and MuJoCo has no restitution at all (see
+    ``geom_restitution``). The default preset has 0.04, so that a factor 20 to either side stays below 1. A
     friction of 1.5 is rubber on rubber; the default preset has 1, gymnasium's own.
     """
     return _space(PAPER)

@@ -1,7 +1,7 @@
-"""The ant's MJCF, prepared from the file that the installed gymnasium carries; nothing of it is copied here.
+"""The ant's MJCF, prepared from the file in the installed gymnasium; the file is not copied here.
 
-What is changed: feet, actuators and default pose get names; the values of the parameter preset are written;
-the floor alone rules contacts; textures go (a 1278-pixel cube map makes every copy of the model 29 MB).
+Changes: feet, actuators and default pose get names; the parameter preset's values are written; the floor
+alone determines contacts; textures are removed (a 1278-pixel cube map makes every copy of the model 29 MB).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def prepare(text: str, values: Mapping[str, float]) -> str:
         values: Parameter name -> value, as in ``drivers.ant.description``; all 11.
 
     Raises:
-        ConfigurationError: The file is not the one this was written for.
+        ConfigurationError: The file is not the expected one.
     """
     return prepare_model(text, _prepare, values, "ant.xml of gymnasium 1.x")
 
@@ -42,7 +42,7 @@ def prepare(text: str, values: Mapping[str, float]) -> str:
 def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
     root.remove(find(root, "asset"))
     root.remove(find(root, "custom"))
-    # Runge-Kutta with a 10 ms step costs four evaluations a step; the damping wants an implicit integrator.
+    # Runge-Kutta with a 10 ms step costs four evaluations per step; the damping needs an implicit integrator.
     option = find(root, "option")
     option.set("integrator", "implicitfast")
     option.set("timestep", repr(STEP_S))
@@ -75,7 +75,7 @@ def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
 
 
 def prepared_path(values: Mapping[str, float]) -> Path:
-    """Return the prepared MJCF in the user's cache folder, written if it is not there yet.
+    """Return the prepared MJCF in the user's cache folder; it is written if missing.
 
     Raises:
         MissingExtraError: gymnasium is not installed.

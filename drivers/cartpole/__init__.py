@@ -1,1 +1,1 @@
-"""The cart-pole: its description, its protocol, the robot that speaks it and an emulator that answers it."""
+"""The cart-pole: description, protocol, driver and emulator."""

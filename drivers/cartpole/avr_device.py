@@ -1,4 +1,4 @@
-"""The firmware's AVR image under simavr, tied to the mechanics pin by pin: a device for the emulator."""
+"""The firmware's AVR image under simavr, connected to the mechanics pin by pin: a device for the emulator."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from deal_hw.errors import ConfigurationError, ProtocolError
 from deal_hw.types import Status
 
 _BYTES_PER_TICK = 99
-"""One less than 1 Mbaud carries in 1 ms, so that none is left over."""
+"""One byte less than 1 Mbaud carries in 1 ms, so that no byte is left over."""
 _INSTALL = "apt-get install gcc libc6-dev gcc-avr avr-libc libsimavr-dev libelf-dev, or use --firmware python"
 
 
@@ -29,7 +29,7 @@ class Rig:
     """How the emulated cart-pole is built; as in firmware/rig.h.
 
     Attributes:
-        m_per_count: Travel of the cart for one count of its encoder [m].
+        m_per_count: Cart travel per count of its encoder [m].
         counts_per_turn: Counts of the pole's encoder for one turn.
         switch_m: Where the limit switches close, from the middle [m].
         full_force_n: Force on the cart with the PWM fully on [N].
@@ -88,7 +88,7 @@ def library() -> ctypes.CDLL:
 
 
 def eeprom(settings: Settings, full_force_n: float) -> bytes:
-    """Return what the chip's EEPROM holds: the settings with their CRC, little-endian."""
+    """Return the contents of the chip's EEPROM: the settings with their CRC, little-endian."""
     data = struct.pack(
         "<5I2H",
         settings.stiffness_trim,
@@ -103,16 +103,16 @@ def eeprom(settings: Settings, full_force_n: float) -> bytes:
 
 
 class Chip:
-    """An ATmega328P with the firmware's image: pins and bytes, a millisecond a call.
+    """An ATmega328P with the firmware's image: pins and bytes, one millisecond per call.
 
     Attributes:
         outputs: Mean PWM, lamps and cycles of the last millisecond.
         longest_step: Most cycles that a control step took so far, interrupts included.
         asleep: Cycles without anything to do so far.
-        complaints: Errors that the simulator saw so far, such as a byte that came before the last was read.
+        complaints: Errors in the simulator so far, such as a byte that arrived before the last one was read.
 
     Args:
-        memory: What its EEPROM holds, from address 0.
+        memory: Contents of its EEPROM, from address 0.
 
     Raises:
         ConfigurationError: avr-gcc, a C compiler or simavr is missing, or the image cannot be read.
@@ -138,8 +138,8 @@ class Chip:
         """Run a millisecond; return the bytes sent in it.
 
         Args:
-            cart_counts: By how much the cart's encoder turns.
-            pole_counts: By how much the pole's does.
+            cart_counts: Motion of the cart's encoder.
+            pole_counts: Motion of the pole's encoder.
             switches: Whether the left and the right limit switch are closed.
             data: Bytes from the host; they come as fast as 1 Mbaud carries them, also in later calls.
 
@@ -152,14 +152,17 @@ class Chip:
             self._board, cart_counts, pole_counts, *switches, rx, len(rx), self._out, ctypes.byref(outputs)
         )
         if outputs.crashed:
-            raise ConfigurationError("the chip's program ended; this is an error of the firmware")
+            raise ConfigurationError(
+                "the chip's program ended, which is an error of the firmware; report "
+                "it, or use --firmware python"
+            )
         self.longest_step = max(self.longest_step, outputs.longest_step)
         self.asleep += outputs.asleep
         self.complaints += outputs.complaints
         return self._out.raw[:length]
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the simulator's memory."""
         self._library.board_close(self._board)
         self._board = None
 
@@ -167,17 +170,17 @@ class Chip:
 class AvrDevice(EmulatedDevice):
     """A chip on a cart-pole.
 
-    The chip sees no more than its pins: edges of two quadrature encoders, two limit switches, the UART. Its
-    PWM, averaged over each millisecond, is the force on the cart. Noise and jitter of the profile do not act:
-    counts are what the encoders count. The whole latency lies between a command and its action.
+    The chip sees only its pins: edges of two quadrature encoders, two limit switches, the UART. Its PWM,
+    averaged over each millisecond, is the force on the cart. Noise and jitter of the profile have no effect,
+    since encoders count exactly. The whole latency is between a command and its action.
 
     Attributes:
         chip: The chip.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
-        start_angle_rad: Where the hand sets the pole when homing [rad]; None: within +-0.03 rad, by the seed.
-        build: How the cart-pole is built.
+        start_angle_rad: Pole angle set by hand when homing [rad]; None: within +-0.03 rad, by the seed.
+        build: Dimensions of the cart-pole.
 
     Raises:
         ConfigurationError: avr-gcc, a C compiler or simavr is missing, or the image cannot be read.
@@ -204,14 +207,14 @@ class AvrDevice(EmulatedDevice):
 
     @property
     def mode(self) -> str:
-        """What the motor does: "idle" and "held" are without torque, "homing" and "armed" are not."""
+        """State of the motor: without torque in "idle" and "held", with torque in "homing" and "armed"."""
         if self._mechanics.held:
             return "held"
         return "armed" if self.armed else "homing" if Status.HOMING in self._status else "idle"
 
     @property
     def watchdog(self) -> bool:
-        """Whether the last state frame said that commands had stayed away."""
+        """Whether the last state frame reported missing commands."""
         return Status.WATCHDOG in self._status
 
     def tick(self) -> bytes:
@@ -224,7 +227,7 @@ class AvrDevice(EmulatedDevice):
         counts = self._counts()
         cart, _ = mechanics.position
         turns = counts[1] - self._counted[1]
-        # The hand sets the pole by the short way; the simulator's angle may jump by whole turns then.
+        # The hand moves the pole the short way, so the simulator's angle may jump by whole turns.
         turns = (turns + build.counts_per_turn // 2) % build.counts_per_turn - build.counts_per_turn // 2
         data, self._inbox = self._inbox, b""
         switches = (cart <= -build.switch_m, cart >= build.switch_m)
@@ -241,12 +244,12 @@ class AvrDevice(EmulatedDevice):
         return out
 
     def close(self) -> None:
-        """Give the simulator's memory back."""
+        """Free the simulator's memory."""
         self.chip.close()
 
     def _counts(self) -> tuple[int, int]:
-        """Return where the encoders are at the end of this millisecond, if nothing pushes meanwhile."""
-        # Without that foresight all edges would come a millisecond late, and act like a lighter cart.
+        """Return the encoders' counts at the end of this millisecond without a force."""
+        # Without this prediction all edges would come a millisecond late, with the effect of a lighter cart.
         motor = self._mechanics.motor()
         _, pole, _, pole_velocity = self._mechanics.truth_row()
         cart = motor.position + motor.velocity * 1e-3

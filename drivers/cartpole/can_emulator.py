@@ -24,7 +24,7 @@ from deal_hw.drivers.transports.slcan_transport import (
 )
 
 _BUFFERED: Final = 3
-"""Frames that wait in the adapter while nobody acknowledges the first."""
+"""Most frames waiting in the adapter while the first is not acknowledged."""
 _SECOND_DEVICE: Final = 0x5EC0_0000
 
 
@@ -35,9 +35,9 @@ class SlcanAdapter:
         received_bytes: How many characters have come from the host.
 
     Args:
-        devices: What is on the bus, whose bytes are frames as :data:`FRAME` lays them out; the first is the
+        devices: Devices on the bus, whose bytes are frames in the layout of :data:`FRAME`; the first is the
             cart-pole itself.
-        faults: What goes wrong on the bus.
+        faults: Faults of the bus.
     """
 
     def __init__(self, devices: list[EmulatedDevice], faults: CanFaults) -> None:
@@ -64,17 +64,17 @@ class SlcanAdapter:
 
     @property
     def mode(self) -> str:
-        """What the motor does."""
+        """State of the motor."""
         return self._devices[0].mode
 
     @property
     def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away."""
+        """Whether the motor was stopped by missing commands."""
         return self._devices[0].watchdog
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the bus now."""
+        """Current fault of the bus."""
         if self._driven_off:
             return "bus-off"
         if self._full:
@@ -97,7 +97,7 @@ class SlcanAdapter:
         if not self._hears:
             return answers
         lines = [[_line(f) for f in FRAME.iter_unpack(frames)] for frames in sent]
-        # Two devices under one number talk into each other's messages.
+        # Two devices with one number corrupt each other's messages.
         longest = max(map(len, lines))
         return answers + b"".join(own[k] for k in range(longest) for own in lines if k < len(own))
 
@@ -115,7 +115,7 @@ class SlcanAdapter:
                 self._is_open = True
             case b"C":
                 self._is_open = False
-                # Closing and opening helps only once what drove it off the bus is over.
+                # Closing and opening helps only after the cause of the bus-off is over.
                 self._bus_off = self._driven_off
                 self._waiting = 0
             case b"F":
@@ -192,7 +192,7 @@ def can_device(truth: CartpoleTruth, node: int = NODE, version: int = 1, identit
 
 
 def can_devices(truth: CartpoleTruth, faults: CanFaults) -> list[EmulatedDevice]:
-    """Return the cart-pole on a bus, and what else is there by its faults."""
+    """Return the cart-pole on a bus, and the additional devices of its faults."""
     identities = (0, _SECOND_DEVICE) if faults.duplicate_node else (0,)
     return [can_device(truth, faults.node, faults.dbc_version, identity) for identity in identities]
 
@@ -207,10 +207,10 @@ def adapter_emulator(
     """Return an emulated serial CAN adapter with devices on its bus.
 
     Args:
-        devices: What is on the bus; the first is the cart-pole itself.
+        devices: Devices on the bus; the first is the cart-pole itself.
         link: A symbolic link to make to the port.
-        hazards: What goes wrong on purpose.
-        port: Makes of the path what a host gives as ``--port``.
+        hazards: Faults on purpose.
+        port: Converts the path to a host's ``--port``.
     """
     return CartpoleEmulator(
         SlcanAdapter(devices, hazards.can), link, hazards, port=lambda path: port(f"slcan:{path}")

@@ -3,7 +3,7 @@
 The table of signals is assets/cartpole.dbc.
 
 A state takes five frames, a target three and an info five. The last frame of each carries a CRC over all of
-them: a sample that lost a frame, or mixes two samples, is refused as a whole.
+them: a sample with a lost frame, or with frames of two samples, is refused completely.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Angle:
-    """The pole's encoder alone, where a motor drive has the cart: one sample.
+    """One sample of the pole's encoder alone, if a motor drive has the cart.
 
     Attributes:
         sequence: Low byte of the sample's number.
@@ -47,7 +47,7 @@ class Angle:
 CanMessage = protocol.AnyMessage | Angle
 NODE: Final = 1
 LAST_NODE: Final = 62
-"""Numbers are 1 to 62: 0 would take ids that CANopen uses for its network, 63 is a new ODrive's."""
+"""Largest node number. 0 would use ids of CANopen's network management, 63 is that of a new ODrive."""
 STATES_PER_HEARTBEAT: Final = 20
 FRAME: Final = struct.Struct("<IB3x8s")
 """One frame as bytes: Linux' ``struct can_frame``, id, length and eight data bytes."""
@@ -82,7 +82,7 @@ def frame_id(name: str, node: int) -> int:
 
 
 def accept(*nodes: int) -> tuple[tuple[int, int], ...]:
-    """Return the filter, ids and masks, that lets through what nodes with these numbers send and get."""
+    """Return the filter, ids and masks, that passes the frames to and from nodes with these numbers."""
     return tuple((node << _NUMBER_BITS, 0x7FF & ~0x1F) for node in nodes)
 
 
@@ -90,24 +90,24 @@ def check_node(node: int) -> int:
     """Return a node's number.
 
     Raises:
-        ConfigurationError: It is none.
+        ConfigurationError: It is outside the range.
     """
     if not 1 <= node <= LAST_NODE:
-        raise ConfigurationError(f"node {node}: CAN nodes of deal-hw are numbered 1 to {LAST_NODE}")
+        raise ConfigurationError(f"node {node}: allowed CAN node numbers are 1 to {LAST_NODE}")
     return node
 
 
 class CanLink:
-    """One side of a CAN wire; bytes are whole frames as :data:`FRAME` lays them out.
+    """One side of a CAN wire; bytes are whole frames in the layout of :data:`FRAME`.
 
     Attributes:
         errors: Messages that were corrupt or unknown so far.
-        torn: Messages that lost a frame so far. A state's number tells a host that it is missing.
-        fault: Two devices under one number; "" for nothing.
+        torn: Messages that lost a frame so far; hosts detect a missing state by its number.
+        fault: Two devices with one number; "" for none.
 
     Args:
         node: The device's number.
-        version: Of the protocol, for devices under test.
+        version: Version of the protocol, for devices under test.
         unique_id: The device's serial number, for its heartbeat; a host has none.
     """
 
@@ -123,10 +123,10 @@ class CanLink:
 
     @property
     def hint(self) -> str:
-        """What to check where frames come but no answer."""
+        """What to check if frames arrive, but no answer."""
         return (
-            f"node {self._node} sends, but does not answer in this protocol; is it another device, or does "
-            "its firmware have another DBC?"
+            f"node {self._node} sends, but does not answer in this protocol; check that it is the "
+            "cart-pole, and that its firmware has the same DBC"
         )
 
     def encode(self, message: CanMessage) -> bytes:
@@ -150,15 +150,15 @@ class CanLink:
         return out
 
     def decode(self, data: bytes) -> Iterator[protocol.AnyMessage]:
-        """Take frames; return the messages that they complete, and count what is none."""
+        """Take frames; return the messages that they complete, and count invalid ones."""
         return (message for message in self.decode_all(data) if not isinstance(message, Angle))
 
     def feasible(self, target: protocol.Target) -> protocol.Target:
-        """Return a target as this wire carries it."""
+        """Return a target with the wire's resolution."""
         return target
 
     def decode_all(self, data: bytes) -> Iterator[CanMessage]:
-        """Do the same with messages that only CAN has."""
+        """As :meth:`decode`, including messages that only CAN has."""
         if len(data) % FRAME.size:
             self.errors += 1
             return
@@ -179,11 +179,11 @@ class CanLink:
         index = names.index(name)
         parts = self._parts.get(group)
         if index == 0:
-            # A first frame while others are missing: that message is torn.
+            # A first frame while others are missing: the earlier message is incomplete.
             self.torn += bool(parts)
             parts = self._parts[group] = []
         if parts is None:
-            return None  # The rest of a message whose beginning is lost or was not heard.
+            return None  # The rest of a message whose beginning was lost.
         if len(parts) != index:
             self.torn += 1
             self._parts[group] = None
@@ -204,14 +204,14 @@ class CanLink:
         values: dict[str, int] = {}
         for name, part in zip(names, parts, strict=True):
             values |= database()[name].decode_simple(part, decode_choices=False, scaling=False)  # type: ignore[arg-type]
-        # Who a peer is can be asked, and a motor switched off, in any version.
+        # Requests for the peer's identity and for motor-off work in any version.
         timeless = (protocol.Hello, protocol.Info, protocol.Stop)
         if _GROUPS[group] not in timeless and values.get("Version", self._version) != self._version:
             raise FrameError(f"{group}: of version {values['Version']}, this side speaks {self._version}")
         return _from_values(_GROUPS[group], values)
 
     def _crc(self, group: str, parts: Sequence[bytes]) -> int:
-        # The version goes in, so that the frames of another version are refused; that of info never does.
+        # The version is included, so that frames of another version are refused; not in info.
         version = 0 if group == "Info" else self._version
         return crc16.ibm_3740(bytes([version]) + b"".join(parts)[:-2])
 
@@ -291,7 +291,7 @@ def _to_values(message: CanMessage, version: int) -> dict[str, int]:
             if len(kind) > 16:
                 raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
             major, minor, patch = message.firmware
-            # A device of another version says so, whatever the message was made with.
+            # A device of another version reports its own version.
             told = version if message.version == protocol.VERSION else message.version
             return {
                 "Request": message.request,

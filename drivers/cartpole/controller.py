@@ -1,4 +1,4 @@
-"""What the cart-pole's firmware does, by message and by tick; the wire and the mechanics plug in."""
+"""The cart-pole's firmware, by message and by tick, for any wire and mechanics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FIRMWARE_VERSION: Final = (0, 1, 0)
 
 
 class Mode(enum.Enum):
-    """What the motor does; only "homing" and "armed" may have torque."""
+    """State of the motor; only "homing" and "armed" may have torque."""
 
     IDLE = enum.auto()
     HOMING = enum.auto()
@@ -28,7 +28,7 @@ class Mode(enum.Enum):
 
 
 class Firmware(Protocol):
-    """What stands between a wire and the mechanics.
+    """The firmware between a wire and the mechanics.
 
     One tick is :meth:`receive` (where something came), :meth:`control`, and :meth:`report` where one is due.
 
@@ -36,22 +36,22 @@ class Firmware(Protocol):
 
     @property
     def homings(self) -> int:
-        """How often homing began; who moves the cart-pole home ends each with :meth:`finish_homing`."""
+        """Number of started homings; the mechanics end each with :meth:`finish_homing`."""
         ...
 
     @property
     def armings(self) -> int:
-        """How often the motor was armed; whoever holds the pole lets go then."""
+        """Number of times the motor was armed; the hand then releases the pole."""
         ...
 
     @property
     def mode(self) -> Mode:
-        """What the motor does."""
+        """State of the motor."""
         ...
 
     @property
     def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away, since it was last armed."""
+        """Whether the motor was stopped by missing commands since it was last armed."""
         ...
 
     @property
@@ -65,7 +65,7 @@ class Firmware(Protocol):
         ...
 
     def receive(self, data: bytes, motor: Motor) -> bytes:
-        """Handle what the host sent before this tick; return the answers."""
+        """Handle the host's bytes before this tick; return the answers."""
         ...
 
     def control(self, motor: Motor) -> tuple[float, bool]:
@@ -77,7 +77,7 @@ class Firmware(Protocol):
         ...
 
     def finish_homing(self) -> None:
-        """Take note that the cart is in the middle and the pole upright; nothing happens unless homing."""
+        """Note that the cart is in the middle and the pole upright; only has an effect while homing."""
         ...
 
 
@@ -91,7 +91,7 @@ class Controller:
     Args:
         servo: The position loop.
         unique_id: Serial number of the device.
-        command_delay: Called for every accepted target: it acts that many ticks after it was received.
+        command_delay: Called for every accepted target; returns the ticks from its reception to its action.
         link: The wire; serial frames by default.
     """
 
@@ -114,12 +114,12 @@ class Controller:
 
     @property
     def mode(self) -> Mode:
-        """What the motor does."""
+        """State of the motor."""
         return self._mode
 
     @property
     def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away, since it was last armed."""
+        """Whether the motor was stopped by missing commands since it was last armed."""
         return self._watchdog
 
     @property
@@ -133,12 +133,12 @@ class Controller:
         return self._servo.setpoint
 
     def receive(self, data: bytes, motor: Motor) -> bytes:
-        """Handle what the host sent before this tick; return the answers."""
+        """Handle the host's bytes before this tick; return the answers."""
         answers = (self.handle(message, motor) for message in self._link.decode(data))
         return b"".join(self._link.encode(answer) for answer in answers if answer is not None)
 
     def handle(self, message: protocol.AnyMessage, motor: Motor) -> protocol.AnyMessage | None:
-        """Do what one message asks for; return the answer, None where there is none."""
+        """Handle one message; return the answer, or None."""
         match message:
             case protocol.Target():
                 self._take_target(message)
@@ -199,13 +199,13 @@ class Controller:
         )
 
     def finish_homing(self) -> None:
-        """Take note that the cart is in the middle and the pole upright; nothing happens unless homing."""
+        """Note that the cart is in the middle and the pole upright; only has an effect while homing."""
         if self._mode is Mode.HOMING:
             self._mode = Mode.IDLE
             self._homed = True
 
     def _take_target(self, target: protocol.Target) -> None:
-        # A repeated number is a stuck host or a stuck adapter: it must not keep the watchdog quiet.
+        # A repeated number comes from a stuck host or adapter; it must not reset the watchdog.
         if self._mode is not Mode.ARMED or target.sequence == self._command_sequence:
             return
         self._command_sequence = target.sequence
@@ -230,7 +230,7 @@ class Controller:
 
     def _answer(self, request: protocol.Arm | protocol.Stop | protocol.Home, motor: Motor) -> protocol.Ack:
         result = protocol.Result.DONE
-        # A host that missed the answer asks again under the same number; the request must not act twice.
+        # A host that missed the answer repeats the request with the same number; it must not act twice.
         if (key := (request.TYPE, request.request)) != self._last_request:
             result = self._act(request, motor)
             self._last_request = key if result is protocol.Result.DONE else None

@@ -2,7 +2,7 @@
 
 The numbers of the mechanics are a plausible bench build, not a measured one: the paper's Table 8 prints the
 sizes (0.3 m, 0.1 kg, 0.3 kg) beside frictions and gains that no such cart could have (a pole friction of 0.1
-N·m is two thirds of the pole's whole gravity torque), so those were replaced; each source says which.
+N·m is two thirds of the pole's whole gravity torque), so those were replaced; each source notes it.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ DESCRIPTION = RobotDescription(
 def parameter_space() -> ParameterSpace:
     """Return all 11 parameters (K11); search ranges are a factor 5 to either side of the nominal value.
 
-    The four servo parameters are what the device does when it is sent the description's default gains and
-    limits; when it is sent others, they scale along.
+    The four servo parameters are the device's behaviour at the description's default gains and limits; with
+    other commanded values they scale in proportion.
     """
 
     def log(name: str, kind: str, element: str, unit: str, nominal: float) -> Parameter:
@@ -110,8 +110,8 @@ def parameter_space() -> ParameterSpace:
 def k9_space() -> ParameterSpace:
     """Return K9: pole length and pole mass measured with ruler and scale, the other nine searched.
 
-    Without that the model is structurally unidentifiable: scaling all masses, frictions, gains and the effort
-    limit together leaves every trajectory as it is.
+    Without these two the model is structurally unidentifiable: scaling all masses, frictions, gains and the
+    effort limit together leaves every trajectory unchanged.
     """
     return parameter_space().with_known({"pole.length": POLE_LENGTH_M, "pole.mass": POLE_MASS_KG})
 

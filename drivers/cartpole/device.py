@@ -21,7 +21,7 @@ TICK_NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class TrueTrajectory:
-    """What really happened, for benches; it never goes over the wire and never to a calibrator.
+    """The true motion, for benches; never sent over the wire or to a calibrator.
 
     Attributes:
         tick: Device ticks, (T,).
@@ -39,7 +39,7 @@ class TrueTrajectory:
 
 
 def python_firmware(truth: CartpoleTruth, mechanics: Mechanics, link: Link | None = None) -> Firmware:
-    """Return the firmware in Python, whose servo is what the truth says; on serial frames by default."""
+    """Return the firmware in Python, with the truth's servo; on serial frames by default."""
     servo = Servo(truth.parameters, mechanics.timestep_s)
     return Controller(servo, unique_id(truth), mechanics.command_delay, link)
 
@@ -48,10 +48,10 @@ class EmulatedDevice(abc.ABC):
     """A device on the mechanics of the emulated cart-pole, in device time: bytes in, bytes out.
 
     Attributes:
-        received_bytes: How many have come from the host.
+        received_bytes: Number of bytes from the host.
 
     Args:
-        mechanics: What it moves and measures.
+        mechanics: The mechanics.
         keep_truth: Whether to keep the true trajectory for :meth:`true_trajectory`.
     """
 
@@ -112,7 +112,7 @@ class EmulatedDevice(abc.ABC):
         """Return the true states of all ticks so far.
 
         Raises:
-            ValueError: They were not kept.
+            ValueError: The device was made with ``keep_truth=False``.
         """
         if self._kept is None:
             raise ValueError("the device was made with keep_truth=False")
@@ -127,10 +127,10 @@ class EmulatedDevice(abc.ABC):
 class CartpoleDevice(EmulatedDevice):
     """Firmware and mechanics of an emulated cart-pole.
 
-    Control tick k, at device time k ms: (1) handle what was received, let due commands act; (2) slew the
+    Control tick k, at device time k ms: (1) handle received bytes, let due commands act; (2) slew the
     set-point; (3) force from the state at the start of the tick; (4) one physics step with that force. A
     state frame at tick k reports the state before step (4). Tick k runs when :meth:`advance_to` passes k ms,
-    so bytes that come at k ms sharp are handled in tick k + 1.
+    so bytes that arrive at exactly k ms are handled in tick k + 1.
 
     Until armed the motor is off: the pole hangs, or is held upright by a hand after homing. Between arming
     and the first target the force is zero, because gains come only with targets.
@@ -138,7 +138,7 @@ class CartpoleDevice(EmulatedDevice):
     Args:
         truth: Hidden parameters, latency, profile and seed.
         keep_truth: Whether to keep the true trajectory for :meth:`true_trajectory`.
-        start_angle_rad: Where the hand sets the pole when homing [rad]; None: within +-0.03 rad, by the seed.
+        start_angle_rad: Pole angle set by hand when homing [rad]; None: within +-0.03 rad, by the seed.
         firmware: Makes the firmware for these mechanics; the one in Python, on serial frames, by default.
     """
 

@@ -60,9 +60,7 @@ class SerialLink:
     """COBS frames with a CRC, as on the serial wire."""
 
     resync: ClassVar[bytes] = protocol.DELIMITER
-    hint: ClassVar[str] = (
-        f"is another device on it, or does it use another baud rate than {protocol.BAUD_RATE}?"
-    )
+    hint: ClassVar[str] = f"check for another device on it, or another baud rate than {protocol.BAUD_RATE}"
 
     def __init__(self) -> None:
         self.fault = ""

@@ -71,7 +71,9 @@ class OdriveSettings:
             raise ConfigurationError(f"drive node {self.drive}: an ODrive's number is 0 to 62")
         check_node(self.encoder)
         if self.drive == self.encoder:
-            raise ConfigurationError(f"drive and encoder have the same node number {self.drive}")
+            raise ConfigurationError(
+                f"drive and encoder have the same node number {self.drive}; give them different ones"
+            )
         if bool(self.enable_watchdog) != bool(self.watchdog_timeout):
             raise ConfigurationError(
                 "enable_watchdog and watchdog_timeout belong together: give both or neither"
@@ -119,7 +121,7 @@ def drive_command(target: protocol.Target, s: OdriveSettings) -> DriveCommand:
         FrameError: A stiffness without damping: the cascade has none.
     """
     if target.stiffness_mn_m and not target.damping_mns_m:
-        raise FrameError("an ODrive has no stiffness without damping; ask for a damping above 0")
+        raise FrameError("an ODrive has no stiffness without damping; send a damping above 0")
     gain = target.stiffness_mn_m / target.damping_mns_m if target.damping_mns_m else 0.0
     torque_nm = target.effort_limit_mn / 1e3 / s.newtons_per_nm
     return DriveCommand(
@@ -190,12 +192,12 @@ class OdriveLink:
         """What to check where frames come but no answer."""
         drive, encoder = self._s.drive, self._s.encoder
         if self._heartbeat_us is None:
-            return f"no heartbeat of an ODrive at node {drive}; is that its axis0.config.can.node_id?"
+            return f"no heartbeat of an ODrive at node {drive}; check its axis0.config.can.node_id"
         if self._info is None:
-            return f"the pole encoder at node {encoder} does not answer; is that its number?"
+            return f"the pole encoder at node {encoder} does not answer; check its node number"
         return (
-            "the ODrive did not confirm its watchdog; are enable_watchdog and watchdog_timeout the numbers "
-            "in its firmware's flat_endpoints.json?"
+            "the ODrive did not confirm its watchdog; compare enable_watchdog and watchdog_timeout with its "
+            "firmware's flat_endpoints.json"
         )
 
     def feasible(self, target: protocol.Target) -> protocol.Target:

@@ -117,8 +117,8 @@ class CartpoleRobot(Robot):
                 self._pump(max(0, deadline_ns - self._clock.now_ns()) / 1e9)
             except TransportTimeoutError as error:
                 raise TransportTimeoutError(
-                    f"cartpole: no state within {timeout_s:g} s; is the device powered, is the cable good "
-                    f"({self.transport_errors} transport errors so far)?{self._trouble}"
+                    f"cartpole: no state within {timeout_s:g} s; check the device's power and the cable "
+                    f"({self.transport_errors} transport errors so far){self._trouble}"
                 ) from error
         return self._states.popleft()
 
@@ -194,8 +194,8 @@ class CartpoleRobot(Robot):
                 f"{self._where}: {received} bytes came but no answer to hello; {self._link.hint}"
             )
         raise TransportTimeoutError(
-            f"{self._where}: no answer to hello within {HELLO_TIMEOUT_S:g} s; is the device powered "
-            f"and is this its port?{self._trouble}"
+            f"{self._where}: no answer to hello within {HELLO_TIMEOUT_S:g} s; check the device's power and "
+            f"the port{self._trouble}"
         )
 
     def _hear_info(self, timeout_s: float) -> tuple[protocol.Info | None, int]:
@@ -217,7 +217,7 @@ class CartpoleRobot(Robot):
     def _check_info(self, info: protocol.Info) -> None:
         if info.kind != protocol.DEVICE_KIND:
             raise WrongDeviceError(
-                f"{self._where}: the device says it is {info.kind!r}, not {protocol.DEVICE_KIND!r}; "
+                f"{self._where}: the device reports the kind {info.kind!r}, not {protocol.DEVICE_KIND!r}; "
                 "choose another port"
             )
         if info.version != protocol.VERSION:
@@ -290,7 +290,7 @@ class CartpoleRobot(Robot):
     @property
     def _trouble(self) -> str:
         trouble = getattr(self._transport, "trouble", "")
-        return f" The adapter reports: {trouble}" if trouble else ""
+        return f". The adapter reports: {trouble}" if trouble else ""
 
     @property
     def _where(self) -> str:

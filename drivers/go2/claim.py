@@ -1,12 +1,12 @@
-"""The exclusive claim on a Go2, on the wire: who commands it, so that a second program is refused at once.
+"""The exclusive claim on a Go2, on the wire, by which a second commander is refused at once.
 
 Claims are messages on a topic of our own, which robot and sport mode ignore. A claim has a life cycle:
 
     asking --nobody answered for LISTEN_S--> held --every REFRESH_S--> held ... --> released
        └──── somebody holds it, or asks with a smaller number: refused
 
-Whoever holds it answers each asking at once and repeats itself; whoever falls silent for LISTEN_S has lost
-it: the claim has expired. Programs that know nothing of claims are found by their commands (:mod:`takeover`).
+The holder answers each request at once and repeats its claim. A claim that is silent for LISTEN_S has
+expired. Programs without claims are detected by their commands ( :mod:`takeover`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from deal_hw.errors import FrameError, PortBusyError, TransportError, TransportT
 from deal_hw.transport import Message, TopicTransport
 
 LISTEN_S: Final = 0.8
-"""How long nobody may have answered before the claim is held; who is silent for so long has lost it [s].
-Discovery over DDS takes up to some 0.3 s of it."""
+"""Time without an answer after which the claim is held, and after which a silent claim has expired [s].
+Discovery over DDS takes up to about 0.3 s of it."""
 REFRESH_S: Final = 0.2
 _ASK_S: Final = 0.1
 _JOIN_S: Final = 2.0
@@ -34,13 +34,13 @@ ASKING, HELD, RELEASED = "asking", "held", "released"
 
 
 class WireClaim:
-    """Claims the robot on a transport of its own; a thread keeps the claim alive.
+    """Claims the robot on its own transport; a thread keeps the claim alive.
 
     Args:
-        transport: Topics of the robot; not open, and nobody else's.
+        transport: Topics of the robot; not open, and not shared.
         clock: For the waiting.
-        holder: Who claims, in words for others to read.
-        identity: Tells claims apart; of two that ask at the same time the smaller wins. Random by default.
+        holder: Description of the claimant for other programs.
+        identity: Number of the claim; of two simultaneous requests the smaller one wins. Random by default.
     """
 
     def __init__(
@@ -52,10 +52,10 @@ class WireClaim:
         self._thread: threading.Thread | None = None
 
     def acquire(self) -> None:
-        """Open the transport, ask, and hold the claim from now on.
+        """Open the transport, request the claim, and hold it from now on.
 
         Raises:
-            PortBusyError: Somebody else holds it, or asked first.
+            PortBusyError: Another program holds it, or requested it first.
             TransportError: The transport cannot be opened.
         """
         self._transport.declare(publish=[CLAIM], subscribe=[CLAIM])
@@ -70,7 +70,7 @@ class WireClaim:
         self._thread.start()
 
     def release(self) -> None:
-        """Give the claim up and close the transport; idempotent."""
+        """Release the claim and close the transport; idempotent."""
         self._end.set()
         thread, self._thread = self._thread, None
         if thread is not None:
@@ -92,7 +92,7 @@ class WireClaim:
         if claim["state"] == HELD or (claim["state"] == ASKING and claim["id"] < self._identity):
             raise PortBusyError(
                 f"go2: the robot is in use: {claim['who']} commands it, or is about to. Two programs that "
-                "command one robot make it jump. End that run first (Ctrl-C in its terminal)"
+                "command one robot make it jump. End the other run first (Ctrl-C in its terminal)"
             )
 
     def _keep(self) -> None:
@@ -105,7 +105,8 @@ class WireClaim:
                     next_ns = now_ns + round(REFRESH_S * 1e9)
                 self._listen(max(next_ns - now_ns, 0) * 1e-9, self._answer)
             except TransportError:
-                # The link is down: the control process deals with that. The claim goes on once it is back.
+                # The connection is lost, which the control process handles. The claim continues when it is
+                # back.
                 self._end.wait(REFRESH_S)
                 with contextlib.suppress(TransportError):
                     self._transport.reopen()
@@ -115,7 +116,7 @@ class WireClaim:
             self._say(HELD)
 
     def _listen(self, timeout_s: float, handle: Callable[[dict[str, Any]], None]) -> None:
-        """Hand what another says to ``handle``; return after one message or the time [s]."""
+        """Pass another claim's message to ``handle``; return after one message or the time [s]."""
         try:
             message = self._transport.receive(timeout_s)
         except TransportTimeoutError:

@@ -1,4 +1,4 @@
-"""The commands on their way to the motors: encoded, numbered, held in force."""
+"""Sends commands to the motors: encodes, numbers and repeats them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand
 
 PASSIVE_COPIES: Final = 3
-"""Messages get lost, and the last command must not: it is held for ever."""
+"""Number of sends of the last command: it is held for ever, and single messages may be lost."""
 
 
 class CommandSender:
@@ -53,7 +53,7 @@ class CommandSender:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all commands."""
+        """Clear the memory of commands."""
         self.in_force, self.sequence = b"", -1
         self.echo.reset()
 
@@ -105,12 +105,12 @@ class CommandSender:
         return JointCommand(q, dq, kp, kd, tau, self.effort_limit.copy(), self._speed_limit.copy())
 
     def damp(self, position: FloatArray) -> None:
-        """Send the passive command for joints there, (J,) [rad]; it is none of the behaviour's: no number."""
+        """Send the passive command for joints at a position, (J,) [rad]; it is not numbered."""
         self.in_force = self._encoder.encode(self._passive_command(position))
         self.publish(topics.LOW_COMMAND, self.in_force)
 
     def repeat(self) -> None:
-        """Send the command in force again, the same bytes; nothing before the first."""
+        """Send the current command again, the same bytes; nothing before the first."""
         if self.in_force:
             self._transport.send(Message(topics.LOW_COMMAND, self.in_force, self._clock.now_ns()))
 

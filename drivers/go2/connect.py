@@ -1,4 +1,4 @@
-"""Finding a Go2 on a wire: whether one is there, and only one, or why none is heard."""
+"""Finding exactly one Go2 on a wire, or the reason why none is received."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from deal_hw.transport import TopicTransport
 
 CONNECT_TIMEOUT_S: Final = 5.0
 _FIRST_STATES: Final = 20
-"""Sound states with a running clock that make a Go2."""
+"""Number of valid states with a running clock that identify a Go2."""
 _TOO_MANY: Final = 20
-"""Messages that are no states, without one that is: then it is no Go2."""
+"""Number of messages without a valid state after which the device is no Go2."""
 
 
 def await_robot(
@@ -56,8 +56,8 @@ def _why_silent(transport: TopicTransport, stream: StateStream) -> str:
     where = getattr(transport, "port", type(transport).__name__)
     if stream.stale:
         return (
-            f"go2 on {where}: states come, but {stream.standstill}; a robot that hangs (restart it), or a "
-            "simulator that is paused?"
+            f"go2 on {where}: states arrive, but {stream.standstill}; restart the robot, or continue a "
+            "paused simulator"
         )
     return (
         f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{_seen_writing(transport)} Is "

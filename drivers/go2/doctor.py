@@ -91,7 +91,7 @@ class Go2Doctor:
                     "states",
                     Level.WARN,
                     "head and checksum of the states are not checked",
-                    "leave --state-check out where the robot makes both as deal-hw expects",
+                    "leave --state-check out if the robot's head and checksum are as deal-hw expects",
                 )
             yield from _judge_states(heard, self._seconds)
             mode = None if self._simulated else (yield from self._ask_mode())
@@ -190,7 +190,7 @@ class Go2Doctor:
             "link",
             Level.WARN if slow else Level.OK,
             text,
-            "a cable instead of wireless; stop what else loads network and computer" if slow else "",
+            "use a cable instead of wireless; stop other load on network and computer" if slow else "",
         )
         yield _judge_mode(name)
         return name
@@ -208,7 +208,7 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
         yield Finding(
             "states",
             Level.FAIL,
-            f"states come, but nothing in them changes: {heard.repeated} times the same",
+            f"states arrive, but do not change: {heard.repeated} times the same",
             "let the simulation run: it is paused",
         )
         return
@@ -217,8 +217,8 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
             "states",
             Level.FAIL,
             f"no states came on {topics.LOW_STATE} within {seconds:g} s",
-            "is the robot on and started up (one minute), is this the right interface or endpoint, does a "
-            "firewall stand between?",
+            "check that the robot is on and has started up (one minute), the interface or end point, and "
+            "the firewall",
         )
         return
     gaps = np.diff(heard.stamps) * 1e-9
@@ -228,7 +228,7 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
         f"{np.percentile(gaps, 99) * 1e3:.2f} ms p99, {gaps.max() * 1e3:.2f} ms longest"
     )
     sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
-    remedy = "a cable instead of wireless, a faster or less busy computer" if sparse or late else ""
+    remedy = "use a cable instead of wireless, or a faster or less busy computer" if sparse or late else ""
     yield Finding("states", Level.WARN if remedy else Level.OK, text, remedy)
     if not heard.ticks:
         return
@@ -258,7 +258,8 @@ def _judge_refused(refused: Refusals, sound: int) -> Finding:
     )
     if sound:
         remedy = (
-            "states are corrupted on the way: another cable, no wireless; or does a second program send them?"
+            "states are corrupted on the way: use another cable, not wireless; check for a second program "
+            "that sends them"
         )
     else:
         remedy = refused.remedy
@@ -271,14 +272,14 @@ def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str) -> Itera
             "commands",
             Level.NOTE,
             f"{heard.commands} motor commands came while sport mode {mode!r} is active, probably its own",
-            "run doctor again after the release: nobody may command the motors then",
+            "run doctor again after the release: then no program may command the motors",
         )
     elif heard.commands:
         who = f" ({'; '.join(writers)})" if writers else ""
         yield Finding(
             "commands",
             Level.FAIL,
-            f"somebody else commands the motors: {heard.commands} messages{who}",
+            f"another program commands the motors: {heard.commands} messages{who}",
             "stop that program",
         )
     elif writers:

@@ -26,7 +26,8 @@ BUSY: Final = 7002
 ERRORS: Final[Mapping[int, str]] = {
     3102: "the request could not be sent",
     3104: "no answer in time",
-    3203: "the function is not there; the robot's firmware is older or newer than deal-hw knows",
+    3203: "the function is missing; the robot's firmware is older or newer than the versions that deal-hw "
+    "supports",
     3204: "the parameter is wrong",
     4201: "sport mode took too long",
     4205: "sport mode is not ready yet; wait until the robot has booted",
@@ -51,8 +52,8 @@ _ACT_S: Final = 5.0
 
 
 _UNHEARD: Final = (
-    "states arrive, but requests do not reach the robot, or it has no such services (a simulator?). A bridge "
-    "must carry rt/api/*/request and rt/api/*/response, too"
+    "states arrive, but requests do not reach the robot, or it has no such services, as in a simulator. A "
+    "bridge must also carry rt/api/*/request and rt/api/*/response"
 )
 
 

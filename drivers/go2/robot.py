@@ -31,9 +31,9 @@ from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
 STOP_BUTTONS: Final = "L2+B"
 PASSIVE_DELAY_NS: Final = 10_000_000
-"""States that were sensed sooner after the passive command say nothing about it [ns]."""
+"""States sensed within this time after the passive command do not confirm it [ns]."""
 BRIDGE_DELAY_NS: Final = 100_000_000
-"""What a bridge says sooner after the arming may be from before it [ns]."""
+"""A bridge's status within this time after the arming may be from before it [ns]."""
 PUBLISHED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES))
 SUBSCRIBED: Final = (
     topics.LOW_STATE,
@@ -43,7 +43,7 @@ SUBSCRIBED: Final = (
 )
 _QUEUE: Final = 4096
 _ENOUGH: Final = 3
-"""New states after the first command that show that the robot is still there."""
+"""Number of new states after the first command that confirm the connection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +66,12 @@ class Go2Info:
 class Go2Robot(Robot):
     """A Unitree Go2 at its motors' own level.
 
-    The robot does what the last command says, for ever: it has no arming and no watchdog, and without torque
-    it falls. Passive therefore means damping, and being armed is this driver's own knowledge: before ``arm``
-    it sends nothing, and after ``passive`` nothing but damping.
+    The robot holds the last command for ever: it has no arming and no watchdog, and without torque it falls.
+    Passive therefore means damping, and only this driver knows whether it is armed: before ``arm`` it sends
+    nothing, and after ``passive`` only damping.
 
-    ``home`` releases the robot's own controller (sport mode) and makes sure that nobody else commands the
-    motors; ``hand_back`` returns the robot to that controller. Whoever waits here keeps reading.
+    ``home`` releases the robot's own controller (sport mode) and checks that no other program commands the
+    motors; ``hand_back`` returns the robot to that controller. All waits here keep reading messages.
 
     Attributes:
         info: What the robot said of itself; None before ``connect``.
@@ -81,9 +81,9 @@ class Go2Robot(Robot):
         clock: The clock of the transport's stamps.
         stop_buttons: Buttons of the remote that stop a run while held together; "" for none.
         state_check: What a state must pass: "strict", or "length" for firmware or a simulator that makes head
-            or checksum by another rule. A state that was corrupted on the way then passes for a true one.
-        support_check: Whether ``home`` makes sure that the robot is on the floor, or on a stand, as the
-            description says.
+            or checksum by another rule. Corrupted states are then not detected.
+        support_check: Whether ``home`` checks that the robot is on the floor, or on a stand, as in the
+            description.
     """
 
     description: ClassVar[RobotDescription] = DRIVER
@@ -115,7 +115,7 @@ class Go2Robot(Robot):
         self._forget()
 
     def _forget(self) -> None:
-        """Be as new; an open transport still serves to make the robot passive."""
+        """Reset; an open transport can still make the robot passive."""
         self.info: Go2Info | None = None
         self._stream.reset()
         self._sender.reset()
@@ -162,7 +162,7 @@ class Go2Robot(Robot):
         self._transport.reopen()
 
     def home(self, timeout_s: float) -> None:
-        """Release the robot's own controller, lying, and make sure that nobody else commands the motors.
+        """Release the robot's own controller, lying, and check that no other program commands the motors.
 
         Raises:
             TransportTimeoutError: The robot's services do not answer, or do not let go in time.
@@ -185,7 +185,7 @@ class Go2Robot(Robot):
             TransportTimeoutError: The mode does not have the robot in time.
         """
         if self._armed:
-            raise SafetyError("go2: make the robot passive before it is handed back")
+            raise SafetyError("go2: make the robot passive before it returns to its own controller")
         self._homed, self._sender.in_force, self._passive_ns = False, b"", None
         self._takeover.hand_back(timeout_s)
 
@@ -219,7 +219,7 @@ class Go2Robot(Robot):
         self._states.clear()
 
     def read_state(self, timeout_s: float) -> RobotState:
-        """Return the next sound and new state; others are counted and dropped."""
+        """Return the next valid and new state; others are counted and dropped."""
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         stale = self._stream.stale
         while not self._states:
@@ -228,8 +228,8 @@ class Go2Robot(Robot):
             except TransportTimeoutError as error:
                 frozen = f" (it repeats old ones: {self._stream.standstill})" * (self._stream.stale > stale)
                 raise TransportTimeoutError(
-                    f"go2: no new state within {timeout_s:g} s{frozen}; is the robot on, is the cable in "
-                    f"({self.transport_errors} transport errors so far)?"
+                    f"go2: no new state within {timeout_s:g} s{frozen}; check that the robot is on, and "
+                    f"the cable ({self.transport_errors} transport errors so far)"
                 ) from error
         return self._states.popleft()
 
@@ -248,11 +248,11 @@ class Go2Robot(Robot):
         self._sender.repeat()
 
     def passive(self) -> None:
-        """Damp all joints; works on an open transport whatever happened before, and never waits.
+        """Damp all joints; works on any open transport, and never waits.
 
-        States that were received before are forgotten, so that none of them passes for a confirmation.
-        Whoever set out to take the robot over and never commanded it sends nothing: sport mode may still hold
-        it, and two who command make the robot jump.
+        Earlier states are dropped, so that none of them counts as a confirmation. A run that began to take
+        the robot over but never commanded it sends nothing: sport mode may still be active, and two
+        commanders make the robot jump.
         """
         self._armed = False
         self._states.clear()
@@ -329,7 +329,7 @@ class Go2Robot(Robot):
             self._fault = self._takeover.complaint()
 
     def _take_bridge(self, message: Message) -> None:
-        """Hear from a bridge who has the robot.
+        """Read a bridge's status on who controls the robot.
 
         Raises:
             SafetyError: Another controller has it, and this one has just begun to take it over.
@@ -342,8 +342,8 @@ class Go2Robot(Robot):
         ours = bool(self._sender.in_force or self._armed_ns)
         if controlled and self._in_charge and not ours:
             raise SafetyError(
-                "go2: another controller commands the robot through the bridge; end that run first (Ctrl-C "
-                "in its terminal)"
+                "go2: another controller commands the robot through the bridge; end the other run first "
+                "(Ctrl-C in its terminal)"
             )
         later = message.stamp_ns - self._armed_ns > BRIDGE_DELAY_NS
         if self._armed and later and not controlled and not self._fault:

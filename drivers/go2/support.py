@@ -192,7 +192,7 @@ def _unsteady(
         )
     if (apart := float(np.arccos(np.clip(_up(orientation) @ force / size, -1.0, 1.0)))) > config.sensors_rad:
         return _undecided(
-            f"orientation and specific force differ by {apart:.2f} rad about where down is",
+            f"the directions of gravity by orientation and by specific force differ by {apart:.2f} rad",
             "restart the robot level and at rest, or calibrate its inertial sensor in the vendor's app",
         )
     return None
@@ -282,8 +282,8 @@ class SupportGuard:
         if found.support is Support.UNDECIDED:
             where = "lies on the floor" if floor else "is held in the air"
             return (
-                f"{self._name}: it is not sure that the robot {where}: {found.seen}. Nothing was commanded. "
-                f"What to do: {found.remedy}. {skip}"
+                f"{self._name}: it is uncertain whether the robot {where}: {found.seen}. No command was "
+                f"sent. What to do: {found.remedy}. {skip}"
             )
         if floor:
             return (
@@ -292,8 +292,7 @@ class SupportGuard:
                 f"robot `go2_on_stand`. {skip}"
             )
         return (
-            f"{self._name}: the robot is on the floor: {found.seen}. `{self._name}` lets go of it as it "
-            "stands, and moves its legs as if nothing could touch them: it would fall. Hang it up with its "
-            "feet free (if it hangs already, pull its legs down by hand), or take the robot `go2`. "
-            f"{skip}"
+            f"{self._name}: the robot is on the floor: {found.seen}. `{self._name}` makes a standing robot "
+            "limp and moves its legs as in free air: it would fall. Hang it up with its feet free (if it "
+            f"hangs already, pull its legs down by hand), or take the robot `go2`. {skip}"
         )

@@ -1,1 +1,1 @@
-"""Paths for bytes and messages to a robot, one module each; they know no protocol."""
+"""Paths for bytes and messages to a robot, one module each, independent of the protocol."""

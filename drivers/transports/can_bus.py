@@ -1,4 +1,4 @@
-"""What CAN adapters of every kind have in common: the address of a bus, and how trouble on it is told."""
+"""Common parts of all CAN adapters: the address of a bus, and the report of its errors."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ BITRATE: Final = 500_000
 _BITRATE: Final = "bitrate"
 _MOST: Final = 1_000_000
 NO_ACKNOWLEDGE: Final = (
-    "no other node acknowledges: is the device powered, does it use this bit rate, are both ends of the bus "
-    "terminated (60 ohm between CAN-H and CAN-L)?"
+    "no other node acknowledges: check the device's power, the bit rate, and the termination at both ends "
+    "of the bus (60 ohm between CAN-H and CAN-L)"
 )
 BUS_OFF: Final = (
     "the controller went bus-off after too many errors; check wiring, termination and bit rate. SocketCAN "
@@ -41,7 +41,7 @@ class CanAddress:
 
     @classmethod
     def parse(cls, port: str) -> CanAddress:
-        """Return what a port means. ``can0`` alone is socketcan, a path alone is slcan.
+        """Return the address in a port. ``can0`` alone is socketcan, a path alone is slcan.
 
         Raises:
             ConfigurationError: It means nothing.
@@ -95,10 +95,10 @@ class CanTransport(Transport):
     Extended, remote and FD frames are foreign here and are not returned.
 
     Attributes:
-        port: As it was given.
-        address: What that means.
-        error_frames: How often adapter or controller reported an error.
-        trouble: What it last reported, in words; "" for nothing.
+        port: As given by the user.
+        address: Its parsed form.
+        error_frames: Number of errors reported by adapter or controller.
+        trouble: The last report, as text; "" for none.
 
     Args:
         port: See :meth:`CanAddress.parse`.

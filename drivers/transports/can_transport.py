@@ -181,7 +181,8 @@ class PythonCanTransport(CanTransport):
                     "can, can_raw and the adapter's, or use a serial adapter: slcan:/dev/ttyACM0"
                 ) from error
             raise PortNotFoundError(
-                f"{self.port} cannot be opened: {error}; is the adapter plugged in, and its driver installed?"
+                f"{self.port} cannot be opened: {error}; check that the adapter is plugged in, and its "
+                "driver installed"
             ) from error
 
     def _failed(self, error: Exception) -> TransportError:
@@ -190,7 +191,8 @@ class PythonCanTransport(CanTransport):
             why = f" (the adapter reports: {self.trouble})" if self.trouble else f"; {NO_ACKNOWLEDGE}"
             return TransportTimeoutError(f"{self.port}: the transmit buffer is full{why}")
         return TransportLostError(
-            f"{self.port}: the bus is lost ({error}); is the adapter plugged in, is `ip link` up?"
+            f"{self.port}: the bus is lost ({error}); check that the adapter is plugged in, and that `ip "
+            "link` shows it up"
         )
 
 

@@ -1,4 +1,4 @@
-"""Certificates for Zenoh over TLS: an authority of one's own, and what it signs.
+"""Certificates for Zenoh over TLS: your own authority, and the certificates that it signs.
 
 Making them needs the package cryptography; using them does not (:mod:`zenoh_session`).
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 AUTHORITY: Final = "ca"
 """Name of the authority's files."""
 BACKDATED: Final = datetime.timedelta(days=1)
-"""Certificates hold from a day before they are made: the robot's clock may be behind."""
+"""Certificates are valid from a day before they are made, since the robot's clock may be behind."""
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
 _SECRET, _PUBLIC = 0o600, 0o644
 
@@ -38,10 +38,10 @@ class Certificate:
         name: Common name, which access is granted by.
         addresses: Addresses and host names that it is valid for.
         authority: Whether it may sign others.
-        issuer: Common name of who signed it.
-        begins: When it begins to hold, UTC.
-        expires: When it ends to hold, UTC.
-        key: Its private key beside it; None where there is none.
+        issuer: Common name of the signer.
+        begins: Start of its validity, UTC.
+        expires: End of its validity, UTC.
+        key: Its private key beside it, or None.
         key_mode: Permissions of that file.
     """
 
@@ -56,7 +56,7 @@ class Certificate:
     key_mode: int
 
     def days_left(self, now: datetime.datetime) -> float:
-        """Return for how many days it still holds; negative where it has expired."""
+        """Return the remaining days of validity; negative after its end."""
         return (self.expires - now) / datetime.timedelta(days=1)
 
 
@@ -76,7 +76,7 @@ def make_authority(folder: Path, days: float, now: datetime.datetime) -> None:
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     _refuse_overwriting(folder, AUTHORITY)
     key = _new_key()
-    # Two authorities need two names, or a mix-up of their files is a puzzling error.
+    # Two authorities need two names, so that a mix-up of their files gives a clear error.
     name = _common_name(f"deal-hw authority {secrets.token_hex(3)}")
     usage = _usage(key_cert_sign=True, crl_sign=True)
     builder = (
@@ -116,7 +116,7 @@ def sign(folder: Path, name: str, *, addresses: Iterable[str], days: float, now:
         signer: Any = load_pem_private_key((folder / f"{AUTHORITY}.key").read_bytes(), None)
     except (OSError, ValueError, TypeError) as error:
         raise ConfigurationError(
-            f"{folder} holds no authority that can sign ({AUTHORITY}.pem and {AUTHORITY}.key): {error}; "
+            f"{folder} contains no authority that can sign ({AUTHORITY}.pem and {AUTHORITY}.key): {error}; "
             "`deal-hw keys make` makes one"
         ) from error
     found = tuple(addresses)
@@ -147,7 +147,10 @@ def read_certificate(path: Path) -> Certificate:
     try:
         found = x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise ConfigurationError(f"{path} holds no certificate in PEM form ({error})") from error
+        raise ConfigurationError(
+            f"{path} contains no certificate in PEM form ({error}); name another "
+            "file, or make one with `deal-hw keys make`"
+        ) from error
     try:
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         addresses = tuple(str(part.value) for part in names)
@@ -253,8 +256,8 @@ def _refuse_overwriting(folder: Path, name: str) -> None:
     for path in (folder / f"{name}.pem", folder / f"{name}.key"):
         if path.exists():
             raise ConfigurationError(
-                f"{path} is there and is not overwritten: whoever uses it would be locked out. Choose "
-                "another folder or name, or move the file away"
+                f"{path} exists and is not overwritten, since its users would lose access. Choose another "
+                "folder or name, or move the file away"
             )
 
 
@@ -274,7 +277,7 @@ def _write(
         (folder / f"{name}.key", secret, _SECRET),
         (folder / f"{name}.pem", certificate.public_bytes(Encoding.PEM), _PUBLIC),
     ):
-        # Never readable to others, not for a moment; and never over a file that came meanwhile.
+        # Never readable for other users, and never over an existing file.
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)

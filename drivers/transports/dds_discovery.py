@@ -1,4 +1,4 @@
-"""Who else is on a DDS domain: from Cyclone's own discovery, without a message of ours."""
+"""Other participants of a DDS domain, from Cyclone's own discovery, without our own messages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _BATCH: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class DdsPeer:
-    """A participant of the domain. What it does not tell is "" or 0.
+    """A participant of the domain. Unknown fields are "" or 0.
 
     Attributes:
         key: Its GUID.

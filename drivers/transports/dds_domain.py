@@ -16,7 +16,8 @@ _LINGER: Final = "100 ms"
 """How long closing waits for peers that have not confirmed the last message; Cyclone's default is 1 s."""
 
 _SEEK: Final = "1 s"
-"""How often we announce ourselves. With Cyclone's default, a cable plugged in again is dumb for longer."""
+"""How often we announce ourselves. With Cyclone's default, a cable that is plugged in again works only
+later."""
 _LOG_FATAL, _LOG_ERROR, _LOG_WARNING = 1, 2, 4
 
 
@@ -52,8 +53,8 @@ def domain_xml(number: int, interface: Interface) -> str:
 def acquire_domain(number: int, interface: Interface) -> None:
     """Open a domain, or join the one that this process has open; each call needs a release.
 
-    The environment is not asked: ``CYCLONEDDS_URI``, which set-up scripts for ROS leave behind, often names
-    another interface.
+    The environment is ignored: ``CYCLONEDDS_URI``, which set-up scripts of ROS set, often names another
+    interface.
 
     Raises:
         MissingExtraError: cyclonedds is not installed.
@@ -117,7 +118,7 @@ def _create(number: int, interface: Interface) -> Any:
     set_log_mask(_LOG_FATAL | _LOG_ERROR | _LOG_WARNING)
     with dds_errors(f"DDS domain {number} cannot be opened on {interface}"):
         domain = Domain(number, domain_xml(number, interface))
-    # From now on Cyclone is silent. With the interface down it would write a line for each send, and a
-    # terminal that does not keep up would hold the control loop; silence of the robot is what tells.
+    # From now on Cyclone prints nothing. With the interface down it would write a line for each send, and a
+    # slow terminal would block the control loop. Missing states of the robot show the fault instead.
     set_log_mask(_LOG_FATAL)
     return domain

@@ -1,4 +1,4 @@
-"""What is alive while a DDS transport is open."""
+"""The objects of an open DDS transport."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ READER_DEPTH: Final = 64
 MAX_BLOCKING_NS: Final = 1_000_000
 """Longest wait of a send for a peer that confirms nothing [ns]."""
 _SLICE_NS: Final = 100_000_000
-"""A wait inside the library hears no signal; after this time [ns] Ctrl-C gets its turn."""
+"""A wait inside the library ignores signals; after this time [ns] Ctrl-C is handled."""
 
 
 class ArrivalClock:
-    """Estimates when messages arrived: not when we looked, which may be much later.
+    """Estimates when messages arrived, which may be much earlier than they are read.
 
     Cyclone tells when a message was written, by the writer's clock. A wait that a message ended tells how
     that clock stands to ours, transit included; every other message tells that it cannot have arrived after

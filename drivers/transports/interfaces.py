@@ -68,7 +68,7 @@ def find_interface(port: str) -> Interface:
             break
     else:
         known = "; ".join(map(str, interfaces))
-        raise PortNotFoundError(f"there is no network interface {port!r}; interfaces at hand: {known}")
+        raise PortNotFoundError(f"there is no network interface {port!r}; known interfaces: {known}")
     if not interface.up:
         raise PortNotFoundError(
             f"network interface {port!r} is switched off; ip link set {interface.name} up"

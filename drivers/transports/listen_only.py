@@ -24,7 +24,7 @@ class ListenOnly(TransportWrapper):
         Raises:
             SafetyError: Always.
         """
-        raise SafetyError(f"{self.port}: this run only listens (--dry-run): nothing may be sent")
+        raise SafetyError(f"{self.port}: this run only listens (--dry-run), so it cannot send")
 
 
 class ListenOnlyTopics(ListenOnly, TopicTransport):

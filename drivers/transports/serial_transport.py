@@ -190,13 +190,12 @@ class SerialTransport(Transport):
         text = str(error)
         if code in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in text:
             return PortBusyError(
-                f"{self.port} is held by another process; close the other collector or monitor "
-                f"(see `fuser {self.port}`)"
+                f"{self.port} is used by another process; close that program (`fuser {self.port}` shows it)"
             )
         if code == errno.EACCES:
             return PortNotFoundError(
-                f"{self.port} may not be opened by this user; add yourself to the group that owns it "
-                "(often `dialout`)"
+                f"this user may not open {self.port}; add the user to the group that owns it (often "
+                "`dialout`)"
             )
         if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
             return PortNotFoundError(f"there is no serial port {self.port!r}; ports at hand: {_ports()}")

@@ -100,9 +100,9 @@ def check_security(endpoints: Sequence[Endpoint], options: WireOptions) -> None:
     for endpoint in endpoints:
         if endpoint.protocol != "tls" and not endpoint.loopback and not options.insecure:
             raise ConfigurationError(
-                f"{endpoint} is plain {endpoint.protocol.upper()} beyond this machine: whoever reaches the "
-                f"port can command the robot. Use tls/{endpoint.host}:{endpoint.port} with --ca, "
-                "--certificate and --key, or allow it with --insecure on a network that you trust"
+                f"{endpoint} is plain {endpoint.protocol.upper()} beyond this machine: everybody who "
+                f"reaches the port can command the robot. Use tls/{endpoint.host}:{endpoint.port} with "
+                "--ca, --certificate and --key, or allow it with --insecure on a network that you trust"
             )
     if any(endpoint.protocol == "tls" for endpoint in endpoints):
         _check_files(options)
@@ -117,8 +117,8 @@ def _check_files(options: WireOptions) -> None:
     code, text = own_certificate_trouble(options)
     if code in (_NOT_YET_VALID, _EXPIRED):
         raise ConfigurationError(
-            f"{options.certificate}, or its authority {options.ca}: {text}. Is this computer's clock right? "
-            "Otherwise make a new one (`deal-hw keys add`); `deal-hw keys show DIR` tells how long each holds"
+            f"{options.certificate}, or its authority {options.ca}: {text}. Check this computer's clock, "
+            "or make a new one (`deal-hw keys add`); `deal-hw keys show DIR` shows how long each is valid"
         )
 
 
@@ -256,15 +256,15 @@ def _probe(endpoint: Endpoint, timeout_s: float) -> PortNotFoundError | Transpor
         socket.create_connection((endpoint.host, endpoint.port), timeout_s).close()
     except TimeoutError:
         return TransportTimeoutError(
-            f"{endpoint}: the host did not answer within {timeout_s:g} s; is it switched on, is the "
-            "address right, does a firewall stand between?"
+            f"{endpoint}: the host did not answer within {timeout_s:g} s; check that it is on, the "
+            "address, and the firewall"
         )
     except socket.gaierror as error:
         return PortNotFoundError(f"{endpoint}: there is no host {endpoint.host!r} ({error.strerror})")
     except OSError as error:
         return PortNotFoundError(
-            f"{endpoint}: {error.strerror or error}. Is the bridge or `deal-hw emulate go2 --transport "
-            "zenoh` running there, and listening on that port?"
+            f"{endpoint}: {error.strerror or error}. Start the bridge, or `deal-hw emulate go2 --transport "
+            "zenoh`, and check its port"
         )
     return None
 

@@ -300,8 +300,8 @@ class ZenohTransport(TopicTransport):
 
     def _gone(self) -> TransportLostError:
         return TransportLostError(
-            f"{self.port}: the link is gone: the bridge or emulator stopped, or the network is down; Zenoh "
-            "goes on trying to reach it"
+            f"{self.port}: the connection is lost: the bridge or emulator stopped, or the network is down; "
+            "Zenoh keeps trying to connect"
         )
 
 

@@ -67,7 +67,7 @@ def test_an_unknown_robot_is_refused() -> None:
         ("friction", [], ["friction law, backlash or a varying delay"], False),
         ("jitter", ["delay"], [], True),
         ("mass", ["backlash"], [], False),
-        ("sign", [], ["is its sign in the column map right"], True),
+        ("sign", [], ["check the sign in the column map"], True),
         ("sign", ["friction"], ["the model does not explain the recording"], False),
     ],
 )

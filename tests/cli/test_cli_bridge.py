@@ -37,7 +37,7 @@ print(json.dumps({"code": code, "loaded": sorted({name.partition(".")[0] for nam
         ("go2 --port lo --observers wall", "--observers would have no effect"),
         ("go2 --port nosuch0", "there is no network interface 'nosuch0'"),
         ("go2 --port lo --command-age-s 9", "command_age_s is 9.0; allowed: 0.01 to 0.5"),
-        ("go2 --port lo --command-age-s 0.02 --rate-hz 50", "looked for less than 5 times within it"),
+        ("go2 --port lo --command-age-s 0.02 --rate-hz 50", "checked less than 5 times in it"),
         ("go2 --port lo --listen lo", "write protocol/host:port"),
     ],
 )
@@ -96,7 +96,7 @@ def test_it_loads_neither_simulator_nor_learning(tmp_path: Path) -> None:
     )
     port, told = done.stdout.splitlines()
     assert port.startswith("port tcp/127.0.0.1:")
-    assert "who moves the robot is not known, so it is not damped yet" in done.stderr
+    assert "the robot's active controller is unknown, so it is not damped yet" in done.stderr
     assert "0 commands passed" in done.stderr
     found = json.loads(told)
     assert found["code"] == 0

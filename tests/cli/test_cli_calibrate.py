@@ -127,7 +127,7 @@ def test_recording_that_is_too_short_is_refused(tmp_path: Path) -> None:
 
 def test_episode_cannot_be_fitted_and_held_out(dataset: Path) -> None:
     """A held-out episode must not be seen."""
-    with pytest.raises(ConfigurationError, match=r"episodes \[0\] are to be fitted and held out"):
+    with pytest.raises(ConfigurationError, match=r"episodes \[0\] are both fitted and held out"):
         calibrate(settings(dataset, episodes=(0,), holdout=(0,)))
 
 

@@ -305,12 +305,12 @@ def test_bad_recordings_are_refused(
         (["--physics-step", "0"], "allowed are 0.001 to 100 ms"),
         (["--window", "9"], "no window"),
         (["--heldout-window", "4"], "held-out recordings are too short"),
-        (["--leave-out", "nothing.csv", "0", "1"], "no such recording; they are rec.csv"),
+        (["--leave-out", "nothing.csv", "0", "1"], "no such recording; known are rec.csv"),
         (["--leave-out", "rec.csv", "0", "99"], "leaves nothing of rec.csv"),
         (["--space", "k9"], "--parameters"),
         (["--latency", "12"], "--latency 12.0 s: allowed are 0 to 1 s"),
         (["--latency-range", "0.1", "0.05"], "--latency-range 0.1 0.05: give the lower one first"),
-        (["--latency", "0.02", "--latency-range", "0", "0.1"], "--latency says the latency"),
+        (["--latency", "0.02", "--latency-range", "0", "0.1"], "--latency gives the latency"),
         (["--spike-ratio", "0.5"], "allowed are 1 to 1000000"),
     ],
 )
@@ -375,8 +375,8 @@ def test_wrong_sign_and_gain_show_under_gravity(
     params = tmp_path / "params.yaml"
     params.write_text("parameters: [{kind: servo_stiffness, elements: '*'}]\n")
     for data, model, message in (
-        ("mirror.csv", "arm.xml", "hangs against gravity"),
-        ("rec.csv", "stiff.xml", "hangs as with a gain of about"),
+        ("mirror.csv", "arm.xml", "deviates from its command against gravity"),
+        ("rec.csv", "stiff.xml", "sags under gravity as with a gain of about"),
     ):
         words = command(
             folder,

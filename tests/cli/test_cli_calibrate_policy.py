@@ -87,7 +87,7 @@ def test_the_datasets_own_policy_is_run(dataset: Path, tmp_path: Path) -> None:
         ([{"stand": True}], "episode 0 stands up and lies down"),
         ([{}, {"policy_digest": "0123456789abcdef"}], "recorded with 2 policies"),
         ([{"velocity": "keyboard"}], "one fixed velocity"),
-        ([{"policy_digest": "0123456789abcdef"}], "keeps no copy.*0123456789abcdef.*--policy FILE"),
+        ([{"policy_digest": "0123456789abcdef"}], "has no copy.*0123456789abcdef.*--policy FILE"),
     ],
 )
 def test_recordings_that_one_policy_did_not_make_are_refused(
@@ -112,7 +112,7 @@ def test_another_policy_than_the_recordings_is_refused(dataset: Path) -> None:
         ({"method": "eki", "policy": POLICY}, "--method eki runs no policy"),
         (
             {"dataset": None, "recordings": Recordings(model=Path("robot.xml"), data=(Path("a.csv"),))},
-            "which recordings of --model do not name",
+            "which is unknown for --model",
         ),
     ],
 )

@@ -84,7 +84,7 @@ def test_collect_records_again_what_hardly_moved(tmp_path: Path, capsys: pytest.
     assert [e.outcome for e in report.episodes] == [Outcome.FINISHED] * 2
     told = capsys.readouterr().err
     assert "pole moved" in told and "recording again, stronger (excitation level 1)" in told
-    assert "go on with --excitation-level 2" in told
+    assert "continue with --excitation-level 2" in told
     dataset = Dataset.open(tmp_path / "dataset")
     metadata = [dataset.read(i).metadata for i in range(2)]
     assert [(m["excitation_level"], m["attempt"], m["seed"]) for m in metadata] == [(0, 0, 0), (1, 1, 0)]

@@ -55,9 +55,9 @@ def test_keys_are_private_and_certificates_fit(folder: Path) -> None:
 def test_nothing_is_overwritten(folder: Path) -> None:
     """Neither an authority nor a certificate; the files stay as they were."""
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(ConfigurationError, match=r"ca\.pem is there and is not overwritten"):
+    with pytest.raises(ConfigurationError, match=r"ca\.pem exists and is not overwritten"):
         make(Make(out=folder, robot=("10.0.0.1",)), NOW)
-    with pytest.raises(ConfigurationError, match=r"controller\.pem is there"):
+    with pytest.raises(ConfigurationError, match=r"controller\.pem exists"):
         sign(folder, "controller", addresses=(), days=1, now=NOW)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
@@ -111,7 +111,7 @@ def test_a_certificate_does_not_outlive_its_authority(tmp_path: Path) -> None:
         (Make(out=Path("k"), robot=("10.0.0.1",), controllers=("a", "a")), "a name of its own"),
         (Make(out=Path("k"), robot=("10.0.0.1",), controllers=("../x",)), "small letters"),
         (Make(out=Path("k"), robot=("10.0.0.1",), observers=("ca",)), "small letters"),
-        (Add(folder=Path("nothing"), name="desk"), "holds no authority that can sign"),
+        (Add(folder=Path("nothing"), name="desk"), "contains no authority that can sign"),
         (Show(folder=Path("nothing")), "holds no certificates"),
     ],
 )
@@ -127,7 +127,7 @@ def test_what_cannot_be_made_is_refused(
 def test_what_is_no_certificate_is_refused(tmp_path: Path) -> None:
     """The file is named."""
     (tmp_path / "x.pem").write_text("hello")
-    with pytest.raises(ConfigurationError, match=r"x\.pem holds no certificate"):
+    with pytest.raises(ConfigurationError, match=r"x\.pem contains no certificate"):
         read_certificate(tmp_path / "x.pem")
 
 

@@ -184,7 +184,7 @@ def test_a_range_says_milliseconds_where_seconds_are_small() -> None:
         ("calibrate d --latency 12", "--latency 12.0 s: allowed are 0 to 1 s"),
         ("calibrate d --seed -1", "--seed -1: allowed are 0 to"),
         ("emulate cartpole --drop nan", "--drop nan: allowed are 0 to 1"),
-        ("deploy cartpole --port p --domain 233", "DDS domain 233: 0 to 232"),
+        ("deploy cartpole --port p --domain 233", "DDS domain 233: allowed are 0 to 232"),
         ("bench loop --seeds 0-99999999999", "--seeds 99999999999: allowed are"),
     ],
 )
@@ -291,7 +291,7 @@ def test_a_help_page_shows_what_the_named_robot_takes(verb: str, capsys: pytest.
     plain = help_page(verb, capsys)
     assert not set(marked) & options_of(plain)
     for name in {name for names in marked.values() for name in names}:
-        assert name in plain.partition("more options for ")[2].partition(":")[0]
+        assert name in plain.partition("More options for ")[2].partition(":")[0]
         page = options_of(
             help_page(f"{verb} --robot {name}" if verb == "replay" else f"{verb} {name}", capsys)
         )

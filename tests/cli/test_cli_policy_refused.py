@@ -105,7 +105,7 @@ def test_a_policy_of_a_red_calibration_is_asked_about(
     """Without a terminal it is refused; with one the answer decides, and so does the option."""
     path = edited(tmp_path / "p.onnx", lambda spec: spec["training"].update({VERDICT: "red"}))
     said = deploy(path)
-    assert "verdict is red" in said and "--trust-calibration" in said and "no-port" not in said
+    assert "a red verdict" in said and "--trust-calibration" in said and "no-port" not in said
     assert "no-port" in deploy(path, "deploy", "cartpole", "--trust-calibration")
     amber = edited(tmp_path / "a.onnx", lambda spec: spec["training"].update({VERDICT: "amber"}))
     assert "no-port" in deploy(amber)

@@ -162,7 +162,7 @@ def refused(
 SETTINGS: Lines = [
     ("calibrate", "name a dataset (deal-hw calibrate runs/first/dataset), or a model"),
     ("calibrate run/dataset --model arm.xml", "not both"),
-    ("calibrate run/dataset --holdout rec.csv", "of a dataset name episodes by number"),
+    ("calibrate run/dataset --holdout rec.csv", "with a dataset give episode numbers"),
     ("calibrate run/dataset --method nosuch", "unknown calibration method 'nosuch'; known: default"),
     ("calibrate --model arm.xml --data gone.csv --method nosuch", "unknown calibration method 'nosuch'"),
     ("data verify gone.mcap", "gone.mcap does not exist; name a dataset (DIR) or an episode"),
@@ -173,9 +173,9 @@ SETTINGS: Lines = [
     ("calibrate run/dataset --write-parameters p.yaml", "--write-parameters needs --model robot.xml"),
     ("calibrate --model arm.xml --write-parameters empty.json", "empty.json exists; name another file"),
     ("calibrate --model arm.xml", "--model needs recordings to fit: --data rec.csv"),
-    (f"{MODEL} rec.csv --holdout rec.csv", "a held-out recording must not be seen"),
+    (f"{MODEL} rec.csv --holdout rec.csv", "a held-out recording must not be fitted"),
     (f"{MODEL} rec.csv --holdout one.csv --holdout-part 0.3", "give --holdout or --holdout-part, not both"),
-    (f"{MODEL} rec.csv one.csv", "calibrate them apart"),
+    (f"{MODEL} rec.csv one.csv", "calibrate them separately"),
     (f"{MODEL} rec.csv --feet toe", "this one's base is fixed"),
     (f"{MODEL} one.csv", "actuators of the model without recorded commands: belt"),
     (f"{MODEL} positions.csv", "name them as `target` in the column map"),
@@ -189,13 +189,13 @@ SETTINGS: Lines = [
     ("deploy go2 --port p --certificate text.txt", "a certificate and its private key belong together"),
     ("deploy go2 --port p --velocity 9,0,0", "x is 9.0, allowed: -1 to 1"),
     ("deploy go2 --port p --stop-buttons X+NOSUCH", "unknown button 'NOSUCH'; known: R1, L1"),
-    ("replay run/dataset/episodes/000000.mcap --port p --robot go2", "the recording is of joints"),
+    ("replay run/dataset/episodes/000000.mcap --port p --robot go2", "the recording has joints"),
     (
         "design-excitation cartpole --out o.json --low-hz 5 --high-hz 1",
         "--low-hz 5 must be below --high-hz 1",
     ),
     ("design-excitation cartpole --out o.json --family multisine --low-hz 0.9 --high-hz 1", "widen the band"),
-    ("design-excitation go2 --out o.json --family sway --high-hz 900", "which carry up to 25 Hz"),
+    ("design-excitation go2 --out o.json --family sway --high-hz 900", "so a motion may have up to 25 Hz"),
     ("design-excitation go2 --out o.json", "robots on a stand (such as go2_suspended)"),
     ("inspect run/dataset/episodes/000000.mcap --calibration empty.json --web", "not a calibration result"),
     ("inspect run/dataset/episodes/000000.mcap --save folder", "name a file, such as folder/episode.rrd"),
@@ -212,7 +212,7 @@ SETTINGS: Lines = [
     ("demo --out folder/../run", "does not hold a former demo; name another folder with --out"),
     ("emulate go2 --transport zenoh --port tcp/192.0.2.1:0 --duration-s 0", "port 'tcp/192.0.2.1:0': "),
 ]
-NO_EFFECT = "would have no effect: a dataset says it; that goes with --model and --data"
+NO_EFFECT = "would have no effect: a dataset defines it; use that option with --model and --data"
 REVIEWED: Lines = [
     ("calibrate run/dataset --parameters nothere.yaml", f"--parameters {NO_EFFECT}"),
     ("calibrate run/dataset --columns nothere.yaml", f"--columns {NO_EFFECT}"),
@@ -222,8 +222,8 @@ REVIEWED: Lines = [
     ("calibrate run/dataset --holdout-part 0.3", f"--holdout-part {NO_EFFECT}"),
     (f"{MODEL} rec.csv --parameters nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
     (f"{MODEL} rec.csv --columns nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
-    (f"{MODEL} rec.csv --leave-out nosuch 0 99", "no such recording; they are rec.csv"),
-    ("deploy cartpole --port p --velocity 0.1,0,0", "only robots with legs take that, and robot 'cartpole'"),
+    (f"{MODEL} rec.csv --leave-out nosuch 0 99", "no such recording; known are rec.csv"),
+    ("deploy cartpole --port p --velocity 0.1,0,0", "only for robots with legs, and robot 'cartpole'"),
     ("collect cartpole --port p --out o --motion chirp --excite multisine", "leave one of the two out"),
     ("inspect nothere.mcap", "nothere.mcap cannot be read: there is no such file"),
     ("inspect blank", "blank is a folder without an episode; record one with `deal-hw collect`"),
@@ -232,7 +232,7 @@ REVIEWED: Lines = [
         "x.jpg does not end in .png; name it x.png",
     ),
     ("calibrate run --episodes 7", "dataset run/dataset has 1 episodes; there is no number 7"),
-    ("train --udr --distribution scale.json", "--distribution and --udr exclude each other: leave one"),
+    ("train --udr --distribution scale.json", "--distribution and --udr exclude each other: keep one"),
     (
         "calibrate",
         "or a model and its recordings (deal-hw calibrate --model robot.xml --data rec.csv), one of",
@@ -246,11 +246,11 @@ DATA: Lines = [
     ("data export blank --out o", "no recording to export"),
     ("data export run/dataset --out text.txt", "text.txt cannot be written: Not a directory"),
     ("data import nothere.csv --out o", "nothere.csv does not exist"),
-    ("data import two.csv --out o --force", "2 samples at different times; that is no recording"),
+    ("data import two.csv --out o --force", "2 samples at different times; check the time channel"),
     ("data import other.csv --out o --model arm.xml", "which channels are the joints' positions"),
     ("data import rec.csv --out o --description cartpole.json", "which channels are the joints' positions"),
     ("data import rec.csv --out o --description arm.json", "(commands: elbow); correct the column map"),
-    ("data import lerobot --out o", "is the dataset downloaded whole?"),
+    ("data import lerobot --out o", "download the whole dataset"),
     ("data import stopped --out o", "field fps is 0.0; allowed: 0.001 to 1e6 Hz"),
 ]
 ENTRIES: Lines = [
@@ -270,7 +270,7 @@ COLUMNS: Lines = [
     ("gyro: gyro", "gyro has shape (300, 2); it has 3 columns, x y z"),
     ("orientation: quat", "orientation has shape (300, 3); a quaternion has 4 columns"),
     ("orientation: short", "orientation has 299 rows, time has 300"),
-    ("position: nothing", "every position is empty; is it the right channel?"),
+    ("position: nothing", "every position is empty; check the channel in the column map"),
     ("position: [dof_pos]", "name a channel, or a pattern with {joint}"),
     ("position: none", "no position of elbow, rail; give `position` in the column map"),
     ("joints: [{name: elbow, index: -1}, rail]", "joint 'elbow': index -1 is not a column number, from 0"),
@@ -312,7 +312,7 @@ def test_a_recording_too_short_to_calibrate_is_told_before_it_is_made(
     monkeypatch.chdir(place)
     assert main(shlex.split("collect cartpole --port p --out o --seconds 1")) == EXIT_ERROR
     said = capsys.readouterr().err
-    assert "too short for `deal-hw calibrate`" in said and "(--seconds 4)" in said
+    assert "are too short: `deal-hw calibrate`" in said and "(--seconds 4)" in said
 
 
 def test_a_quiet_calibration_prints_nothing(
@@ -373,7 +373,7 @@ def test_a_demo_without_its_policy_says_how_to_make_it(
 ) -> None:
     """A checkout in which the assets were left out."""
     monkeypatch.setattr(shipped, "shipped_policy", lambda robot: None)
-    refused("demo --out new", "tools/train_udr_policy.py makes it")
+    refused("demo --out new", "tools/train_udr_policy.py trains one")
 
 
 def parts_of(hint: Any) -> Iterator[type[Any]]:

@@ -125,7 +125,7 @@ def test_terms_without_the_base_need_no_base() -> None:
 def test_a_state_without_a_base_is_refused() -> None:
     """The message says how many coordinates are needed and were given."""
     builder = ObservationBuilder(spec(ObservationTerm("height", "z", 1.0)))
-    with pytest.raises(ConfigurationError, match=r"'go2' observes the base: it needs 6 \+ 12 .* got 12"):
+    with pytest.raises(ConfigurationError, match=r"'go2' observes the base and needs 6 \+ 12 .* got 12"):
         builder.build(np.zeros(J), np.zeros(J))
 
 

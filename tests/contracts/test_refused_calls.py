@@ -101,7 +101,11 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
         UnknownNameError,
         "unknown arrangement 'x'; known: ",
     ),
-    (lambda: random_steps(np.ones(1), 1.0, (0.5, 0.1), RNG), ConfigurationError, "holds of 0.5 to 0.1 s"),
+    (
+        lambda: random_steps(np.ones(1), 1.0, (0.5, 0.1), RNG),
+        ConfigurationError,
+        "hold times of 0.5 to 0.1 s",
+    ),
     (lambda: parameter(scale="cubic"), UnknownNameError, "unknown scale of parameter 'a.b' 'cubic'"),
     (lambda: object_of(3, "a table"), ConfigurationError, "a table was expected, got 3"),
     (lambda: texts([1], "names"), ConfigurationError, "names must be a list of texts, got [1]"),
@@ -109,7 +113,7 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: sampling(0.01, 0.0, 1.0), ConfigurationError, "physics step must be above 0, got 0 s"),
     (lambda: sampling(0.01, 0.001, 0.0), ConfigurationError, "window must be above 0, got 0 s"),
     (lambda: FaultRates(drop=2.0), ConfigurationError, "drop is a probability from 0 to 1, got 2"),
-    (lambda: WireOptions(mode="router"), ConfigurationError, "wire mode 'router': peer or client"),
+    (lambda: WireOptions(mode="router"), ConfigurationError, "wire mode 'router': allowed are peer"),
     (lambda: make_topic_transport("serial", "p", MonotonicClock()), UnknownNameError, "known: dds, zenoh"),
     (
         lambda: make_transport("serial", "p", MonotonicClock(), WireOptions(domain=3, mode="peer")),
@@ -121,7 +125,7 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: supervised.run_episodes(PLAN, port="p", dataset=None, episodes=0, purpose="x"),
         ConfigurationError,
-        "--episodes 0: at least 1",
+        "--episodes 0: give at least 1",
     ),
     (
         lambda: train_policy("so101", udr_distribution("cartpole"), Path("p.onnx")),
@@ -163,7 +167,7 @@ FILES: list[tuple[Callable[[Path], object], type[DealHwError], str]] = [
         ConfigurationError,
         "the calibrated model has other elements than the file: ",
     ),
-    (lambda p: load_recordings([p / "a.csv", p / "b.csv"]), DatasetError, "import them apart"),
+    (lambda p: load_recordings([p / "a.csv", p / "b.csv"]), DatasetError, "import them into two datasets"),
     (lambda p: export_lerobot([], p / "out", "r", "t"), InsufficientDataError, "no recording to export"),
 ]
 
@@ -202,7 +206,7 @@ def test_samples_that_never_follow_each_other_are_no_recording() -> None:
         gyro=None,
         source={"file": "rec.csv", "part": "", "kind": "csv", "sha256": ""},
     )
-    with pytest.raises(DatasetError, match=r"rec\.csv: no two samples follow within"):
+    with pytest.raises(DatasetError, match=r"rec\.csv: the pauses between all samples are longer than"):
         to_trajectories(table, period_s=0.01)
 
 
@@ -234,7 +238,9 @@ def test_a_port_that_somebody_has_is_said() -> None:
         taken.bind((LOOPBACK, 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigurationError, match=rf"port {port} of {LOOPBACK} cannot be had .*; choose"):
+        with pytest.raises(
+            ConfigurationError, match=rf"port {port} of {LOOPBACK} cannot be opened .*; choose"
+        ):
             check_port(port)
 
 

@@ -139,7 +139,9 @@ def test_what_no_sensor_reports_is_refused(term: ObservationTerm, words: str) ->
 def test_states_without_a_body_are_an_error() -> None:
     """Zeros in its place would be an upright base, whatever the robot does."""
     bare = dataclasses.replace(state(np.array([1.0, 0, 0, 0]), np.zeros(3)), body=None)
-    with pytest.raises(PolicyError, match="observes the base's orientation, and this robot's states carry"):
+    with pytest.raises(
+        PolicyError, match="observes the base's orientation, which this robot's states do not"
+    ):
         PolicyBehaviour(Ear(*SENSED), DRIVER).command(bare, 0.0)
     blind = Ear(*JOINTS)
     PolicyBehaviour(blind, DRIVER).command(bare, 0.0)

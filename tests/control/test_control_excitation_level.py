@@ -38,7 +38,7 @@ def moved(cart: float, pole: float, asked: float) -> Excitation:
     [
         # 30 % of 0.24 m is 0.072 m. The pole's noise is sqrt(2^2 + (2 pi / 4096 * 1000)^2 / 12) = 2.05 mrad.
         (0.073, 0.21, 0.24, ()),
-        (0.071, 0.21, 0.24, ("cart moved 0.071 m, less than 0.072 m (30% of what was asked)",)),
+        (0.071, 0.21, 0.24, ("cart moved 0.071 m, less than 0.072 m (30% of the commanded range)",)),
         (0.073, 0.20, 0.24, ("pole moved 0.2 rad, less than 0.2 rad (100 times the sensor's noise)",)),
         # 20 times sqrt(0.3^2 + 0.5^2 / 12) mm is 6.7 mm: of a cart that was hardly asked at all.
         (0.006, 3.0, 0.01, ("cart moved 0.006 m, less than 0.0067 m (20 times the sensor's noise)",)),
@@ -97,7 +97,7 @@ def test_a_still_robot_is_asked_for_more_until_the_limits() -> None:
     told = [search.tell(STILL) for _ in range(4)]
     assert told == [True, True, True, False]
     assert [a.level for a in search.attempts] == [0, 1, 2, 3]
-    assert search.words == "it hardly moves: pole moved 0.01 rad; the limits allow nothing stronger"
+    assert search.words == "it hardly moves: pole moved 0.01 rad; it is the strongest level"
     assert search.best == 3
 
 
@@ -107,7 +107,8 @@ def test_a_trip_is_followed_by_less_and_the_two_are_bisected() -> None:
     assert search.tell(STILL)
     assert search.tell((), "cart is at 0.4 m")
     assert (
-        search.words == "it was cut short (cart is at 0.4 m); recording again, gentler (excitation level 0.5)"
+        search.words == "the safety module ended it (cart is at 0.4 m); recording again, gentler "
+        "(excitation level 0.5)"
     )
     assert not search.tell(STILL)
     assert search.words.endswith("half a step stronger was tried before")
@@ -122,14 +123,14 @@ def test_on_a_robot_nothing_follows_a_trip_by_itself() -> None:
     """A person looks first; the words say with what to go on."""
     search = ExcitationLevelSearch(rearm=False)
     assert not search.tell((), "cart is at 0.4 m")
-    assert search.words.endswith("look at the robot, then record again with --excitation-level -1")
+    assert search.words.endswith("check the robot, then record again with --excitation-level -1")
 
 
 def test_the_number_of_recordings_is_kept() -> None:
     """Two allowed, two made."""
     search = ExcitationLevelSearch(level=1, attempts=2)
     assert search.tell(STILL) and not search.tell(STILL)
-    assert search.words.endswith("no more recordings are allowed here; go on with --excitation-level 3")
+    assert search.words.endswith("the number of recordings is used up; continue with --excitation-level 3")
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def test_plan_for_another_robot_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"made for robot 'cartpole'.*'so101'"):
         ExcitationBehaviour(plan, ARM)
     other = dataclasses.replace(DESCRIPTION, stiffness=(81.0,))
-    with pytest.raises(ConfigurationError, match="make another with `deal-hw design-excitation`"):
+    with pytest.raises(ConfigurationError, match="make a new one with `deal-hw design-excitation`"):
         ExcitationBehaviour(plan, other)
     with pytest.raises(ConfigurationError, match="there is no policy"):
         ExcitationBehaviour(plan, DESCRIPTION)
@@ -205,7 +205,7 @@ def test_a_signal_that_cannot_be_played_is_refused(joints: int, size: float) -> 
     wave = Tones(
         frequency_hz=((1.0, 1.1),) * joints, amplitude=((size, size),) * joints, phase=((1.5, 1.5),) * joints
     )
-    with pytest.raises(ConfigurationError, match=f"moves {joints} joints"):
+    with pytest.raises(ConfigurationError, match=f"has offsets for {joints} joints"):
         dataclasses.replace(good, wave=wave).check_fits(DESCRIPTION)
 
 

@@ -217,7 +217,7 @@ def test_a_link_that_stays_away_is_given_up_after_the_stated_time() -> None:
     assert not armed.make_passive()
     assert armed.clock.now_ns() - armed.begin_ns == 30 * S
     texts = list(dict.fromkeys(text for _, text, _ in armed.told))
-    why = "the link is down (virtual wire: the device vanished)"
+    why = "the connection is lost (virtual wire: the device vanished)"
     assert texts == [f"{why}; passive command repeated for {s} s, {30 - s} s left" for s in range(30)]
     assert [silence_s for _, _, silence_s in armed.told[:2]] == [10.0, 1.0]
     opened = [(ns - armed.begin_ns) / S for ns in armed.wire.opened]
@@ -231,7 +231,7 @@ def test_a_silent_robot_is_told_apart_and_its_path_is_opened_every_three_seconds
     armed = Armed()
     armed.wire.silent = True
     assert not armed.make_passive(timeout_s=10.0)
-    assert armed.told[0][1] == "the robot does not show it; passive command repeated for 0 s, 10 s left"
+    assert armed.told[0][1] == "the robot does not confirm it; passive command repeated for 0 s, 10 s left"
     assert [ns - armed.begin_ns for ns in armed.wire.opened] == [3 * S, 6 * S, 9 * S]
     assert len(armed.stops()) == 200
 
@@ -273,7 +273,7 @@ def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
     armed.device.__class__ = Deaf
     assert not armed.make_passive(timeout_s=7.0)
     assert armed.wire.opened == []
-    assert armed.told[-1][1] == "the robot does not show it; passive command repeated for 6 s, 1 s left"
+    assert armed.told[-1][1] == "the robot does not confirm it; passive command repeated for 6 s, 1 s left"
 
 
 @pytest.mark.parametrize("error", [TransportLostError("the read side is gone"), ZeroDivisionError("a bug")])
@@ -332,7 +332,7 @@ def test_a_robot_that_sends_faster_than_it_is_read_is_told_again() -> None:
     assert not armed.make_passive(timeout_s=5.0)
     assert armed.stops() == [n * 50 * MS for n in range(100)]
     assert armed.wire.opened == []
-    assert armed.told[0][1].startswith("the robot does not show it; passive")
+    assert armed.told[0][1].startswith("the robot does not confirm it; passive")
 
 
 def test_the_operator_may_give_up() -> None:
@@ -359,7 +359,9 @@ def test_a_driver_that_fails_in_every_way_is_survived() -> None:
 
     armed.wire.send = armed.wire.reopen = broken  # type: ignore[method-assign, assignment]
     assert not armed.make_passive(timeout_s=1.0)
-    assert armed.told[0][1].startswith("the link is down (a bug); passive command repeated for 0 s, 1 s left")
+    assert armed.told[0][1].startswith(
+        "the connection is lost (a bug); passive command repeated for 0 s, 1 s left"
+    )
 
 
 def test_the_defaults_are_as_documented() -> None:
@@ -435,7 +437,9 @@ def test_a_go2_whose_link_drops_while_the_run_ends_is_damped_once_it_is_back() -
     assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True)
     assert rig.kinds[-2:] == [STIFF, DAMPING]
     told = [phase for phase, _ in rig.beats if phase.startswith("making passive: ")]
-    assert told[0].startswith("making passive: the link is down (virtual wire: the device vanished); passive")
+    assert told[0].startswith(
+        "making passive: the connection is lost (virtual wire: the device vanished); passive"
+    )
 
 
 def test_a_go2_whose_link_is_lost_in_the_run_trips_at_once_and_is_damped_once_it_is_back() -> None:

@@ -144,7 +144,7 @@ def test_a_process_that_falls_silent_is_killed() -> None:
     """20 ms were allowed; the phase is named."""
     run = Run("beat('homing', 0.02); time.sleep(600)")
     end = run.end()
-    assert (end.killed, end.exit_code) == ("it gave no sign of life while homing", -9)
+    assert (end.killed, end.exit_code) == ("it sent no heartbeat while homing", -9)
     assert run.passive == [("homing", False)]
 
 
@@ -153,7 +153,7 @@ def test_a_process_that_lingers_after_its_last_word_is_killed(monkeypatch: pytes
     monkeypatch.setattr(module, "_GRACE_S", 0.05)
     run = Run("result(passive_confirmed=True); channel.close(); time.sleep(600)")
     end = run.end()
-    assert (end.killed, end.exit_code) == ("it did not end after its last word", -9)
+    assert (end.killed, end.exit_code) == ("it did not end after its last message", -9)
     assert end.result == {"passive_confirmed": True}
     assert run.passive == []
 
@@ -356,7 +356,7 @@ def test_the_supervisor_wakes_up_as_soon_as_a_sign_of_life_is_overdue(
         return true_select(read, write, other, timeout_s)
 
     monkeypatch.setattr("select.select", wait)
-    assert run.end().killed == "it gave no sign of life while homing"
+    assert run.end().killed == "it sent no heartbeat while homing"
     assert waits[0] == 0.05
     assert waits[-2:] == pytest.approx([0.021, 0.001], rel=1e-9)
 
@@ -374,7 +374,7 @@ def test_a_process_that_never_beats_has_thirty_seconds() -> None:
 
     clock = Late()
     end = Run("time.sleep(30); sys.exit(7)", clock=clock).end()
-    assert (end.killed, end.exit_code) == ("it gave no sign of life while starting", -9)
+    assert (end.killed, end.exit_code) == ("it sent no heartbeat while starting", -9)
     assert clock.asked > 30
 
 

@@ -186,7 +186,7 @@ def test_a_claim_is_exclusive_and_says_who_holds_it() -> None:
         text = str(raised.value)
         assert text.startswith(f"zenoh on loopback:1: the robot is in use by process {os.getpid()} (")
         assert text.endswith(
-            "). Two programs that command one robot make it jump. End that run first (Ctrl-C in its "
+            "). Two programs that command one robot make it jump. End the other run (Ctrl-C in its "
             "terminal), then start this one"
         )
         with LocalClaim("zenoh on loopback:2") as other:

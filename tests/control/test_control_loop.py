@@ -309,13 +309,13 @@ def test_a_recorder_that_is_gone_ends_the_run_passively(rig: Any) -> None:
 
     def sink(record: CycleRecord) -> bool:
         if record.cycle >= 12:
-            raise DatasetError("the recorder is gone")
+            raise DatasetError("the recorder has ended")
         return True
 
     report = make_loop(rig, balance(), sink=sink).run()
     assert (report.outcome, report.reason, report.error) == (
         Outcome.FAILED,
-        "the recorder is gone",
+        "the recorder has ended",
         "DatasetError",
     )
     assert report.passive_confirmed
@@ -366,5 +366,5 @@ def test_the_report_survives_json(rig: Any) -> None:
 
 def test_settings_that_cannot_be_are_refused() -> None:
     """A run of no time."""
-    with pytest.raises(ConfigurationError, match="longer than 0 s"):
+    with pytest.raises(ConfigurationError, match="a length above 0 s"):
         LoopConfig(duration_s=0.0)

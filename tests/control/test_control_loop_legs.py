@@ -325,7 +325,7 @@ def test_a_robot_that_cannot_be_handed_back_is_a_warning() -> None:
     assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True)
     warnings = [message for kind, message in rig.events if kind == "warning"]
     assert len(warnings) == 1
-    assert warnings[0].startswith("the robot was not handed back: ")
+    assert warnings[0].startswith("the robot did not return to its own controller: ")
 
 
 @pytest.mark.parametrize("stall_ms", [200, 700])

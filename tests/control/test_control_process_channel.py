@@ -75,7 +75,7 @@ def test_fifty_refusals_in_a_row_end_the_run(pair: Pair) -> None:
 def test_a_recorder_that_is_gone_is_an_error(pair: Pair) -> None:
     """A closed socket never takes anything again."""
     pair[1].close()
-    with pytest.raises(DatasetError, match="the recorder is gone"):
+    with pytest.raises(DatasetError, match="the recorder has ended"):
         RecordSender(pair[0])(record(0))
 
 

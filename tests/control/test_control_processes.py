@@ -187,7 +187,7 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     assert said.replay is not None and said.replay.position[0] < 0.05
     lines = said.lines()
     assert lines[1].startswith("  ran for 0.5 of 0.5 s")
-    assert any(line.startswith("  off the recording by ") for line in lines)
+    assert any(line.startswith("  difference from the recording at most ") for line in lines)
 
 
 def test_dry_run_leaves_the_motor_off(emulator: Emulator, tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ def test_a_stopped_control_process_is_killed_and_the_robot_made_passive(
         pids.update(children())
         os.kill(pids["control_process"], signal.SIGSTOP)
 
-    with pytest.raises(SafetyError, match="was killed: it gave no sign of life while running"):
+    with pytest.raises(SafetyError, match="was killed: it sent no heartbeat while running"):
         run(emulator, tmp_path, stall)
     assert not Path(f"/proc/{pids['control_process']}").exists()
     assert Status.ARMED not in emulator.status()
@@ -278,7 +278,7 @@ def test_a_killed_control_process_leaves_a_passive_robot(emulator: Emulator, tmp
 
 def test_a_killed_recorder_ends_the_run_passively(emulator: Emulator, tmp_path: Path) -> None:
     """No recording, no run; the dataset repairs what was written and keeps all but the last 0.1 s."""
-    with pytest.raises(DatasetError, match="the recorder is gone"):
+    with pytest.raises(DatasetError, match="the recorder has ended"):
         run(emulator, tmp_path, lambda: os.kill(children()["recorder_process"], signal.SIGKILL))
     assert Status.ARMED not in emulator.status()
     assert_whole(tmp_path)
@@ -350,8 +350,7 @@ def test_a_cable_that_is_pulled_is_named_and_the_data_are_whole(
     facts = Dataset.open(tmp_path).episodes[0].facts
     assert facts["passive_confirmed"] is False
     assert any(
-        "switch it off by hand. Where the cable is cut, its own watchdog has stopped the motor after 0.2 s"
-        in w
+        "switch it off by hand. If the cable is cut, its own watchdog has stopped the motor after 0.2 s" in w
         for w in facts["warnings"]
     )
     assert_whole(tmp_path)

@@ -78,7 +78,7 @@ def test_a_run_ends_with_next_to_no_torque(tmp_path: Path, simulator: tuple[str,
             report = run_episodes(PLAN, port=port, dataset=folder, episodes=1, purpose="collect", view=view)
         except SafetyError as error:
             # A machine that holds the simulator up makes states old: the limit is the robot's.
-            if attempt == 2 or not ("old" in str(error) or "no sign of life" in str(error)):
+            if attempt == 2 or not ("old" in str(error) or "no heartbeat" in str(error)):
                 raise
             continue
         break

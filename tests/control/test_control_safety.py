@@ -135,12 +135,12 @@ def test_arming_twice_and_rearming_while_armed_are_errors() -> None:
     machine = SafetyMachine(ease_in_ns=0)
     machine.rearm()
     machine.arm(0)
-    with pytest.raises(SafetyError, match="cannot arm while easing in"):
+    with pytest.raises(SafetyError, match="cannot arm in state easing in"):
         machine.arm(0)
-    with pytest.raises(SafetyError, match="cannot re-arm while easing in"):
+    with pytest.raises(SafetyError, match="cannot re-arm in state easing in"):
         machine.rearm()
     machine.stop()
-    with pytest.raises(SafetyError, match="cannot arm while passive"):
+    with pytest.raises(SafetyError, match="cannot arm in state passive"):
         machine.arm(0)
 
 

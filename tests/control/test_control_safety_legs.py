@@ -199,8 +199,8 @@ def test_a_robot_with_legs_that_reports_no_body_fails(armed: Safety) -> None:
     bare = dataclasses.replace(state(T0 + 20 * MS), body=None)
     verdict = step(armed, 20, bare)
     assert verdict.flags == ("body_missing",)
-    assert verdict.reason == "the robot reports nothing of its body: no orientation, no battery"
-    with pytest.raises(SafetyError, match="reports nothing of its body"):
+    assert verdict.reason == "the robot reports no state of its body: no orientation, no battery"
+    with pytest.raises(SafetyError, match="reports no state of its body"):
         Safety(robot()).arm(cycle(sample=dataclasses.replace(state(), body=None)))
 
 

@@ -197,7 +197,7 @@ def test_unknown_names_list_what_there_is() -> None:
 
 def test_a_band_without_harmonics_is_refused() -> None:
     """0.3 to 0.4 Hz holds no multiple of 1 Hz."""
-    with pytest.raises(ConfigurationError, match="holds 0 multiples"):
+    with pytest.raises(ConfigurationError, match="contains 0 multiples"):
         multisine(np.ones(1), 0.3, 0.4, 1.0, rng=np.random.default_rng(0))
 
 

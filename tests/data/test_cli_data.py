@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.data import InfoSettings, Repair, Verify, _moved_by, data
+from deal_hw.cli.data import InfoSettings, Repair, Verify, _position_ranges, data
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.episode_info import EpisodeInfo
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -63,8 +63,8 @@ def test_of_many_joints_the_widest_is_shown() -> None:
         clock=None,
     )
     facts = {"joint_names": ["a", "b", "c"], "position_units": ["rad"] * 3}
-    assert _moved_by(episode, facts) == "0.90 rad (b)"
-    assert _moved_by(dataclasses.replace(episode, excitation=None), facts) == ""
+    assert _position_ranges(episode, facts) == "0.90 rad (b)"
+    assert _position_ranges(dataclasses.replace(episode, excitation=None), facts) == ""
 
 
 def test_info_as_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -113,7 +113,7 @@ def test_unreadable_file_does_not_hide_the_others(dataset: Path, capsys: pytest.
 
 def test_wrong_path_is_said(tmp_path: Path) -> None:
     """A folder without episodes and an absent file are errors with their paths."""
-    with pytest.raises(DatasetError, match="neither a dataset"):
+    with pytest.raises(DatasetError, match="is no dataset"):
         data(Verify(path=tmp_path))
     with pytest.raises(DatasetError, match=r"it has no dataset\.json"):
         data(InfoSettings(path=tmp_path))

@@ -129,7 +129,7 @@ def test_import_with_a_description_and_dry_run(recording: Path, tmp_path: Path) 
     second = Dataset.open(tmp_path / "second")
     assert second.description["name"] == "other" and len(second.episodes) == 2
     path.write_text("{}")
-    with pytest.raises(ConfigurationError, match="lacks name, joint_names"):
+    with pytest.raises(ConfigurationError, match="name, joint_names, actuated"):
         data(Import(paths=(recording,), out=first, description=path))
     with pytest.raises(ConfigurationError, match="device-periods"):
         data(Import(paths=(recording,), out=first, device_periods=0))

@@ -122,7 +122,7 @@ def test_a_list_of_something_else_names_row_and_column(tmp_path: Path, cell: str
     path = tmp_path / "a.csv"
     path.write_text(f"time;pos\n0;[1, 2]\n1;{cell}\n2;[1, 2]\n", encoding="utf-8")
     text = refusal(lambda: read_csv(path), path)
-    assert "row 2, column 'pos' holds" in text and "not a list of 2 numbers" in text
+    assert "row 2, column 'pos' contains" in text and "not a list of 2 numbers" in text
 
 
 @settings(max_examples=80, deadline=None)

@@ -74,7 +74,7 @@ def test_csv_dialects(tmp_path: Path) -> None:
     assert channels.arrays["t"].tolist() == [0.5, 1.5, 2.5]
     np.testing.assert_array_equal(channels.arrays["a"], [1.25, np.nan, 4])
     np.testing.assert_array_equal(channels.arrays["b"], [np.nan, 3, 5])
-    assert "row 4 is cut off" in channels.notes[0]
+    assert "row 4 is incomplete" in channels.notes[0]
 
 
 def test_csv_lists_in_cells(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_csv_lists_in_cells(tmp_path: Path) -> None:
         ("", "empty"),
         ("1,2\n3,4\n", "must name the columns"),
         ("t,t\n1,2\n", "each once"),
-        ("t,a\n0,1\n1,x\n", "row 2, column 'a' holds 'x'"),
+        ("t,a\n0,1\n1,x\n", "row 2, column 'a' contains 'x'"),
         ("t,a\n0,1,2\n", "row 1 has 3 cells"),
         ("t,a\n0\n1,2\n", "row 1 has fewer"),
         ('t,a\n0,"[1,2]"\n1,"[1]"\n', "row 2, column 'a'"),
@@ -206,7 +206,7 @@ def test_mcap_joint_states(tmp_path: Path) -> None:
 def test_mcap_with_changing_joints_is_refused(tmp_path: Path) -> None:
     """Two publishers on one topic are named as the trouble."""
     path = joint_states(tmp_path / "bag.mcap", [("left", "right"), ("left",)])
-    with pytest.raises(DatasetError, match="topic of its own"):
+    with pytest.raises(DatasetError, match="its own topic"):
         read_mcap(path)
     with pytest.raises(DatasetError, match="cannot be read as MCAP"):
         read_mcap(write(tmp_path / "x.mcap", "no mcap"))
@@ -358,7 +358,7 @@ def test_unknown_files(tmp_path: Path) -> None:
     for path, words in (
         (write(tmp_path / "a.bag", "x"), "'.bag' are not known"),
         (tmp_path / "none.csv", "does not exist"),
-        (tmp_path, "no LeRobot dataset"),
+        (tmp_path, "a LeRobot dataset"),
     ):
         with pytest.raises(DatasetError, match=words):
             read_channels(path)

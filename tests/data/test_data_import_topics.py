@@ -169,15 +169,15 @@ def test_a_controllers_state_comes_before_its_goals(tmp_path: Path) -> None:
     [
         (
             lambda n: [states(n)],
-            r"no topic holds commands for hip, knee; topics: /joint_states \(JointState\)",
+            r"no topic contains commands for hip, knee; topics: /joint_states \(JointState\)",
         ),
         (
             lambda n: [states(n), states(n, "/left/joint_states"), commands(n)],
-            r"2 topics may hold the measured positions \(/joint_states\.position: hip, knee; /left/",
+            r"2 topics may contain the measured positions \(/joint_states\.position: hip, knee; /left/",
         ),
         (
             lambda n: [states(n), commands(n), commands(n, topic="/effort_controller/commands")],
-            r"2 topics may hold the commands",
+            r"2 topics may contain the commands",
         ),
     ],
 )
@@ -237,7 +237,7 @@ def test_folder_of_a_bag(tmp_path: Path) -> None:
     """What `ros2 bag record` leaves is a folder; SQLite is refused with the way out."""
     (tmp_path / "bag").mkdir()
     bag(tmp_path / "bag" / "bag_0.mcap", [[states(n), commands(n)] for n in range(5)])
-    with pytest.raises(DatasetError, match=r"no ROS 2 bag of one MCAP file \(metadata\.yaml\)"):
+    with pytest.raises(DatasetError, match=r"a ROS 2 bag of one MCAP file \(metadata\.yaml\)"):
         load_tables(tmp_path / "bag")
     (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     (table,) = load_tables(tmp_path / "bag")
@@ -288,5 +288,5 @@ def test_our_own_episodes_are_taken_in_as_they_are(
     assert dataset.description["name"] == "cartpole"
     assert data(Import(paths=(out, path), out=tmp_path / "both", force=True)) == 0
     assert len(Dataset.open(tmp_path / "both").episodes) == 2
-    with pytest.raises(ConfigurationError, match=r"name.*the episodes' own description says it"):
+    with pytest.raises(ConfigurationError, match=r"name.*the episodes contain their own description"):
         data(Import(paths=(path,), out=out, name="other", force=True))

@@ -173,7 +173,7 @@ def test_full_disk_leaves_the_original(write_episode: WriteEpisode) -> None:
 def test_hopeless_files_are_refused(tmp_path: Path) -> None:
     """Empty files, files of another kind and MCAP files of others are named as such and not touched."""
     (tmp_path / "empty.mcap").touch()
-    with pytest.raises(EmptyRecordingError, match="nothing to repair"):
+    with pytest.raises(EmptyRecordingError, match="cannot be repaired"):
         repair(tmp_path / "empty.mcap")
     (tmp_path / "text.mcap").write_text("not a recording")
     with pytest.raises(DatasetError, match="not an MCAP file"):

@@ -81,7 +81,7 @@ class TestCartpoleOnCan(RobotSuite):
 def test_a_node_that_sends_but_does_not_answer_is_another_device() -> None:
     """States without an info: the message asks for the firmware's DBC."""
     state = protocol.State(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
-    with pytest.raises(WrongDeviceError, match="another DBC"):
+    with pytest.raises(WrongDeviceError, match="the same DBC"):
         fake(state).connect()
 
 
@@ -240,7 +240,7 @@ def test_a_lost_node_is_silence_that_names_the_reason() -> None:
 
 def test_a_bus_without_another_node_is_refused_with_its_reason() -> None:
     """Power, bit rate, termination."""
-    with pytest.raises(TransportTimeoutError, match=r"no answer to hello.*terminated"):
+    with pytest.raises(TransportTimeoutError, match=r"no answer to hello.*termination"):
         Bench(CanFaults(no_acknowledge=True)).robot.connect()
 
 

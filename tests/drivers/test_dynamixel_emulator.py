@@ -176,9 +176,13 @@ def test_doctor_lists_servos(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("faults", "says", "remedy"),
     [
-        (ServoFaults(baud_rate=57600), "set to 57600 baud, deal-hw expects 1000000", r"Baud Rate \(8\)"),
+        (ServoFaults(baud_rate=57600), "set to 57600 baud, but deal-hw expects 1000000", r"Baud Rate \(8\)"),
         (ServoFaults(baud_rate=3_000_000), "set to 3000000 baud", "baud_rate=3000000"),
-        (ServoFaults(duplicate_id=True), "id 1 at 1000000 baud answers pings", "two servos with the same id"),
+        (
+            ServoFaults(duplicate_id=True),
+            "id 1 at 1000000 baud answers pings",
+            "two servos may have the same id",
+        ),
     ],
 )
 def test_doctor_tells_what_is_wrong(faults: ServoFaults, says: str, remedy: str, tmp_path: Path) -> None:

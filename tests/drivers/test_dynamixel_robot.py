@@ -162,7 +162,7 @@ def test_a_rail_of_another_length_is_refused() -> None:
     """Homing that finds another way than the settings say is no homing."""
     wire = Wire(cart_zero=None, rail_m=0.9)
     wire.robot.connect()
-    with pytest.raises(SafetyError, match=r"0\.80\d m between the end stops, the settings say 0\.9"):
+    with pytest.raises(SafetyError, match=r"0\.80\d m between the end stops, but the settings have 0\.9"):
         wire.robot.home(20.0)
     assert not wire.cart.get(TORQUE_ENABLE)
     with pytest.raises(SafetyError, match="home"):
@@ -332,7 +332,7 @@ def test_an_absent_servo_costs_less_than_a_cycle() -> None:
         wire.run(1)
         assert (wire.clock.now_ns() - start_ns) % 20_000_000 == 0
     assert wire.clock.now_ns() - start_ns <= 80_000_000
-    assert "servo 2 (pole) does not answer any more" in robot.fault
+    assert "servo 2 (pole) stopped answering" in robot.fault
     assert make_passive(robot, wire.clock)
     assert not wire.cart.get(TORQUE_ENABLE)
     assert np.isnan(robot.read_state(0.1).position[1])
@@ -410,7 +410,7 @@ def test_two_servos_with_one_id_are_told() -> None:
     third.put(PRESENT_POSITION, 1234)
     wire.device.servos.append(third)
     third.put(STATUS_RETURN_LEVEL, 1)
-    with pytest.raises(WrongDeviceError, match="answers of servo 1 are corrupt time after time"):
+    with pytest.raises(WrongDeviceError, match="answers of servo 1 are corrupt again and again"):
         wire.robot.connect()
 
 

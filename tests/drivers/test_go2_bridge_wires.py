@@ -137,7 +137,7 @@ def test_a_robot_that_does_not_answer_is_not_damped(make_bench: Callable[[str], 
     bench.go2.deaf.add("motion_switcher")
     bench.bridge.open()
     assert bench.go2.heard == []
-    assert "is not known, so it is not damped yet" in bench.told[0]
+    assert "is unknown, so it is not damped yet" in bench.told[0]
 
 
 def test_clients_hear_states_with_stamps_and_who_has_the_robot(make_bench: Callable[[str], Bench]) -> None:

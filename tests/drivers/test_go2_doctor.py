@@ -289,5 +289,5 @@ def test_a_simulator_that_is_named_is_well() -> None:
 
 def test_a_simulator_that_is_paused_is_said() -> None:
     """Its states go on and do not change."""
-    found = only(simulated("unitree_mujoco", paused=True), "states", "nothing in them changes")
+    found = only(simulated("unitree_mujoco", paused=True), "states", "do not change")
     assert (found.level, found.remedy) == (Level.FAIL, "let the simulation run: it is paused")

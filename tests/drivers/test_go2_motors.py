@@ -186,8 +186,8 @@ def test_a_remote_script_is_read_in_order_of_time(tmp_path: Path) -> None:
     [
         ("nonsense", "cannot be read as a remote's script: Invalid JSON"),
         ("{}", "should be an? .*; it is a list of objects"),
-        ('[{"buttons": "A"}]', "is no moment; keys: at_s, buttons"),
-        ('[{"at_s": 0, "stick": 1}]', "is no moment"),
+        ('[{"buttons": "A"}]', "is no valid entry; allowed keys are at_s, buttons"),
+        ('[{"at_s": 0, "stick": 1}]', "is no valid entry"),
         ('[{"at_s": "soon"}]', "at_s must be a number, got 'soon'"),
         ('[{"at_s": 0, "buttons": "Z"}]', "unknown button 'Z'; known: R1, L1"),
     ],

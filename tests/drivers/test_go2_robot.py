@@ -464,7 +464,7 @@ def test_make_passive_reports_what_the_robot_shows() -> None:
     assert not make_passive(robot, wire.clock)
 
 
-def status(control: str, reason: str = "no command that may pass") -> bytes:
+def status(control: str, reason: str = "no admissible command") -> bytes:
     """Return what a bridge says."""
     return encode_status({"control": control, "reason": reason})
 
@@ -480,7 +480,7 @@ def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:
     assert robot.fault == ""
     wire.topics.say(topics.BRIDGE, status("damping"), 0.05)
     drained(robot, 100)
-    assert robot.fault == "go2: the bridge took the robot from this run: no command that may pass"
+    assert robot.fault == "go2: the bridge took the robot from this run: no admissible command"
 
 
 def test_a_robot_that_another_controls_through_the_bridge_is_not_taken_over() -> None:
@@ -539,6 +539,7 @@ def test_another_rule_is_said_with_the_switch_and_its_risk(
 ) -> None:
     """States of the right length without one right checksum, or head: update, or leave both out."""
     with pytest.raises(
-        VersionMismatchError, match=r"another rule.*update deal-hw.*--state-check length.*true"
+        VersionMismatchError,
+        match=r"another head or checksum.*update deal-hw.*--state-check length.*not detected",
     ):
         faked(change).connect()

@@ -268,7 +268,7 @@ def test_a_robot_that_swings_is_waited_for() -> None:
     wire = FakeBench(Go2OnStandRobot, mode="")
     wire.robot.connect()
     wire.device.changes = {"angular_velocity": np.array((0.0, 0.7, 0.0))}
-    with pytest.raises(SafetyError, match=r"not sure.*is held in the air: it moves.*wait until it is still"):
+    with pytest.raises(SafetyError, match=r"uncertain.*is held in the air: it moves.*wait until it is still"):
         wire.robot.home(10.0)
     left, state = iter(range(300)), wire.device.state
 

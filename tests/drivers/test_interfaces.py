@@ -46,10 +46,10 @@ def test_an_interface_has_a_name_and_addresses(port: str, found: Interface) -> N
     [
         (
             "eth9",
-            r"'eth9'; interfaces at hand: lo 127\.0\.0\.1; eth0 10\.0\.0\.2, 192\.168\.123\.99 \(no carrier\)"
+            r"'eth9'; known interfaces: lo 127\.0\.0\.1; eth0 10\.0\.0\.2, 192\.168\.123\.99 \(no carrier\)"
             r"; eth1 without an IPv4 address; eth2 10\.0\.0\.3 \(down\)",
         ),
-        ("", "interfaces at hand"),
+        ("", "known interfaces"),
         ("eth1", r"ip address add 192\.168\.123\.99/24 dev eth1"),
         ("eth2", "ip link set eth2 up"),
     ],

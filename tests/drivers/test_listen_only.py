@@ -101,7 +101,7 @@ def test_the_path_is_otherwise_the_inner_one() -> None:
         assert path.receive(0.1).channel == topics.LOW_STATE
         assert path.writers(topics.LOW_COMMAND) == ()
         with pytest.raises(
-            SafetyError, match=r"virtual: this run only listens \(--dry-run\): nothing may be sent"
+            SafetyError, match=r"virtual: this run only listens \(--dry-run\), so it cannot send"
         ):
             path.send(Message(topics.LOW_COMMAND, b"", 0))
     assert inner._publish == frozenset()

@@ -224,7 +224,7 @@ def test_a_supervisor_that_stands_still_leaves_a_damped_go2(
 
 
 @pytest.mark.parametrize(
-    ("number", "words"), [(signal.SIGKILL, "died by signal 9"), (signal.SIGSTOP, "no sign of life")]
+    ("number", "words"), [(signal.SIGKILL, "died by signal 9"), (signal.SIGSTOP, "no heartbeat")]
 )
 def test_a_dry_run_whose_control_process_dies_or_hangs_sends_nothing(
     go2: Callable[..., Go2], number: signal.Signals, words: str

@@ -196,7 +196,7 @@ def test_a_policy_for_another_robot_is_refused_by_field() -> None:
     text = str(caught.value)
     assert "robot: policy has 'pendulum', robot has 'cartpole'" in text
     assert "control_rate_hz: policy has 100.0, robot has 50.0" in text
-    assert "stiffness: policy asks for (900.0,), the robot allows at most (200.0,)" in text
+    assert "stiffness: policy requests (900.0,), the robot allows at most (200.0,)" in text
     assert "joint_names" not in text
 
 

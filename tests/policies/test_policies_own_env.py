@@ -193,8 +193,8 @@ def test_an_environment_that_cannot_be_used(robot: Path, env: str, words: str, t
     ("given", "words"),
     [
         ({"robot": "cartpole", "nominal": True}, "--env needs a robot.yaml"),
-        ({"udr": True}, "--env takes --distribution or --nominal, not --udr"),
-        ({}, "say under what to train"),
+        ({"udr": True}, "--udr does not go with --env, not --udr"),
+        ({}, "no distribution is named"),
     ],
 )
 def test_what_env_does_not_go_with(robot: Path, given: dict[str, Any], words: str) -> None:

@@ -58,7 +58,7 @@ def test_udr_covers_a_factor_of_five_and_30_ms() -> None:
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        (Train(), r"say under what to train: --distribution FILE .*, --udr or --nominal"),
+        (Train(), r"no distribution is named: give --distribution FILE .*, --udr or --nominal"),
         (Train(udr=True, distribution=Path("x.json")), "--distribution and --udr exclude each other"),
         (Train(udr=True, nominal=True), "--udr and --nominal exclude each other"),
         (
@@ -95,7 +95,7 @@ def test_a_go2_is_trained_stopped_and_resumed(
     with pytest.raises(KeyboardInterrupt):
         train(config)
     assert signal.getsignal(signal.SIGINT) is handler
-    assert "stopped before the end; --resume goes on" in capsys.readouterr().out
+    assert "stopped before the end; --resume continues" in capsys.readouterr().out
     policies = tmp_path / "policies"
     OnnxPolicy(policies / "policy.onnx").spec.check_fits(driver_description("go2"))
     record = json.loads((policies / "policy.json").read_text(encoding="utf-8"))

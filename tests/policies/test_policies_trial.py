@@ -204,7 +204,7 @@ def test_a_rare_fault_passes(tmp_path: Path) -> None:
             {"observation": (ObservationTerm("gravity", "z", 1.0),)},
             r"observes gravity of the base, which no sensor of 'cartpole' reports",
         ),
-        ({"stiffness": (1e9,)}, r"stiffness: policy asks for \(1000000000.0,\), the robot allows at most"),
+        ({"stiffness": (1e9,)}, r"stiffness: policy requests \(1000000000.0,\), the robot allows at most"),
     ],
 )
 def test_a_spec_that_does_not_suit_the_robot_is_refused(

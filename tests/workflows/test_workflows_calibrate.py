@@ -124,7 +124,10 @@ def test_models_in_memory(pendulum: tuple[Path, Path, Path], tmp_path: Path) -> 
             [{"time": T, "position": np.zeros((400, 1)), "target": np.zeros((400, 1)), "joints": ["elbow"]}],
             r"which of the model's joints \(pivot\) the file's \(elbow\) are",
         ),
-        ([{"time": T, "position": np.sin(T)[:, None]}], "no commanded positions; name them as `target`"),
+        (
+            [{"time": T, "position": np.sin(T)[:, None]}],
+            "no commanded positions, so nothing can be predicted; name them",
+        ),
         (
             [{"time": T, "position": 40 * np.sin(T)[:, None], "target": 40 * np.sin(T)[:, None]}],
             r"units: pivot: positions reach 40 rad, the joint .* rad \(degrees",
@@ -148,11 +151,11 @@ def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, P
         deal_hw.calibrate(model, fit, dataset="runs/first/dataset")
     with pytest.raises(ConfigurationError, match="--episodes would have no effect: only datasets take that"):
         deal_hw.calibrate(model, fit, episodes=[0])
-    with pytest.raises(ConfigurationError, match="--feet, --data would have no effect: a dataset says it"):
+    with pytest.raises(ConfigurationError, match="--feet, --data would have no effect: a dataset defines it"):
         deal_hw.calibrate(None, fit, dataset="d", feet=["FL"])
     with pytest.raises(ConfigurationError, match="eki runs no policy"):
         deal_hw.calibrate(model, fit, method="eki", policy="pi.onnx")
-    with pytest.raises(ConfigurationError, match="which recordings of --model do not name"):
+    with pytest.raises(ConfigurationError, match="which is unknown for --model"):
         deal_hw.calibrate(model, fit, method="deal-paper")
     with pytest.raises(UnknownNameError, match="eki"):
         deal_hw.calibrate(model, fit, method="gradient")

@@ -38,12 +38,12 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
         {**COLLECT, "motion": "chirp", "excitation_level": 1.0},
         "--excitation-level would have no effect",
     ),
-    ("collect", {**COLLECT, "legs": WALK}, "--velocity would have no effect: only robots with legs"),
+    ("collect", {**COLLECT, "legs": WALK}, "--velocity would have no effect: only for robots with legs"),
     ("collect", {**COLLECT, "link": deal_hw.LinkOptions(transport="dds")}, "dds"),
     ("collect", CARTPOLE, "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
     ("collect", {**COLLECT, "dataset": "d"}, "give --out RUN or --dataset DIR, not both"),
     ("collect", COLLECT, "no-port"),
-    ("collect", {"robot": "cartpole", "out": "out"}, "say where the robot is: --port"),
+    ("collect", {"robot": "cartpole", "out": "out"}, "no port is given: name the robot's port"),
     (
         "collect",
         {**COLLECT, "simulation": REHEARSAL},
@@ -68,7 +68,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("deploy", {**CARTPOLE, "episodes": 0}, "--episodes 0: allowed are 1 to 10000"),
     ("deploy", CARTPOLE, "no-port"),
     ("replay", {"episode": "none.mcap", "port": "no-port"}, "none.mcap"),
-    ("train", {}, "say under what to train: --distribution FILE"),
+    ("train", {}, "no distribution is named: give --distribution FILE"),
     ("train", {"udr": True, "nominal": True}, "--udr and --nominal exclude each other"),
     (
         "train",
@@ -77,7 +77,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ),
     ("train", {"udr": True, "trainer": "dqn"}, "dqn"),
     ("train", {"robot": "cartpole", "env": "a:B-v0", "nominal": True}, "--env needs a robot.yaml"),
-    ("train", {"robot": "r.yaml", "env": "a:B-v0", "udr": True}, "--env takes --distribution or --nominal"),
+    ("train", {"robot": "r.yaml", "env": "a:B-v0", "udr": True}, "--udr does not go with --env"),
     ("train", {"udr": True, "steps": 0}, "--steps 0: allowed are 1 to"),
     ("train", {"distribution": "none.json"}, "none.json cannot be read"),
     (
@@ -123,12 +123,16 @@ ON_MODEL = "--model m.xml --data r.csv"
 CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
     ({}, "", "in Python dataset=..., or model=... and data=[...]"),
     ({**MODEL, "dataset": "d"}, f"d {ON_MODEL}", "not both"),
-    ({"dataset": "d", "data": ["r.csv"]}, "d --data r.csv", "--data would have no effect: a dataset says it"),
-    ({"dataset": "d", "feet": ["FL"]}, "d --feet FL", "--feet would have no effect: a dataset says it"),
+    (
+        {"dataset": "d", "data": ["r.csv"]},
+        "d --data r.csv",
+        "--data would have no effect: a dataset defines it",
+    ),
+    ({"dataset": "d", "feet": ["FL"]}, "d --feet FL", "--feet would have no effect: a dataset defines it"),
     (
         {"dataset": "d", "holdout": ["r.csv"]},
         "d --holdout r.csv",
-        "--holdout r.csv: of a dataset name episodes",
+        "--holdout r.csv: with a dataset give episode",
     ),
     ({"dataset": "d", "method": "gradient"}, "d --method gradient", "gradient"),
     (
@@ -140,7 +144,7 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
     (
         {"dataset": "d", "latency_s": 0.01, "latency_range_s": (0.0, 0.01)},
         "d --latency 0.01 --latency-range 0 0.01",
-        "--latency-range would have no effect: --latency says the latency",
+        "--latency-range would have no effect: --latency gives the latency",
     ),
     (
         {"dataset": "d", "latency_range_s": (0.02, 0.01)},
@@ -165,14 +169,14 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
         f"{ON_MODEL} --sample-hz 50",
         "--sample-hz would have no effect: only data",
     ),
-    ({"dataset": "d", "force": True}, "d --force", "--force would have no effect: a dataset says it"),
+    ({"dataset": "d", "force": True}, "d --force", "--force would have no effect: a dataset defines it"),
     ({**MODEL, "window_s": 0.0}, f"{ON_MODEL} --window 0", "--window 0.0 s: allowed are 0.001 to 60 s"),
     ({**MODEL, "physics_step_s": 1.0}, f"{ON_MODEL} --physics-step 1", "--physics-step 1.0 s: allowed are"),
     ({**MODEL, "space": "k9"}, f"{ON_MODEL} --space k9", "--space would have no effect: only datasets"),
     (
         {**MODEL, "method": "deal-paper"},
         f"{ON_MODEL} --method deal-paper",
-        "which recordings of --model do not",
+        "which is unknown for --model",
     ),
     ({"model": "m.xml"}, "--model m.xml", "--model needs recordings to fit: --data rec.csv"),
     (
@@ -185,7 +189,7 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
         f"{ON_MODEL} --holdout-part 1",
         "--holdout-part 1.0: allowed are 0 to 0.95",
     ),
-    ({**MODEL, "holdout": ["r.csv"]}, f"{ON_MODEL} --holdout r.csv", "is to be fitted and held out"),
+    ({**MODEL, "holdout": ["r.csv"]}, f"{ON_MODEL} --holdout r.csv", "is both fitted and held out"),
     (MODEL, ON_MODEL, "m.xml"),
 ]
 """Arguments in Python, on the command line, and words of the refusal."""

@@ -33,9 +33,9 @@ def test_from_two_files_to_an_inspected_calibration(made: Path, capsys: pytest.C
     assert main(["robot", "check", str(made / "robot.yaml")]) == EXIT_OK
     told = capsys.readouterr().out
     assert "robot.yaml and MJCF agree" in told and "holding for 1 s: stable" in told
-    assert "note velocity_limit: not said for" in told
+    assert "note velocity_limit: missing for" in told
     assert main(["data", "info", str(dataset)]) == EXIT_OK
-    assert "it carries its robot" in capsys.readouterr().out
+    assert "its robot" in capsys.readouterr().out
     assert main(["data", "verify", str(dataset)]) == EXIT_OK
     words = [str(dataset), "--holdout", "1", "--threads", "1", "--quiet"]
     assert main(["calibrate", *words]) == EXIT_OK
@@ -122,9 +122,12 @@ def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
 
 
 REFUSED: list[tuple[str, str]] = [
-    ("calibrate {made}/run/dataset --method deal-paper", "nor those of a dataset that carries its robot"),
+    ("calibrate {made}/run/dataset --method deal-paper", "and for a dataset with its own robot.yaml"),
     ("robot new {made}/robot.xml", "robot.yaml exists; name another file with --out, or remove it"),
-    ("robot new {made}/robot.xml --out o.yaml --name so101", "'so101' is that of a robot of deal-hw; choose"),
+    (
+        "robot new {made}/robot.xml --out o.yaml --name so101",
+        "'so101' is the name of a robot of deal-hw; choose",
+    ),
     ("robot new none.xml", "model none.xml does not exist"),
     ("robot check none.yaml", "there is no such file; `deal-hw robot new robot.xml` writes one"),
     (
@@ -151,7 +154,7 @@ REFUSED: list[tuple[str, str]] = [
     ),
     (
         "collect {made}/robot.yaml --simulated --out r --excite chirp",
-        "may go is not known; write its position_range",
+        "is unknown, so no excitation can be planned; write its position_range",
     ),
     ("collect cartpole --simulated --out r", "--simulated takes a robot.yaml"),
     (
@@ -162,13 +165,10 @@ REFUSED: list[tuple[str, str]] = [
         "collect cartpole --port p --truth-seed 1 --out r",
         "--truth-seed would have no effect: only with --simulated",
     ),
-    ("collect cartpole --out r", "say where the robot is: --port"),
-    ("replay {made}/run/dataset/episodes/000000.mcap --port p", "deal-hw has no driver for this robot"),
-    ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a rehearsal is"),
-    (
-        "deploy {made}/robot.yaml --port p",
-        "deal-hw has no driver for this robot; page 'Add a robot or a method'",
-    ),
+    ("collect cartpole --out r", "no port is given: name the robot's port"),
+    ("replay {made}/run/dataset/episodes/000000.mcap --port p", "a robot of your own has no driver here"),
+    ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a simulated"),
+    ("deploy {made}/robot.yaml --port p", "a robot of your own has no driver here; docs/how-to/add.md"),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]
 

@@ -50,7 +50,7 @@ def test_a_robot_is_emulated_recorded_and_replayed(
     assert again.paths[0].parent == tmp_path / "again" / "episodes" and dry.paths == ()
     assert kept.dataset == Path("runs/replay_cartpole/dataset") and kept.paths[0].is_file()
     assert lost.dataset is None and lost.paths == ()
-    assert any("too short for `deal-hw calibrate`" in text for text in said)
+    assert any("too short: `deal-hw calibrate`" in text for text in said)
     assert "finished: the run is over" in said
     for shown in (run._repr_html_(), run.table()):
         assert str(run.paths[0]) in shown and "finished" in shown
@@ -63,7 +63,7 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
     lost = EpisodeReport(
         path=None,
         outcome=Outcome.TRIPPED,
-        reason="the link is gone",
+        reason="the connection is lost",
         passive_confirmed=False,
         loop_timing=None,
         clipped={},
@@ -76,7 +76,7 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
         view.ended(lost)
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
-    assert said == ["tripped: the link is gone", "warning: switch it off by hand"]
+    assert said == ["tripped: the connection is lost", "warning: switch it off by hand"]
 
 
 def test_a_policy_for_another_robot_is_refused_before_the_port(tmp_path: Path) -> None:

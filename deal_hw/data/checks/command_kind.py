@@ -1,8 +1,8 @@
 """Are recorded commands what the model's actuators take: positions for servos, efforts for motors?
 
-The two look alike in a file. Positions are followed: the joint goes where its command says. Efforts are not,
-but they explain how the joint accelerates. A check that finds the one where the model has the other refuses,
-since every parameter would be fitted to nonsense.
+The two look alike in a file. A joint follows commanded positions; commanded efforts explain its acceleration
+instead. If the commands are of one kind and the model's actuators of the other, the check fails, since every
+fitted parameter would be meaningless.
 """
 
 from __future__ import annotations
@@ -19,34 +19,35 @@ from deal_hw.types import FloatArray
 LAG_S: Final = 0.3
 """A joint follows a position within this time."""
 FOLLOWS: Final = 0.95
-"""Correlation of a position with the command that it follows ..."""
+"""Least correlation of a position with the command that it follows ..."""
 SLOPE: Final = (0.7, 1.3)
-"""... and how far it goes for a command of 1."""
+"""... and the least and largest motion for a command of 1."""
 PERHAPS: Final = 0.7
 PERHAPS_SLOPE: Final = (0.4, 2.0)
-"""A joint that follows its command this much may be a poor servo; it is not accused of taking efforts."""
+"""A joint that follows its command with this correlation may be a poor servo; its commands do not count as
+efforts."""
 SERVO_SHARE: Final = 0.5
-"""In a servo's command its own position stands with weight 1, give or take this much."""
+"""In a servo's command its own position has weight 1, within this tolerance."""
 EXPLAINED: Final = 0.5
-"""Position, speed and acceleration explain this share of an effort."""
+"""Position, speed and acceleration explain at least this share of an effort."""
 EFFORT_LAG_S: Final = 0.06
 SMOOTHED_S: Final = 0.08
-"""Acceleration is that of a parabola through so much of the motion."""
+"""The acceleration is that of a parabola through this much of the motion."""
 MOST: Final = 2 / 3
-"""Share of the moving joints that must say the same."""
+"""Share of the moving joints that must agree."""
 BEYOND: Final = (0.05, 0.5)
-"""Commands outside the actuator's range for these shares of the time are a warning, a refusal."""
+"""Commands outside the actuator's range for these shares of the time: a warning, a failure."""
 SLACK: Final = 1.02
 FEWEST: Final = 50
 STILL: Final = {"rad": 0.02, "m": 0.002}
-"""A joint or a command whose standard deviation is a quarter of this or less says nothing [rad or m]."""
+"""A joint or a command with a standard deviation of a quarter of this or less is not checked [rad or m]."""
 
 
 def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> CheckResult:
     """Check that commands are what the actuators of the model take.
 
     Args:
-        table: The recording, already found sound in clock and values.
+        table: The recording, with valid clock and values.
         servo: Whether the model's actuators take positions; else efforts.
         limits: Lowest and highest command that the actuators take, (A, 2); infinite where free.
     """
@@ -63,9 +64,7 @@ def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None)
     test = _is_effort if servo else _is_position
     found = [table.actuated[c] for c, i in joints if test(position[:, i], command[:, c], period)]
     if not joints or len(found) < MOST * len(joints):
-        return beyond or CheckResult(
-            "actuation", Severity.OK, "commands are of the kind that the model takes"
-        )
+        return beyond or CheckResult("actuation", Severity.OK, "the commands fit the model's actuators")
     return CheckResult("actuation", Severity.FAIL, _accusation(found, servo=servo))
 
 
@@ -73,21 +72,20 @@ def _accusation(names: Sequence[str], *, servo: bool) -> str:
     said = ", ".join(names)
     if servo:
         return (
-            f"commands that look like efforts ({said}): no joint goes where they say, but they explain its "
-            "acceleration, and the model's actuators take positions. If they are torques (N·m) or forces "
-            "(N), put <motor> in the place of <position> in a copy of the MJCF; if not, name the column of "
-            "commanded positions as `target`"
+            f"commands that look like efforts ({said}): no joint follows them as positions, but they "
+            "explain its acceleration, and the model's actuators take positions. If they are torques "
+            "(N·m) or forces (N), replace <position> by <motor> in a copy of the MJCF; if not, name the "
+            "column of commanded positions as `target`"
         )
     return (
-        f"commands that look like positions ({said}): the joints go where they say, and the model has "
-        "motors, which would take them as torques. Put <position joint=... kp=... kv=...> in the place "
-        "of <motor> in a copy of the MJCF, with the gains of the drives; or name the column of torques "
-        "as `target`"
+        f"commands that look like positions ({said}): the joints follow them, but the model has motors, "
+        "which would take them as torques. Replace <motor> by <position joint=... kp=... kv=...> in a "
+        "copy of the MJCF, with the gains of the drives; or name the column of torques as `target`"
     )
 
 
 def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> CheckResult | None:
-    """Return what to say of commands that the actuators would clip; None where there are hardly any."""
+    """Return the finding on commands that the actuators would clip; None if there are hardly any."""
     if limits is None:
         return None
     outside = (table.target < limits[:, 0] * SLACK) | (table.target > limits[:, 1] * SLACK)
@@ -101,13 +99,15 @@ def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> CheckResult
     if not named:
         return None
     other = "torques for a position actuator" if servo else "positions for a motor"
-    text = f"commands outside the actuators' ctrlrange: {', '.join(named)}; {other}, or another unit?"
+    text = (
+        f"commands outside the actuators' ctrlrange: {', '.join(named)}; check for {other}, or another unit"
+    )
     severe = float(np.max(share)) > BEYOND[1]
     return CheckResult("actuation", Severity.FAIL if severe else Severity.WARN, text)
 
 
 def _on_grid(table: Table) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return even times, (N,), measured positions, (N, J), and the commands in force, (N, A)."""
+    """Return uniform times, (N,), measured positions, (N, J), and the active commands, (N, A)."""
     sound = np.isfinite(table.position).all(axis=1)
     time = table.time_s[sound]
     steps = np.diff(time)

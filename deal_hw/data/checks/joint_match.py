@@ -1,9 +1,9 @@
-"""Whose command is whose: finds joints in the wrong order, with the wrong sign, and clocks that disagree.
+"""Matches commands to joints: finds a wrong order, a wrong sign, and clocks that disagree.
 
 Commands and measurements are put on one grid and high-passed by differences over a tenth of a second, so that
 poses and gravity do not count. C[i, j] is the correlation of the measurement of joint i with the command of
-joint j, at the common lag at which the given pairs agree best. Joints that are commanded alike (the legs of a
-robot that all move together) cannot be told apart and are not accused.
+joint j, at the common lag at which the given pairs agree best. Joints with the same commands (legs that all
+move together) cannot be distinguished and give no finding.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
 WINDOW_S = 0.1
-"""Differences are taken over this time."""
+"""Differences are taken over this time [s]."""
 MAX_LAG_S = 0.25
 SLOW_S = 1.0
 MAX_SAMPLES = 30_000
 CLEAR = 0.3
-"""Another assignment must explain each joint that it moves by this much more correlation on average."""
+"""Another assignment must raise the mean correlation of the reassigned joints by this much ..."""
 GOOD = 0.6
-"""... and with at least this much."""
+"""... and to at least this much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,8 +37,8 @@ class _Match:
         lags_s: (L,) [s]; positive where the measurement follows.
         correlation: (L, M, M): lag, measurement, command.
         level: Correlation of the positions themselves, (M,).
-        slow: Correlation of what is slower than a second, (M,).
-        near: How near the measurement of joint i stays to the command of joint j, (M, M), 0 to 1.
+        slow: Correlation of the motion slower than a second, (M,).
+        near: Nearness of the measurement of joint i to the command of joint j, (M, M), 0 to 1.
     """
 
     names: tuple[str, ...]
@@ -57,7 +57,7 @@ def match(table: Table) -> tuple[CheckResult, CheckResult]:
         return CheckResult("assignment", Severity.WARN, text), CheckResult("delay", Severity.OK, text)
     follows = found.lags_s >= -1e-9
     own = np.abs(np.diagonal(found.correlation, axis1=1, axis2=2)).mean(axis=1)
-    # Where joints are swapped, the given pairs say nothing of the lag: each takes the best partner it has.
+    # If joints are swapped, the given pairs do not show the lag, so each joint takes its best partner.
     best = np.abs(found.correlation).max(axis=2).mean(axis=1)
     at = int(np.argmax(np.where(follows, np.maximum(own, best), -1)))
     return _assignment(found, at), _delay(found, own if own.max() > GOOD else best)
@@ -65,7 +65,7 @@ def match(table: Table) -> tuple[CheckResult, CheckResult]:
 
 def _correlate(table: Table) -> _Match | None:
     steps = np.diff(table.time_s)
-    # A long recording is looked at more coarsely, down to 50 Hz: the answer is the same, the wait is not.
+    # A long recording is resampled, down to 50 Hz, which is faster with the same answer.
     coarse_s = min(float(table.time_s[-1]) / MAX_SAMPLES, 0.02)
     period = max(float(np.median(steps[steps > 0])), 2e-3, coarse_s)
     grid = np.arange(0.0, table.time_s[-1], period)
@@ -116,7 +116,7 @@ def _assignment(found: _Match, at: int) -> CheckResult:
     C = found.correlation[at]
     M = len(found.names)
     same = np.arange(M)
-    # Among joints that are commanded alike the nearest level decides, and then the given order.
+    # Among joints with the same commands the nearest level decides, then the given order.
     tie = 0.05 * found.near + 0.02 * np.eye(M)
     hypotheses = [
         ("order", best_assignment(C + tie), False),
@@ -140,7 +140,7 @@ def _assignment(found: _Match, at: int) -> CheckResult:
         gain = float(np.mean(score - before))
         if gain < CLEAR or float(np.min(score)) < GOOD:
             continue
-        # Signs alone explain it as well: that is the simpler story, so an order must explain clearly more.
+        # Wrong signs alone also explain it. They are simpler, so another order must explain clearly more.
         if best is not None and (kind == "both" or gain < best[0] + CLEAR / 2):
             best = best[0], f"{best[1]}; or joints are swapped: {_pairs(found, C, order, moved)}"
             continue
@@ -152,7 +152,7 @@ def _assignment(found: _Match, at: int) -> CheckResult:
             )
     if best is not None:
         return CheckResult(
-            "assignment", Severity.FAIL, f"commands and measurements do not belong together: {best[1]}"
+            "assignment", Severity.FAIL, f"commands and measurements do not fit together: {best[1]}"
         )
     against = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < -GOOD]
     if against:
@@ -162,7 +162,9 @@ def _assignment(found: _Match, at: int) -> CheckResult:
     if weak:
         text = f"command and measurement of a joint hardly move together: {', '.join(weak)}"
         return CheckResult(
-            "assignment", Severity.WARN, f"{text}; is it free, blocked, or another joint's channel?"
+            "assignment",
+            Severity.WARN,
+            f"{text}; check whether it is free, blocked, or another joint's channel",
         )
     return CheckResult(
         "assignment", Severity.OK, f"each of {M} joints follows its own command (at least {_least(C):.2f})"
@@ -176,7 +178,7 @@ def _least(C: FloatArray) -> float:
 def _wrong_signs(found: _Match, C: FloatArray) -> IntArray:
     """Return the joints that move against their command.
 
-    Either at every lag allowed and in their level, too; or in all that is slower than any lag.
+    Either at every allowed lag and in their level; or in all motion slower than any lag.
     """
     follows = found.lags_s >= -1e-9
     own = np.diagonal(found.correlation, axis1=1, axis2=2)[follows]
@@ -202,20 +204,21 @@ def _delay(found: _Match, own: FloatArray) -> CheckResult:
     after = float(np.max(own[found.lags_s >= -1e-9]))
     if lag_s < -1.5 * period and own[at] > after + 0.01:
         text = (
-            f"measurements come {-lag_s * 1e3:.0f} ms before the commands that they follow; do both "
-            "have one clock, "
-            "and is the target column the one that was sent?"
+            f"measurements come {-lag_s * 1e3:.0f} ms before the commands that they follow; check that "
+            "both have one clock, and that the target column contains the sent commands"
         )
         return CheckResult("delay", Severity.FAIL, text)
     if lag_s > MAX_LAG_S - period:
         return CheckResult(
-            "delay", Severity.WARN, f"measurements follow commands by {lag_s:.2f} s or more; is that right?"
+            "delay",
+            Severity.WARN,
+            f"measurements follow commands by {lag_s:.2f} s or more; check the clocks and the target column",
         )
     return CheckResult("delay", Severity.OK, text)
 
 
 def best_assignment(score: FloatArray) -> IntArray:
-    """Return for each row the column that makes the total score greatest, each column once, (M,).
+    """Return for each row the column that maximises the total score, each column once, (M,).
 
     Args:
         score: (M, M).
@@ -223,7 +226,7 @@ def best_assignment(score: FloatArray) -> IntArray:
     Raises:
         MissingExtraError: scipy is not installed.
     """
-    # Not at the top: the base install has no scipy, and checks what it recorded itself.
+    # Imported here: the base install has no scipy, and checks only its own recordings.
     try:
         from scipy.optimize import linear_sum_assignment
     except ImportError as err:

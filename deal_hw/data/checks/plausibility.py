@@ -1,9 +1,9 @@
 """Checks of a recording of unknown origin, before any long work: clock, units, joints, commands.
 
-``recording/telemetry_checks`` looks at what our own recorder wrote; these look for what goes wrong on the way
-from somebody else's log: a clock in the wrong unit or going backwards, degrees for radians, joints in another
-order or with another sign, a target that is a copy of the measurement, and the like. A check returns one
-:class:`~deal_hw.data.recording.telemetry_checks.CheckResult`; "fail" is a refusal.
+``recording/telemetry_checks`` checks files of our own recorder. These checks find the usual errors of other
+logs: a clock in the wrong unit or running backwards, degrees for radians, joints in another order or with
+another sign, a target that is a copy of the measurement. A check returns one
+:class:`~deal_hw.data.recording.telemetry_checks.CheckResult`; with "fail" the recording is refused.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ MAX_LOST = 0.2
 MAX_NAN = 0.01
 MAX_DUPLICATES = 0.05
 MOVES = {"rad": 0.02, "m": 0.002}
-"""A joint whose positions span less does not move [rad or m]."""
+"""A joint with a smaller range of positions does not move [rad or m]."""
 FAR = {"rad": 1.0, "m": 0.2}
-"""No servo hangs this far off its command all along [rad or m]."""
+"""No servo stays this far from its command all the time [rad or m]."""
 FROZEN_S = 0.5
 DEGREES = 180 / np.pi
 SCALE_TOLERANCE = 0.25
-"""A ratio of spans this near to a known factor is taken for it."""
+"""Tolerance within which a ratio of spans counts as a known factor."""
 FURTHEST = 2 * np.pi
-"""A servo's joint without limits seldom turns farther [rad]."""
+"""A servo joint without limits seldom turns farther [rad]."""
 FOLLOWS = 0.8
-"""Correlation from which on a joint follows its command [-]."""
+"""A joint with this correlation or more follows its command [-]."""
 OUTSIDE = 0.05
 """Share of the limits' span by which positions may lie outside (compliance, a soft stop)."""
 FLAT = 0.1
-"""A continuous signal that sits at exactly its extreme for this share of the time is clipped there."""
+"""A continuous signal exactly at its extreme for this share of the time is clipped."""
 
 
 def examine(
@@ -55,14 +55,14 @@ def examine(
 ) -> tuple[CheckResult, ...]:
     """Run all checks on a recording; the order is fixed.
 
-    Where clock or values are unusable the later checks are left out: they would only say the same again.
-    Spikes are told, and the checks after that one look at the recording without them.
+    If clock or values are unusable, the later checks are skipped: they would only repeat it. Spikes are
+    reported, and the later checks use the recording without them.
 
     Args:
         table: The recording, on its own stamps.
         limits: Lowest and highest position of each joint in the model, (J, 2) [rad or m]; infinite if free.
-        kept: The same without what is left out, where slips do no harm.
-        spikes: What counts as a spike.
+        kept: The recording without the left-out parts, in which slips do no harm.
+        spikes: Definition of a spike.
     """
     first = [_size(table), _finite(table), _clock(table)]
     if any(verdict.severity is Severity.FAIL for verdict in first):
@@ -102,7 +102,7 @@ def require(verdicts: Sequence[CheckResult], name: str) -> None:
     """Refuse a recording with a failed check.
 
     Raises:
-        DatasetError: One failed; the message holds each failed check's sentence.
+        DatasetError: A check failed; the message contains the sentence of each failed check.
     """
     failed = [
         f"{verdict.name}: {verdict.message}" for verdict in verdicts if verdict.severity is Severity.FAIL
@@ -136,16 +136,14 @@ def _finite(table: Table) -> CheckResult:
     bad = {name: found for name, found in counts.items() if found[0]}
     stamps = int(np.sum(~np.isfinite(table.time_s)) + np.sum(~np.isfinite(table.command_s)))
     if stamps:
-        return _verdict("finite", Severity.FAIL, f"{stamps} stamps are not numbers; mend the time channel")
+        return _verdict("finite", Severity.FAIL, f"{stamps} stamps are not numbers; repair the time channel")
     if not bad:
         return _verdict("finite", Severity.OK, "all values are finite")
     text = "values that are not finite: " + ", ".join(f"{name} {count}" for name, (count, _) in bad.items())
     worst = max((count for count, kind in bad.values() if kind == "position"), default=0)
     targets = any(kind == "target" for _, kind in bad.values())
     if targets or worst > MAX_NAN * table.time_s.size:
-        return _verdict(
-            "finite", Severity.FAIL, f"{text}; a channel is broken, or one name stands for two rates"
-        )
+        return _verdict("finite", Severity.FAIL, f"{text}; a channel is broken, or one name has two rates")
     return _verdict("finite", Severity.WARN, f"{text}; samples without a position are left out")
 
 
@@ -156,16 +154,16 @@ def _clock(table: Table) -> CheckResult:
         if back.size:
             text = (
                 f"the clock of the {what} goes backwards {back.size} times, first after row {back[0]} "
-                f"({stamps[back[0]]:.6g} s, then {stamps[back[0] + 1]:.6g} s); was the clock set, or "
-                "are rows mixed up?"
+                f"({stamps[back[0]]:.6g} s, then {stamps[back[0] + 1]:.6g} s); sort the rows if they are "
+                "mixed up, or cut the file where the clock was set"
             )
             return _verdict("clock", Severity.FAIL, text)
     same = int(np.sum(np.diff(table.time_s) == 0))
     if not same:
         return _verdict("clock", Severity.OK, "the clock goes forward")
-    text = f"{same} samples have the stamp of the one before; the first of each is used"
+    text = f"{same} samples repeat the stamp of the one before; the first of each is used"
     if same > MAX_DUPLICATES * table.time_s.size:
-        return _verdict("clock", Severity.FAIL, f"{text}: the stamps are too coarse, record finer ones")
+        return _verdict("clock", Severity.FAIL, f"{text}: the stamps are too coarse; record with finer ones")
     return _verdict("clock", Severity.WARN, text)
 
 
@@ -179,18 +177,20 @@ def _rate(clock: FloatArray) -> CheckResult:
     if not steps.size:
         return _verdict("rate", Severity.FAIL, "the clock stands still")
     rate_hz, duration_s = 1 / float(np.median(steps)), float(clock[-1] - clock[0])
-    text = f"{rate_hz:.4g} samples a second over {duration_s:.4g} s"
+    text = f"{rate_hz:.4g} samples per second over {duration_s:.4g} s"
     if rate_hz > 20_000 or duration_s > 1e6:
-        return _verdict("rate", Severity.FAIL, f"{text}; is the unit of time right?")
+        return _verdict("rate", Severity.FAIL, f"{text}; check the unit of time")
     if duration_s < MIN_DURATION_S:
         return _verdict(
-            "rate", Severity.FAIL, f"{text}; record at least {MIN_DURATION_S:g} s (unit of time right?)"
+            "rate", Severity.FAIL, f"{text}; record at least {MIN_DURATION_S:g} s, and check the unit of time"
         )
     if rate_hz < MIN_RATE_HZ:
-        text = f"{text}; below {MIN_RATE_HZ:g} Hz friction and damping cannot be told apart"
+        text = f"{text}; below {MIN_RATE_HZ:g} Hz friction cannot be separated from damping; record faster"
         return _verdict("rate", Severity.FAIL, f"{text}, record faster")
     if rate_hz < GOOD_RATE_HZ * 0.95:
-        return _verdict("rate", Severity.WARN, f"{text}; {GOOD_RATE_HZ:g} Hz or more would tell more")
+        return _verdict(
+            "rate", Severity.WARN, f"{text}; {GOOD_RATE_HZ:g} Hz or more would give better estimates"
+        )
     return _verdict("rate", Severity.OK, text)
 
 
@@ -223,13 +223,10 @@ def _frozen(table: Table) -> CheckResult:
     constant = np.nanmax(table.position, axis=0) == np.nanmin(table.position, axis=0)
     names = np.array(table.joint_names)
     if not moves.any():
-        return _verdict("frozen", Severity.FAIL, "no joint moves; is this the right channel and unit?")
+        return _verdict("frozen", Severity.FAIL, "no joint moves; check the channels and their unit")
     dead = names[constant & commanded]
     if dead.size:
-        text = (
-            f"positions without any change although commands move: {', '.join(dead)}; is the "
-            "sensor connected?"
-        )
+        text = f"positions without any change although commands move: {', '.join(dead)}; check the sensor"
         return _verdict("frozen", Severity.FAIL, text)
     stuck = [
         f"{name} for {still:.2g} s"
@@ -238,11 +235,15 @@ def _frozen(table: Table) -> CheckResult:
     ]
     if stuck:
         text = (
-            f"positions stand exactly still while their commands move: {', '.join(stuck)}; stale or blocked"
+            f"positions do not change at all while their commands move: {', '.join(stuck)}; the joint is "
+            "blocked, or the values are old"
         )
         return _verdict("frozen", Severity.WARN, text)
     if not moves.all():
-        text = f"joints that do not move: {', '.join(names[~moves])}; nothing can be learnt about them"
+        text = (
+            f"joints that do not move: {', '.join(names[~moves])}; their parameters cannot be "
+            "estimated: move them, or leave them nominal"
+        )
         return _verdict("frozen", Severity.WARN, text)
     return _verdict("frozen", Severity.OK, "every joint moves")
 
@@ -262,32 +263,29 @@ def _longest_still(table: Table, joint: int) -> float:
 
 
 def held_target(table: Table) -> FloatArray:
-    """Return the command in force at each sample, (T, A); the first one before it was sent."""
+    """Return the active command at each sample, (T, A); before the first command, that one."""
     rows = np.searchsorted(table.command_s, table.time_s + 1e-9, side="right") - 1
     return np.asarray(table.target[np.maximum(rows, 0)])
 
 
 def _commands(table: Table) -> CheckResult:
     if not table.command_s.size:
-        text = (
-            "no commanded positions; name them as `target` in the column map: without them "
-            "nothing can be predicted"
-        )
+        text = "no commanded positions, so nothing can be predicted; name them as `target` in the column map"
         return _verdict("commands", Severity.FAIL, text)
     begin, end = float(table.command_s[0]), float(table.command_s[-1])
     inside = min(end, table.time_s[-1]) - max(begin, table.time_s[0])
     text = f"{table.command_s.size} commands from {begin:.4g} s to {end:.4g} s"
     if inside < 0.5 * min(end - begin, table.time_s[-1]):
         text = (
-            f"{text}, samples from 0 s to {table.time_s[-1]:.4g} s; are both on one clock and in "
-            "the right unit?"
+            f"{text}, samples from 0 s to {table.time_s[-1]:.4g} s; check that both have one clock and the "
+            "right unit"
         )
         return _verdict("commands", Severity.FAIL, text)
     still = [
         name for name, span in zip(table.actuated, np.ptp(table.target, axis=0), strict=True) if span == 0
     ]
     if len(still) == len(table.actuated):
-        return _verdict("commands", Severity.FAIL, f"{text}; no command ever changes")
+        return _verdict("commands", Severity.FAIL, f"{text}; no command ever changes: record a motion")
     return _verdict("commands", Severity.OK, text)
 
 
@@ -303,16 +301,16 @@ def _copy(table: Table) -> CheckResult:
                 copied.append(f"{name}, {lag} samples later" if lag else name)
                 break
     if not copied:
-        return _verdict("copy", Severity.OK, "measured and commanded positions are two things")
+        return _verdict("copy", Severity.OK, "measured and commanded positions differ")
     text = (
-        f"measured positions that copy the command: {', '.join(copied)}; one of the two channels "
-        "is the wrong one"
+        f"measured positions that are a copy of the command: {', '.join(copied)}; one of the two channels "
+        "is wrong: correct the column map"
     )
     return _verdict("copy", Severity.FAIL, text)
 
 
 def _slip(table: Table) -> CheckResult:
-    # A stamp that stands twice is reported by the clock's check; here the first of each counts.
+    # The clock's check reports repeated stamps; here the first of each counts.
     new = np.concatenate([[True], np.diff(table.time_s) > 0])
     return slip_verdict(
         table.time_s[new], table.position[new], table.command_s, table.target, np.array(table.actuated_index)
@@ -347,7 +345,7 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
             )
     found += _beyond_limits(table, limits)
     if found:
-        text = f"{'; '.join(found)}. Say the unit in the column map (unit, target_unit, normalised)"
+        text = f"{'; '.join(found)}. Give the unit in the column map (unit, target_unit, normalised)"
         return _verdict("units", Severity.FAIL, text)
     suspects = [
         f"{name} ({bottom}..{top})"
@@ -357,11 +355,11 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
     ]
     if suspects:
         text = (
-            f"positions that fill a range without unit: {', '.join(suspects)}; if so, say "
-            "`normalised` in the column map"
+            f"positions that seem normalised (they fill a range without a unit): {', '.join(suspects)}; if "
+            "they are, give `normalised` in the column map"
         )
         return _verdict("units", Severity.WARN, text)
-    return _verdict("units", Severity.OK, "ranges of commands and measurements fit each other")
+    return _verdict("units", Severity.OK, "ranges of commands and measurements agree")
 
 
 def _levels(table: Table) -> CheckResult:
@@ -372,9 +370,11 @@ def _levels(table: Table) -> CheckResult:
         if abs(off) > max(FAR[table.units[index]], 3 * span):
             found.append(f"{table.joint_names[index]} {off:+.3g} {table.units[index]}")
     if not found:
-        return _verdict("levels", Severity.OK, "measurements are where their commands are")
-    text = f"measurements lie far from their commands all along: {', '.join(found)}"
-    return _verdict("levels", Severity.FAIL, f"{text}; another joint's channel, or another zero (offset)?")
+        return _verdict("levels", Severity.OK, "measurements are near their commands")
+    text = f"measurements are far from their commands all the time: {', '.join(found)}"
+    return _verdict(
+        "levels", Severity.FAIL, f"{text}; check for another joint's channel, or another zero (offset)"
+    )
 
 
 def _beyond_limits(table: Table, limits: FloatArray | None) -> list[str]:
@@ -385,7 +385,7 @@ def _beyond_limits(table: Table, limits: FloatArray | None) -> list[str]:
         reach = float(np.nanmax(np.abs(values)))
         bounded = np.isfinite(low) and np.isfinite(high)
         if not bounded and index not in table.actuated_index:
-            # A pole may turn over and over.
+            # A pole may make many turns.
             continue
         furthest = max(abs(low), abs(high)) if bounded else 4 * np.pi
         if table.units[index] == "rad" and reach > 3 * furthest and reach < 1000:
@@ -413,7 +413,7 @@ def _normal_range(values: FloatArray) -> str:
 
 def _inside_limits(table: Table, limits: FloatArray | None) -> CheckResult:
     if limits is None:
-        return _verdict("limits", Severity.OK, "no joint limits given to compare with")
+        return _verdict("limits", Severity.OK, "not checked, since no joint limits are given")
     found, severe = [], False
     for index, name in enumerate(table.joint_names):
         low, high = limits[index]
@@ -431,25 +431,28 @@ def _inside_limits(table: Table, limits: FloatArray | None) -> CheckResult:
         for column, (name, index) in enumerate(zip(table.actuated, table.actuated_index, strict=True))
         if table.units[index] == "rad"
         and not np.isfinite(limits[index]).all()
-        # A wheel does not follow its effort.
+        # The position of a wheel does not follow its effort.
         and _correlation(held[:, column], table.position[:, index]) > FOLLOWS
         and (reach := float(np.nanmax(np.abs(table.position[:, index])))) > FURTHEST
     ]
     if not found and far:
-        text = f"joints without limits that turn more than once: {', '.join(far)}; in degrees?"
+        text = (
+            f"joints without limits that turn more than once: {', '.join(far)}; check whether they are "
+            "in degrees"
+        )
         return _verdict("limits", Severity.WARN, text)
     if not found:
         return _verdict("limits", Severity.OK, "positions lie inside the model's limits")
     text = (
         f"positions outside the model's limits: {', '.join(found)}; check zero (offset), sign, unit and "
-        "joint order; if these are right the model's range is too narrow: widen it, or its stop pushes in "
-        "every prediction"
+        "joint order. If these are right, the model's range is too narrow and its end stop pushes in "
+        "every prediction: widen it"
     )
     return _verdict("limits", Severity.FAIL if severe else Severity.WARN, text)
 
 
 def _at_extreme(values: FloatArray) -> float:
-    """Return the share of samples at exactly an extreme of a continuous signal; 0 of a stepped one."""
+    """Return the share of samples exactly at an extreme of a continuous signal; 0 for a stepped one."""
     if np.unique(values).size < 50:
         return 0.0
     return float(max(np.mean(values == np.max(values)), np.mean(values == np.min(values))))
@@ -469,8 +472,8 @@ def _clipped_commands(table: Table, limits: FloatArray | None) -> CheckResult:
     if not found:
         return _verdict("clamped", Severity.OK, "commands are not clamped")
     text = (
-        f"commands sit at their extreme: {', '.join(found)} of the time; was the recorded target "
-        "the clamped one?"
+        f"commands stay at their extreme: {', '.join(found)} of the time; check that the recorded target "
+        "is the clamped one"
     )
     return _verdict("clamped", Severity.WARN, text)
 
@@ -487,7 +490,7 @@ def _saturated_effort(table: Table) -> CheckResult:
     ]
     if not found:
         return _verdict("saturated", Severity.OK, "effort does not saturate")
-    text = f"effort sits at its highest value: {', '.join(found)} of the time; the effort limit was in force"
+    text = f"effort stays at its highest value: {', '.join(found)} of the time; the effort limit was active"
     return _verdict("saturated", Severity.WARN, text)
 
 
@@ -500,14 +503,15 @@ def _excitation(table: Table) -> CheckResult:
     ]
     if len(weak) == len(spans):
         text = (
-            f"every joint moves too little to tell its parameters ({', '.join(weak)}); record larger motions"
+            f"every joint moves too little to estimate its parameters ({', '.join(weak)}); record larger "
+            "motions"
         )
         return _verdict("excitation", Severity.FAIL, text)
     if weak:
         return _verdict(
             "excitation", Severity.WARN, f"little motion: {', '.join(weak)}; record larger motions of these"
         )
-    return _verdict("excitation", Severity.OK, "every joint moves enough to look at")
+    return _verdict("excitation", Severity.OK, "every joint moves enough")
 
 
 def _quaternion(table: Table) -> CheckResult:
@@ -515,16 +519,21 @@ def _quaternion(table: Table) -> CheckResult:
     off = float(np.max(np.abs(np.linalg.norm(values, axis=1) - 1)))
     if not off < 0.02:
         return _verdict(
-            "orientation", Severity.FAIL, f"quaternions of norm 1 +- {off:.2g}; are these the right columns?"
+            "orientation",
+            Severity.FAIL,
+            f"quaternions of norm 1 +- {off:.2g}, but it must be 1; check the columns",
         )
     if np.mean(np.abs(values[:, 0])) < 0.3 and np.mean(np.abs(values[:, 3])) > 0.9:
-        text = "the base seems turned over about its own z axis by half a turn all along; is the order xyzw?"
+        text = (
+            "the base seems to be turned by half a turn about its own z axis all the time; the order may "
+            "be xyzw: set `order` in the column map"
+        )
         return _verdict("orientation", Severity.WARN, text)
     return _verdict("orientation", Severity.OK, "unit quaternions")
 
 
 def _span(values: FloatArray) -> float:
-    """Return the range of a channel without its outermost percents."""
+    """Return the range of a channel without its outermost percentiles."""
     low, high = np.nanpercentile(values, [1, 99])
     return float(high - low)
 

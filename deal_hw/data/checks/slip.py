@@ -1,13 +1,13 @@
-"""Time slips: does a part of a recording lag behind its commands by more, or less, than the rest?
+"""Time slips: parts of a recording that follow their commands with another delay than the rest.
 
-A clock that jumps, a writer that loses rows of one file, or a column that is shifted from some row on leave a
-recording whose commands and measurements belong together at a delay that changes once and for good, or for a
-while. No model explains both parts, so every parameter pays for it.
+Causes are a clock that jumps, a writer that loses rows of one file, or a column that is shifted after some
+row. The delay between commands and measurements then changes for good, or for a while. No model explains both
+parts, so every parameter becomes wrong.
 
-How a joint follows depends on what it is asked: a slow motion hardly lags, a fast one does. So lags of parts
-are not compared. One linear predictor a joint (all positions and speeds now, and its own commands around now)
-is fitted to the whole recording, and fitted again with the commands of a part shifted in time. A slip is a
-shift that makes the error of that one predictor clearly smaller, and that most joints agree on.
+A joint's lag depends on its motion: a slow motion hardly lags, a fast one does. Lags of parts are therefore
+not compared. One linear predictor per joint (all positions and speeds now, and its own commands around now)
+is fitted to the whole recording. It is fitted again with the commands of a part shifted in time. A slip is a
+shift that clearly reduces this predictor's error, and on which most joints agree.
 """
 
 from __future__ import annotations
@@ -22,44 +22,45 @@ from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.types import FloatArray, IntArray
 
 AHEAD_S: Final = 0.1
-"""The predictor looks so far ahead; commands count from as long before on."""
+"""The predictor looks this far ahead [s]; it uses commands from the same time before."""
 TAP_S: Final = 0.02
 SPEED_S: Final = 0.04
 FURTHEST_S: Final = 0.15
-"""Slips are looked for up to this."""
+"""Largest slip that is searched [s]."""
 STEP_S: Final = 0.01
-"""Shifts are tried in steps of this, or of the sampling period where that is longer."""
+"""Step of the tried shifts [s]; at least the sampling period."""
 LEAST_S: Final = 0.015
-"""Slips below this are not reported: they hardly differ from what friction does."""
+"""Smaller slips are not reported, since friction has a similar effect [s]."""
 PARTS: Final = 16
 SHORTEST_S: Final = 1.0
 FEWEST_PARTS: Final = 8
-"""A recording is cut into parts of a second or more, 16 at the most; with fewer than 8 nothing is said."""
+"""A recording is cut into parts of at least a second, at most 16; with fewer than 8 there is no finding."""
 FINEST_S: Final = 0.005
 MOST_SAMPLES: Final = 30_000
 CLEAR: Final = 0.5
-"""The error's logarithm falls by this share of what the shifted part has of the recording. Clean recordings
-reach 0.4 for shifts of 10 ms (a noise-free cart-pole) and 0.06 to 0.22 for longer ones (real arms, the latter
-where one presses on a table); slips of 20 to 60 ms under brisk motion 0.5 to 7; slow motion shows none."""
+"""Least decrease of the error's logarithm, divided by the shifted part's share of the recording. Clean
+recordings reach 0.4 for shifts of 10 ms (a noise-free cart-pole) and 0.06 to 0.22 for longer ones (real arms,
+the latter where one presses on a table); slips of 20 to 60 ms under brisk motion 0.5 to 7; slow motion shows
+none."""
 GLARING: Final = 1.5
-"""From here on most of what a fit leaves unexplained is the slip: such a recording is refused."""
+"""From this value on, most of a fit's residual comes from the slip, so the recording is refused."""
 AGREE: Final = 0.75
-"""Share of the joints that must want about the same shift."""
+"""Share of the joints that must agree on about the same shift."""
 GAP_PERIODS: Final = 3.0
 TINY: Final = 1e-4
-"""A joint whose position changes less within the predictor's time says nothing [rad or m]."""
+"""A joint whose position changes less within the predictor's time is ignored [rad or m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """A part of a recording that follows its commands at another delay than the rest.
+    """A part of a recording that follows its commands with another delay than the rest.
 
     Attributes:
-        begin_s: Where it begins [s].
-        end_s: Where it ends [s].
-        later_s: By how much later it follows; negative: sooner [s].
-        clear: How much better the recording is explained with it, see :data:`CLEAR`.
-        agree: Share of the joints that want about this shift.
+        begin_s: Start of the part [s].
+        end_s: Its end [s].
+        later_s: Additional delay; negative: less delay [s].
+        clear: How much better the shift explains the recording, see :data:`CLEAR`.
+        agree: Share of the joints that agree on about this shift.
     """
 
     begin_s: float
@@ -76,7 +77,7 @@ def slip_verdict(
     found = find_slip(time_s, position, command_s, target, actuated)
     if found is None:
         return CheckResult(
-            "slip", Severity.OK, "too short, or too little motion, to look for slips of the clocks"
+            "slip", Severity.OK, "not checked: too short, or too little motion, to find slips of the clocks"
         )
     if found.clear < CLEAR or found.agree < AGREE or abs(found.later_s) < LEAST_S:
         return CheckResult("slip", Severity.OK, "one delay holds for the whole recording")
@@ -94,12 +95,12 @@ def slip_verdict(
 def find_slip(
     time_s: FloatArray, position: FloatArray, command_s: FloatArray, target: FloatArray, actuated: IntArray
 ) -> Slip | None:
-    """Return the most likely slip of a recording, clear or not; None where there is too little to tell.
+    """Return the most likely slip of a recording, clear or not; None if the data are too few.
 
     Args:
-        time_s: Stamps of the samples, strictly rising, (T,) [s].
+        time_s: Stamps of the samples, strictly increasing, (T,) [s].
         position: Measured positions, (T, J).
-        command_s: Stamps of the commands, rising, (C,) [s].
+        command_s: Stamps of the commands, increasing, (C,) [s].
         target: Commanded positions, (C, A).
         actuated: Index of each commanded joint among the joints, (A,).
     """
@@ -138,7 +139,7 @@ def find_slip(
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """A recording at even times, and what the predictors of all joints share.
+    """A recording at uniform times, and the data that the predictors of all joints share.
 
     Attributes:
         start_s: Time of the first grid point [s].
@@ -149,9 +150,9 @@ class _Grid:
         ahead: Grid points that the predictor looks ahead.
         tap: Grid points of one tap.
         taps: First grid point of each tap, relative to now.
-        step: Grid points from one shift that is tried to the next.
-        shifts: Shifts that are tried, in grid points.
-        common: What all predictors see: positions and speeds now, and one constant, (R, 2 J + 1).
+        step: Grid points between two tried shifts.
+        shifts: Tried shifts, in grid points.
+        common: Inputs of all predictors: positions and speeds now, and one constant, (R, 2 J + 1).
     """
 
     start_s: float
@@ -201,7 +202,7 @@ class _Grid:
 def _recorded(
     time_s: FloatArray, grid: FloatArray, rows: IntArray, before: int, after: int
 ) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return at which rows all that the predictor uses was measured: no gap lies there, (R,)."""
+    """Return the rows at which all inputs of the predictor were measured, without a gap, (R,)."""
     steps = np.diff(time_s)
     gap = np.flatnonzero(steps > GAP_PERIODS * np.median(steps))
     lost = np.zeros(len(grid) + 1, dtype=np.int64)
@@ -215,7 +216,7 @@ def _recorded(
 def _gains(
     grid: _Grid, joint: int, column: int, edges: IntArray, stretches: list[tuple[int, int]]
 ) -> FloatArray | None:
-    """Return by how much the logarithm of a joint's error falls for each stretch and shift, (P, L)."""
+    """Return the decrease of the logarithm of a joint's error for each part and shift, (P, L)."""
     rows, now = grid.rows, grid.position[grid.rows, joint]
     change = grid.position[rows + grid.ahead, joint] - now
     if not len(rows) or np.std(change) < TINY:
@@ -240,11 +241,11 @@ def _gains(
 
 
 def _left(moments: FloatArray) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the squared error that the best predictor leaves, (L,), from its moments, (L, d, d)."""
+    """Return the squared error of the best predictor, (L,), from its moments, (L, d, d)."""
     d = moments.shape[-1] - 1
     a, b = moments[:, :d, :d], moments[:, :d, d]
     ridge = 1e-6 * np.trace(a, axis1=1, axis2=2) / d
     weights = np.linalg.solve(a + ridge[:, None, None] * np.eye(d), b[..., None])[..., 0]
     left = moments[:, d, d] - np.einsum("li,li->l", b, weights)
-    # A motion that is predicted to rounding has nothing left to improve.
+    # A motion that is predicted up to rounding cannot be improved.
     return np.asarray(np.maximum(left, 1e-9 * moments[:, d, d]))

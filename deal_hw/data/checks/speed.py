@@ -9,11 +9,12 @@ from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.types import FloatArray
 
 OVER_S = 0.1
-"""Velocities are integrated over this time: an encoder's steps and a filter's lag hardly count then."""
+"""Velocities are integrated over this time, so that an encoder's steps and a filter's lag hardly matter
+[s]."""
 ALIKE = 0.9
-"""Correlation of both from which on their sizes are compared [-]."""
+"""Their sizes are compared from this correlation on [-]."""
 FACTOR = 1.5
-"""A ratio within this factor of 1 is a filter, or a gear's compliance [-]."""
+"""A ratio within this factor of 1 is the effect of a filter, or of a gear's compliance [-]."""
 UNITS = {57.3: "degrees and radians", 1000.0: "millimetres and metres"}
 
 
@@ -45,15 +46,15 @@ def speed_verdict(table: Table) -> CheckResult:
     ]:
         what = f"{units[0]} in one recording?"
     elif len(ratios) == len(table.joint_names) and np.ptp(np.log(values)) < np.log(FACTOR):
-        what = "all alike: is the clock right (unit of time, rate), and the unit of positions?"
+        what = "all alike: check the clock (unit of time, rate) and the unit of positions"
     else:
-        what = "is the unit of its positions right?"
+        what = "check the unit of its positions"
     text = f"recorded velocities are not the slopes of positions: {found}; {what}"
     return CheckResult("velocity", Severity.WARN, text)
 
 
 def _ratio(time_s: FloatArray, position: FloatArray, velocity: FloatArray) -> float | None:
-    """Return how many times as large a velocity is as the positions' slope; None where they are not alike."""
+    """Return the ratio of a velocity to the positions' slope; None if they are not correlated."""
     sound = np.isfinite(position) & np.isfinite(velocity)
     time, x, v = time_s[sound], position[sound], velocity[sound]
     new = np.concatenate([[True], np.diff(time) > 0])[: time.size]

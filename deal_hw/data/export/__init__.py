@@ -1,1 +1,1 @@
-"""Recordings in the formats of others."""
+"""Export of recordings to other formats."""

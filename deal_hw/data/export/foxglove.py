@@ -1,4 +1,4 @@
-"""Writes an episode once more with the robot in 3D: transforms of its links and their shapes, for Foxglove.
+"""Writes a copy of an episode with the robot in 3D for Foxglove: transforms of its links and their shapes.
 
 Shapes are ``foxglove.SceneUpdate``, one message a shape, written once and fixed to the frame of its link.
 """
@@ -77,7 +77,7 @@ class Drawn(Protocol):
 
     @property
     def kind(self) -> str:
-        """What it is: box, sphere, ellipsoid, capsule, cylinder or mesh."""
+        """Kind of shape: box, sphere, ellipsoid, capsule, cylinder or mesh."""
 
     @property
     def size(self) -> FloatArray:
@@ -115,8 +115,8 @@ def export_foxglove(
 ) -> int:
     """Write an episode with the robot in 3D; return the number of moments.
 
-    The file stays an episode of deal-hw. Its log times are on the wall clock, also where those of the
-    original are on the monotonic one.
+    The file stays an episode of deal-hw. Its log times are on the wall clock, even if those of the original
+    are on the monotonic one.
 
     Args:
         episode: A sound episode.
@@ -125,10 +125,10 @@ def export_foxglove(
         stamps_ns: Host clock of the T moments [ns].
         poses: Positions (T, B, 3) [m] and quaternions w x y z (T, B, 4) in the world; NaN where unknown.
         shapes: What to draw.
-        rate_hz: Most moments a second.
+        rate_hz: Most moments per second.
 
     Raises:
-        DatasetError: The target is there already or cannot be written.
+        DatasetError: The target exists already or cannot be written.
     """
     data = read_episode_bytes(episode)
     try:
@@ -182,10 +182,10 @@ def _copy(data: bytes, writer: Writer) -> int:
 
 
 def _moments(stamps_ns: IntArray, rate_hz: float) -> list[int]:
-    """Return the moments to write, so many a second at most."""
+    """Return the moments to write, at most ``rate_hz`` per second."""
     chosen: list[int] = []
     for index, stamp_ns in enumerate(stamps_ns):
-        # A moment that is early by some jitter still counts.
+        # A moment that is slightly early by jitter still counts.
         if not chosen or (stamp_ns - stamps_ns[chosen[-1]]) * 1e-9 >= 0.9 / rate_hz:
             chosen.append(index)
     return chosen

@@ -47,26 +47,28 @@ def export_lerobot(
     task: str = "deal-hw",
     most_filled: float = 0.5,
 ) -> tuple[int, int]:
-    """Write a LeRobot dataset, one episode a recording; return how many frames it has, and how many filled.
+    """Write a LeRobot dataset, one episode per recording; return its numbers of frames and of filled ones.
 
-    ``observation.state`` holds measured positions, ``action`` the position target in force at the frame,
-    each named ``<joint>.pos`` in rad or m; ``observation.velocity`` and ``observation.effort`` follow where
-    they were measured. Each of these features says its ``units`` in ``info.json``. ``command_age`` says how
-    long before the frame the action came into force [s], so that the exact timing survives.
+    ``observation.state`` holds measured positions, ``action`` the active position target at the frame, each
+    named ``<joint>.pos`` in rad or m; ``observation.velocity`` and ``observation.effort`` follow where they
+    were measured. Each of these features has its ``units`` in ``info.json``. ``command_age`` is the time from
+    the start of the action to the frame [s], which keeps the exact timing.
 
-    Frames lie on a uniform grid without holes: one whose sample was lost is interpolated from its neighbours,
-    and ``filled`` is true there. Importing leaves those out again. Frames before the first command are none.
+    Frames lie on a uniform grid without holes. A frame with a lost sample is interpolated from its
+    neighbours, with ``filled`` true; importing leaves it out again. There are no frames before the first
+    command.
 
     Args:
         trajectories: Of one robot.
-        folder: What to write; it must not hold a dataset yet.
+        folder: Folder to write, without a dataset in it.
         robot_type: Goes into ``info.json``.
-        task: What the robot did, in words.
-        most_filled: A recording of which a larger share would be filled is refused.
+        task: Description of the robot's task.
+        most_filled: A recording with a larger share of filled frames is refused.
 
     Raises:
         MissingExtraError: pyarrow is not installed.
-        DatasetError: The folder is taken, the recordings do not fit one dataset, or too much of one was lost.
+        DatasetError: The folder has a dataset already, the recordings do not fit one dataset, or too much of
+            one was lost.
     """
     try:
         import pyarrow.parquet  # noqa: F401
@@ -74,9 +76,9 @@ def export_lerobot(
         raise MissingExtraError("pyarrow", "lerobot") from error
     folder = Path(folder)
     if (folder / "meta" / "info.json").exists():
-        raise DatasetError(f"{folder} holds a LeRobot dataset already; name another folder")
+        raise DatasetError(f"{folder} already contains a LeRobot dataset; name another folder")
     if not trajectories:
-        raise InsufficientDataError("no recording to export")
+        raise InsufficientDataError("the dataset has no recording to export; record or import one")
     first = trajectories[0]
     if any((t.joint_names, t.actuated) != (first.joint_names, first.actuated) for t in trajectories):
         raise DatasetError("the recordings have different joints; export those of one robot at a time")
@@ -100,13 +102,13 @@ def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float
     begin = int(np.argmax(trajectory.command_sequence >= 0))
     time_s = trajectory.device_s[begin:] - trajectory.device_s[begin]
     if time_s.size < 2 or trajectory.command_sequence[begin] < 0:
-        raise InsufficientDataError(f"{name} has no two samples with a command in force; leave it out")
+        raise InsufficientDataError(f"{name} has fewer than two samples with an active command; leave it out")
     index = np.round(time_s / period).astype(np.int64)
     length = int(index[-1]) + 1
     if length - index.size > most_filled * length:
         raise DatasetError(
-            f"{name} lacks {length - index.size} of {length} samples; LeRobot's grid is even, and at most "
-            f"{most_filled:.0%} of it may be filled: leave that recording out"
+            f"{name} lacks {length - index.size} of {length} samples; LeRobot's grid is uniform, and at "
+            f"most {most_filled:.0%} of it may be filled: leave this recording out"
         )
     filled = np.ones(length, dtype=bool)
     filled[index] = False
@@ -115,7 +117,7 @@ def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float
     def on_grid(values: FloatArray) -> FloatArray:
         return np.stack([np.interp(grid, index, column) for column in values[begin:].T], axis=1)
 
-    # A command holds until the next one, also where no sample shows it.
+    # A command is active until the next one, even if no sample shows it.
     sent_s = trajectory.sent_s - trajectory.device_s[begin]
     in_force = np.searchsorted(sent_s, grid * period + 1e-9, side="right") - 1
     return _Episode(
@@ -134,7 +136,7 @@ def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float
 def _features(
     first: Trajectory, units: Sequence[str], episodes: Sequence[_Episode]
 ) -> dict[str, dict[str, Any]]:
-    """Return the features that are known in every frame, as ``info.json`` lists them."""
+    """Return the features that every frame has, as ``info.json`` lists them."""
     unit = dict(zip(first.joint_names, units, strict=True))
     features: dict[str, dict[str, Any]] = {}
     for name, word, joints in (
@@ -204,7 +206,7 @@ def _write(
     _write_tasks(folder, task)
     whole = {name: np.concatenate([episode.frames[name] for episode in episodes]) for name in features}
     write_json(folder / "meta" / "stats.json", {name: _statistics(values) for name, values in whole.items()})
-    # Last of all: a folder with info.json is a whole dataset.
+    # Last of all, since a folder with info.json counts as a complete dataset.
     write_json(folder / "meta" / "info.json", _info(features, fps, len(episodes), begin, robot_type))
 
 
@@ -221,7 +223,7 @@ def _info(
         "chunks_size": CHUNK_FILES,
         "data_files_size_in_mb": FILE_MIB,
         "video_files_size_in_mb": 200,
-        # Whole where it is: readers take it as an integer. A rate like 49.85 Hz must not be rounded.
+        # An integer if it is whole, as readers expect. A rate like 49.85 Hz must not be rounded.
         "fps": whole if abs(fps - whole) < 1e-6 * fps else fps,
         "splits": {"train": f"0:{episodes}"},
         "data_path": DATA_PATH,
@@ -294,7 +296,7 @@ def _write_episodes(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _write_tasks(folder: Path, task: str) -> None:
-    """Write the one task; the pandas note makes its text the index, by which LeRobot looks it up."""
+    """Write the task; the pandas metadata make its text the index, in which LeRobot searches."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

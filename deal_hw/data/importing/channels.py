@@ -1,4 +1,4 @@
-"""What a source found in a file: named channels, not yet interpreted."""
+"""Named channels of a file, not yet interpreted."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _PICK = re.compile(r"(?P<array>.+)\[(?P<inside>[^\[\]]+)\]")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Channels:
-    """Channels of one recording, as the file names them.
+    """Channels of one recording, by the file's names.
 
     Attributes:
         path: The file or folder.
         kind: "csv", "npz", "mcap", "lerobot" or "deal-hw".
-        digest: SHA-256 of what was read.
+        digest: SHA-256 of the read bytes.
         arrays: By name, (T,) or (T, K); those of one clock have one length.
-        labels: Names of the K columns of an array, where the file tells them.
-        units: Units of the K columns of an array, where the file tells them.
-        types: Message type of each topic, such as "sensor_msgs/msg/JointState"; of a bag.
-        joint_names: Names of the joints, where the file lists them.
-        part: Which recording of the file it is, such as "episode 3"; "" where there is only one.
-        notes: What the reader of the file left out or changed.
+        labels: Names of the K columns of an array, if the file has them.
+        units: Units of the K columns of an array, if the file has them.
+        types: Message type of each topic of a bag, such as "sensor_msgs/msg/JointState".
+        joint_names: Names of the joints, if the file lists them.
+        part: Which recording of the file it is, such as "episode 3"; "" if there is only one.
+        notes: Changes and omissions by the reader.
     """
 
     path: Path

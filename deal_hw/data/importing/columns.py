@@ -1,4 +1,4 @@
-"""The column map: which channel of a file is time, position, target, ... of which joint.
+"""The column map: which channel of a file is the time, position or target of which joint.
 
 A YAML file such as::
 
@@ -11,8 +11,8 @@ A YAML file such as::
       - {name: elbow_joint, column: elbow, sign: -1, offset: 0.1}
       - {name: jaw, normalised: {from: [0, 100], to: [-0.17, 1.75]}}
 
-A value x of the file becomes ``sign * scale(x) + offset`` in rad or m; offset and sign turn the file's zero
-and direction into the model's, for position and target alike; velocity and effort take the sign.
+A value x of the file becomes ``sign * scale(x) + offset`` in rad or m; offset and sign convert the file's
+zero and direction to the model's, for position and target alike; velocity and effort use the sign only.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, 
 from deal_hw.reading import NAMES, number, read_yaml, reading
 
 TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Seconds in one of each."""
+"""Unit of time -> seconds."""
 POSITION_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0, "mm": 1e-3}
-"""Radians or metres in one of each."""
+"""Unit of position -> radians or metres."""
 QUATERNION_ORDERS = ("wxyz", "xyzw")
 
 
@@ -66,8 +66,8 @@ class Normalised:
         values = (*self.file, *self.robot)
         if not all(map(math.isfinite, values)) or self.file[0] == self.file[1]:
             raise ConfigurationError(
-                f"normalised: from {list(self.file)} to {list(self.robot)} is no scale; "
-                "give two different values of the file and the two positions that they stand for"
+                f"normalised: from {list(self.file)} to {list(self.robot)} is no scale; give two different "
+                "values of the file and their two positions [rad or m]"
             )
 
     @property
@@ -78,20 +78,20 @@ class Normalised:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointColumns:
-    """The channels of one joint and how they become SI.
+    """The channels of one joint and their conversion to SI.
 
     Attributes:
         name: The joint's name in the model.
         column: Its name in the file, which replaces ``{joint}`` in patterns; "" for the same.
-        index: Its column in arrays of one column a joint; None: by label, else by its place in the list.
+        index: Its column in arrays with one column per joint; None: by label, else by its place in the list.
         position, target, velocity, effort: Channels; None: by the map's pattern.
-        unit: Of position and target, one of :data:`POSITION_UNITS`.
-        target_unit: Of the target where it differs; "" for the same.
-        normalised: Replaces ``unit`` where the file's values have none.
-        target_normalised: The same for the target where it differs.
+        unit: Unit of position and target, one of :data:`POSITION_UNITS`.
+        target_unit: Unit of the target if it differs; "" for the same.
+        normalised: Replaces ``unit`` if the file's values have none.
+        target_normalised: The same for the target if it differs.
         sign: 1 or -1.
         offset: Added after sign and scale [rad or m].
-        slides: The joint's unit is m; needed beside ``normalised`` only.
+        slides: The joint's unit is m; only needed with ``normalised``.
     """
 
     name: str
@@ -125,7 +125,7 @@ class JointColumns:
         return "m" if self.slides or self.unit in ("m", "mm") else "rad"
 
     def scale(self, target: bool = False) -> tuple[float, float]:
-        """Return slope and constant that turn a value of the file into rad or m."""
+        """Return slope and constant of the conversion from a file's value to rad or m."""
         both = self.target_normalised if target and self.target_normalised else self.normalised
         if both is not None and not (target and self.target_unit and not self.target_normalised):
             slope = both.slope
@@ -137,7 +137,7 @@ class JointColumns:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vector:
-    """Three or four channels that belong together.
+    """Three or four channels that form a vector.
 
     Attributes:
         columns: The channels; a single one is an array with all of them.
@@ -163,14 +163,14 @@ class ColumnMap:
     Attributes:
         time: Time of the measured samples.
         joints: The joints, in the order of the file's arrays.
-        position: Channel pattern: with ``{joint}`` one channel a joint, without one array for all.
+        position: Channel pattern: with ``{joint}`` one channel per joint, without it one array for all.
         target: The same for commanded positions.
         velocity: The same; None where there is none.
         effort: The same; None where there is none.
-        command_time: Time of the commands where they have stamps of their own.
+        command_time: Time of the commands if they have their own stamps.
         orientation: Quaternion of the base.
         gyro: Angular velocity of the base in its own frame.
-        source: Where the map comes from: a file, or what was guessed.
+        source: Origin of the map: a file, or a guess.
     """
 
     time: TimeColumn
@@ -196,7 +196,7 @@ def read_column_map(path: Path) -> ColumnMap:
     """Read a column map.
 
     Raises:
-        ConfigurationError: It cannot be read or says something that a column map does not.
+        ConfigurationError: It cannot be read or has an entry that a column map cannot have.
     """
     described = "page 'Use your recordings' of the documentation describes it"
     with reading(path, "a column map", described, error=ConfigurationError):

@@ -1,4 +1,4 @@
-"""Reads a CSV file: one header line, one row a sample, numbers or lists of numbers in the cells."""
+"""Reads a CSV file: one header line, one row per sample, numbers or lists of numbers in the cells."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deal_hw.reading import NAMES, NUMBERS, RECORDING_BYTES, check_size, reading
 from deal_hw.types import FloatArray
 
 LINE = 1 << 20
-"""Longest line [characters]; a file without line ends must not be read at once."""
+"""Longest line [characters]; prevents reading a file without line ends at once."""
 _NOTHING = {"", "nan", "null", "none", "na", "n/a", "-"}
 
 
@@ -25,7 +25,7 @@ def read_csv(path: Path) -> Channels:
     """Read a CSV file; the delimiter is a comma, a semicolon or a tab, comment lines start with ``#``.
 
     With a semicolon, a comma is read as the decimal point. An empty cell is NaN. Columns of text are left
-    out. A last row that is cut off is left out with a note. Sizes are limited, see :mod:`deal_hw.reading`.
+    out. An incomplete last row is left out with a note. Sizes are limited, see :mod:`deal_hw.reading`.
 
     Raises:
         DatasetError: It cannot be read, has no header, or a row does not fit it.
@@ -64,18 +64,19 @@ def _parse(path: Path, lines: Iterator[str]) -> tuple[dict[str, FloatArray], tup
     cut = 0
     for number, row in enumerate(rows, start=1):
         if cut:
-            raise DatasetError(f"{path}: row {cut} has fewer than {len(names)} cells; mend the file")
+            raise DatasetError(f"{path}: row {cut} has fewer than {len(names)} cells; repair the file")
         if len(row) < len(names):
-            cut = number  # Only the last one may be: the writer was killed.
+            cut = number  # Only the last row may be incomplete, from a killed writer.
             continue
         if len(row) > len(names):
             raise DatasetError(
-                f"{path}: row {number} has {len(row)} cells, the header {len(names)} ({delimiter!r} between)"
+                f"{path}: row {number} has {len(row)} cells, but the header has {len(names)} (separated by "
+                f"{delimiter!r}); repair the file"
             )
         for column, cell in zip(columns, row, strict=True):
             column.take(number, cell)
     arrays = {column.name: column.values() for column in columns if not column.is_text}
-    notes = [f"row {cut} is cut off and left out"] if cut else []
+    notes = [f"row {cut} is incomplete and left out"] if cut else []
     text = [column.name for column in columns if column.is_text]
     if text:
         notes.append(f"columns of text are left out: {short(', '.join(text))}")
@@ -91,7 +92,7 @@ def _is_number(text: str) -> bool:
 
 
 class _Column:
-    """Collects the cells of one column; what its first cell is decides: a number, a list or text."""
+    """Collects the cells of one column; its first cell decides the kind: a number, a list or text."""
 
     def __init__(self, path: Path, name: str, comma_is_point: bool, most: int) -> None:
         self.name = name
@@ -127,8 +128,8 @@ class _Column:
                 return
             wanted = f"a list of {self._width} numbers" if self._width else "a number"
             raise DatasetError(
-                f"{self._path}: row {row}, column {short(self.name, 60)!r} holds {short(cell, 60)!r}, not "
-                f"{wanted}; mend the file"
+                f"{self._path}: row {row}, column {short(self.name, 60)!r} contains {short(cell, 60)!r}, "
+                f"not {wanted}; repair the file"
             ) from error
         self._seen = True
 
@@ -140,7 +141,7 @@ class _Column:
         if not self._width:
             if len(self._numbers) * len(values) > self._most:
                 raise ValueError("too many empty cells before so long a list")
-            # Empty cells came before: each stood for one number until now.
+            # Earlier empty cells counted as one number each until now.
             self._numbers = array("d", [float("nan")] * len(self._numbers) * len(values))
             self._width = len(values)
         if len(values) != self._width or not values:

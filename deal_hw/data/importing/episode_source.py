@@ -1,4 +1,4 @@
-"""Reads an episode of ours as channels, so that joints can be renamed and picked as in any other file."""
+"""Reads our own episode as channels, so that joints can be renamed and selected as in any other file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deal_hw.data.recording.reader import read_trajectory
 
 
 def read_own(path: Path) -> Channels:
-    """Read an episode: samples on device time, commands at the device time from which they were in force.
+    """Read an episode: samples on device time, commands at the device time of their start.
 
     Raises:
         TornRecordingError: It has no footer or is damaged.

@@ -1,4 +1,4 @@
-"""Puts a recording on a uniform time grid and makes trajectories of it."""
+"""Puts a recording on a uniform time grid and makes trajectories from it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from deal_hw.errors import DatasetError
 from deal_hw.types import BodyTrajectory, FloatArray, IntArray, Status, Trajectory
 
 EVEN = 0.02
-"""Steps between samples that differ by no more than this from a whole number of periods count as even."""
+"""Steps between samples count as even if they differ from whole periods by at most this share."""
 GAP_PERIODS = 3.0
-"""A longer pause between samples splits a recording: nothing is invented across it."""
+"""A longer pause between samples splits a recording; it is not interpolated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gains:
-    """What the robot's own servo was set to, in the order of the actuated joints (A); NaN where unknown.
+    """Settings of the robot's own servos, in the order of the actuated joints (A); NaN if unknown.
 
     Attributes:
         stiffness: kp.
@@ -38,18 +38,18 @@ class Gains:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """An uninterrupted stretch of a recording on a uniform grid.
+    """A part of a recording without pauses, on a uniform grid.
 
     Attributes:
-        trajectory: What calibration reads; ``metadata["import"]`` says where it comes from. Its body holds
-            the base's orientation and angular velocity, where the recording has one of them.
+        trajectory: The data for calibration; ``metadata["import"]`` has its origin. Its body contains the
+            base's orientation and angular velocity, if the recording has one of them.
     """
 
     trajectory: Trajectory
 
     @property
     def orientation(self) -> FloatArray | None:
-        """Base orientation at its samples, quaternion w x y z, (T, 4); None where there is none."""
+        """Base orientation at its samples, quaternion w x y z, (T, 4), or None."""
         body = self.trajectory.body
         return None if body is None or np.isnan(body.orientation).all() else body.orientation
 
@@ -63,8 +63,8 @@ class Recording:
 def period_of(table: Table) -> float:
     """Return the sampling period of a recording [s]: its own, not rounded.
 
-    It is the time between samples over the number of periods that it takes, gaps left out, so that stamps do
-    not drift against the grid as they would with the median step.
+    It is the total time divided by the number of periods, without gaps. With the median step, stamps would
+    drift against the grid.
 
     Raises:
         DatasetError: There are fewer than three samples, or the clock stands still.
@@ -72,7 +72,9 @@ def period_of(table: Table) -> float:
     steps = np.diff(_clock(table)[0])
     steps = steps[steps > 0]
     if steps.size < 2:
-        raise DatasetError(f"{table.name}: {steps.size + 1} samples at different times; that is no recording")
+        raise DatasetError(
+            f"{table.name}: only {steps.size + 1} samples at different times; check the time channel"
+        )
     median = float(np.median(steps))
     inside = steps[steps <= GAP_PERIODS * median]
     return float(np.sum(inside) / np.sum(np.maximum(np.round(inside / median), 1)))
@@ -94,7 +96,8 @@ def common_period(tables: Sequence[Table]) -> float:
     if np.any(np.abs(periods / middle - 1) > EVEN):
         rates = ", ".join(f"{table.name}: {1 / p:.4g} Hz" for table, p in zip(tables, periods, strict=True))
         raise DatasetError(
-            f"recordings of different rates do not fit one dataset ({rates}); import them apart"
+            f"recordings of different rates do not fit into one dataset ({rates}); import them into "
+            "several datasets"
         )
     return middle
 
@@ -109,21 +112,21 @@ def to_trajectories(
     """Put a recording on a uniform grid; gaps split it.
 
     Where the stamps are even (each step within 2 % of whole periods) every sample keeps its values and only
-    its stamp moves to the grid, the commands' stamps along with it: smoothing a measurement would cost more
-    than a step that is 2 % off. Otherwise positions are interpolated linearly at the grid's times, and
-    commands keep their own. A command is in force from its time on. Samples that were lost within a stretch
-    of even stamps stay absent.
+    its stamp moves to the grid, together with the commands' stamps. Smoothing a measurement would add a
+    larger error than a stamp that is 2 % off. Otherwise positions are interpolated linearly at the grid's
+    times, and commands keep their own. A command is active from its time on. Lost samples within a part of
+    even stamps stay absent.
 
     Args:
         table: The recording.
-        gains: What the servo was set to; None: unknown.
+        gains: Settings of the servos; None: unknown.
         period_s: The grid's period [s]; None: the recording's own.
         purpose: Goes into the metadata.
-        gap_periods: A pause of more periods splits the recording; infinite: none does, and its samples are
-            absent.
+        gap_periods: A pause of more periods splits the recording. Infinite: no pause does, and its samples
+        are absent.
 
     Returns:
-        The stretches of at least two samples, in order.
+        The parts of at least two samples, in order.
 
     Raises:
         DatasetError: The clock goes backwards, or there are too few samples or no commands.
@@ -138,7 +141,10 @@ def to_trajectories(
     cuts = np.flatnonzero(np.diff(clock) > limit) + 1
     stretches = [part for part in np.split(np.arange(clock.size), cuts) if part.size >= 2]
     if not stretches:
-        raise DatasetError(f"{table.name}: no two samples follow within {limit:.3g} s")
+        raise DatasetError(
+            f"{table.name}: the pauses between all samples are longer than {limit:.3g} s; "
+            "check the unit of time"
+        )
     recordings = []
     for number, part in enumerate(stretches):
         facts = {
@@ -169,7 +175,7 @@ def _clock(table: Table) -> tuple[FloatArray, IntArray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Placed:
-    """Samples and commands of a stretch on the grid.
+    """Samples and commands of a part on the grid.
 
     Attributes:
         index: Grid index of each sample, (T,).
@@ -205,8 +211,8 @@ def _recording(
         values["gyro"] = table.gyro[rows]
     index = np.round(np.diff(clock) / period).clip(1).cumsum().astype(np.int64)
     index = np.concatenate(([0], index))
-    # A few ppm between this recording's clock and the grid's add up: evenness is judged step by step.
-    # Over a pause they add up to more.
+    # A few ppm between this recording's clock and the grid's accumulate, so evenness is judged step by step.
+    # Over a pause they accumulate more.
     steps = np.diff(clock)
     uneven = (np.abs(steps - np.diff(index) * period) > EVEN * period) & (steps <= GAP_PERIODS * period)
     even = not uneven.any()
@@ -230,7 +236,7 @@ def _keep(
     sent_s = np.where(command_s < clock[0], command_s - clock[0], sent_s)
     sent_s = np.where(command_s > clock[-1], command_s - clock[-1] + grid_s[-1], sent_s)
     off = clock - clock[0] - grid_s
-    # Only differences of time count, so the grid may lie where it fits best.
+    # Only differences of time matter, so the grid is placed where it fits best.
     shift_s = float(np.max(off) - np.min(off)) / 2
     return _Placed(index, dict(values), sent_s, "kept", shift_s)
 
@@ -238,7 +244,7 @@ def _keep(
 def _interpolate(
     clock: FloatArray, index: IntArray, period: float, values: dict[str, FloatArray], command_s: FloatArray
 ) -> _Placed:
-    """Read the measurements at the grid's times, by straight lines; commands keep their own times."""
+    """Interpolate the measurements linearly at the grid's times; commands keep their own times."""
     origin = clock[0] + float(np.median(clock - clock[0] - index * period))
     first = np.ceil((clock[0] - origin) / period - EVEN)
     number = np.arange(first, (clock[-1] - origin) / period + EVEN)
@@ -258,14 +264,14 @@ def _interpolate(
 
 
 def _one_hemisphere(quaternion: FloatArray) -> FloatArray:
-    """Return quaternions, each with the sign nearer to the one before: q and -q are one orientation."""
+    """Return quaternions, each with the sign nearer to its predecessor; q and -q are one orientation."""
     turn = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
     sign = np.where(np.cumsum(np.concatenate(([False], turn))) % 2 == 1, -1.0, 1.0)
     return quaternion * sign[:, None]
 
 
 def _velocity(table: Table, rows: IntArray, clock: FloatArray) -> FloatArray:
-    """Return measured velocities; differences of the positions where the file has none."""
+    """Return measured velocities, or differences of the positions if the file has none."""
     difference = np.gradient(table.position[rows], clock, axis=0)
     if table.velocity is None:
         return np.asarray(difference)
@@ -273,7 +279,7 @@ def _velocity(table: Table, rows: IntArray, clock: FloatArray) -> FloatArray:
 
 
 def _body(measured: dict[str, FloatArray], T: int, J: int) -> BodyTrajectory | None:
-    """Return the base's orientation and angular velocity, and nothing else; None where there is neither."""
+    """Return only the base's orientation and angular velocity; None if there is neither."""
     if not {"orientation", "gyro"} & set(measured):
         return None
     nothing = np.full(T, np.nan)
@@ -300,13 +306,14 @@ def _trajectory(
     gains: Gains | None,
     metadata: dict[str, Any],
 ) -> Trajectory:
-    # A command from before the stretch counts if it is still in force at its start; later ones see no sample.
+    # A command before the part counts if it is still active at its start; commands after its end have no
+    # sample.
     order = np.argsort(sent_s, kind="stable")
     sent_s, target = sent_s[order], table.target[order]
     begin = max(int(np.searchsorted(sent_s, 1e-9, side="right")) - 1, 0)
     end = int(np.searchsorted(sent_s, device_s[-1] + 1e-9, side="right"))
     sent_s, target = sent_s[begin:end], target[begin:end]
-    # Stamps that agree to the nanosecond are one moment: rounding must not hand over a period late.
+    # Stamps that agree to the nanosecond are one time; rounding must not delay a command by a period.
     in_force = np.searchsorted(sent_s, device_s + 1e-9, side="right") - 1
     age = np.full(device_s.size, np.nan)
     known = in_force >= 0

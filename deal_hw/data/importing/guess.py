@@ -1,4 +1,4 @@
-"""Guesses a column map from the names of the channels; the caller says what was guessed."""
+"""Guesses a column map from the names of the channels; the caller prints the guess."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class _Guess:
 
     Attributes:
         channel: Its name.
-        stem: The words that are left, lower case: the joint; empty for an array of all joints.
-        original: The same in the file's own letters.
-        role: "position", "target", "velocity", "effort", or "" where it is none of them.
-        unit: One of the units of position; "" where the name tells none.
+        stem: The remaining words, lower case: the joint; empty for an array of all joints.
+        original: The same in the file's spelling.
+        role: "position", "target", "velocity", "effort", or "" for none of them.
+        unit: One of the units of position; "" if the name has none.
     """
 
     channel: str
@@ -53,16 +53,17 @@ class _Guess:
 def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> ColumnMap:
     """Guess what the channels of a file mean.
 
-    Known layouts: one channel a joint, named like it with a word such as ``_pos``, ``_target``, ``_cmd``,
-    ``_vel``, ``_effort``; or arrays with one column a joint, such as ``dof_pos`` and ``des_dof_pos``,
-    ``observation.state`` and ``action``, ``/joint_states.position`` and ``/joint_command.position``.
+    Known layouts: one channel per joint, with the joint's name and a word such as ``_pos``, ``_target``,
+    ``_cmd``, ``_vel``, ``_effort``; or arrays with one column per joint, such as ``dof_pos`` and
+    ``des_dof_pos``, ``observation.state`` and ``action``, ``/joint_states.position`` and
+    ``/joint_command.position``.
 
     Args:
-        channels: What the file holds.
-        joints: Names of the model's joints; None: as the file names them.
+        channels: The file's channels.
+        joints: Names of the model's joints; None: the file's names.
 
     Raises:
-        DatasetError: No time or no joint can be made out; it says how to write a column map.
+        DatasetError: No time or no joint can be found; the message shows how to write a column map.
     """
     time = _guess_time(channels, channels.arrays, ("",))
     if time is None:
@@ -79,7 +80,7 @@ def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> Co
 
 
 def describe(columns: ColumnMap) -> list[str]:
-    """Return what a column map says, one line each, for the operator to check."""
+    """Return the entries of a column map, one line each, for the operator to check."""
     lines = [f"time: {columns.time.column} [{columns.time.unit}]"]
     if columns.command_time is not None:
         lines.append(f"time of commands: {columns.command_time.column} [{columns.command_time.unit}]")
@@ -110,7 +111,7 @@ def _read_name(channel: str, joints: Iterable[str]) -> _Guess:
     units = [_UNITS[lower[i]] for i in rest if lower[i] in _UNITS]
     left = [i for i in rest if lower[i] not in _ROLE and lower[i] not in _UNITS and lower[i] not in _FILLERS]
     if joint is not None:
-        # Other words beside the joint's name say something that is not known here.
+        # Other words beside the joint's name have an unknown meaning.
         role = "" if left else _role(roles)
         begin, length = joint
         return _Guess(channel, tuple(lower[begin : begin + length]), "", role, units[0] if units else "")
@@ -131,7 +132,7 @@ def _role(roles: set[str], bare: bool = True) -> str:
 
 
 def _joint_in(words: list[str], joints: Iterable[str]) -> tuple[int, int] | None:
-    """Return where the longest name of a joint stands among the words of a channel: first word, words."""
+    """Return the place of the longest joint name among a channel's words: first word, number of words."""
     best: tuple[int, int] | None = None
     for name in joints:
         whole = [word.lower() for word in _SPLIT.split(name) if word]
@@ -143,7 +144,7 @@ def _joint_in(words: list[str], joints: Iterable[str]) -> tuple[int, int] | None
 
 
 def _key(name: str) -> tuple[str, ...]:
-    """Return the words of a joint's name without those that every joint has."""
+    """Return the words of a joint's name without words common to all joints."""
     words = [word.lower() for word in _SPLIT.split(name) if word]
     return tuple(word for word in words if word not in _FILLERS) or tuple(words)
 
@@ -209,7 +210,7 @@ def match_joints(
     """Return name in the model, name in the file and column of each joint of the file that the model has.
 
     Raises:
-        DatasetError: It has none of them; it says what to write in a column map.
+        DatasetError: It has none of them; the message shows what to write in a column map.
     """
     if joints is None:
         return [(name, name, index) for index, name in enumerate(names)]
@@ -240,7 +241,7 @@ def _from_columns(
         ):
             continue
         key = _key(" ".join(guess.stem))
-        # Without a model any column could be a position: only those with a target or a known word are.
+        # Without a model any column could be a position; only those with a target or a known word count.
         if joints is None and guess.stem not in with_target and not _has_role_word(guess.channel):
             continue
         if joints is not None and key not in names:
@@ -277,7 +278,7 @@ def _joint(name: str, roles: dict[str, _Guess]) -> JointColumns:
 
 
 def _guess_time(channels: Channels, names: Iterable[str], prefixes: tuple[str, ...]) -> TimeColumn | None:
-    """Return the channel of time under one of the prefixes; its unit by its name, else by its steps."""
+    """Return the time channel under one of the prefixes, with its unit by its name, else by its steps."""
     by_lower = {name.lower(): name for name in names if channels.arrays[name].ndim == 1}
     for prefix in prefixes:
         for base in ("header.stamp", *_TIME_NAMES):
@@ -321,12 +322,12 @@ def _unit_of(stamps: FloatArray) -> str:
 
 
 def is_target(name: str) -> bool:
-    """Say whether a word of a topic's or channel's name stands for a command."""
+    """Return whether a word of a topic's or channel's name means a command."""
     return any(_ROLE.get(word.lower()) == "target" for word in _SPLIT.split(name))
 
 
 def unguessed(channels: Channels, what: str) -> DatasetError:
-    """Return the error that says what cannot be told, and which channels there are."""
+    """Return the error that names what cannot be guessed, and the channels."""
     names = [
         name if values.ndim == 1 else f"{name}[{values.shape[1]}]" for name, values in channels.arrays.items()
     ]

@@ -1,4 +1,4 @@
-"""Guesses a column map from the message types of a ROS 2 bag: which topic measures and which one commands."""
+"""Guesses a column map from the message types of a ROS 2 bag: the topics of measurements and commands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STATES: Mapping[str, str] = {"JointState": "position"}
 CONTROLLER_STATES: Mapping[str, tuple[str, ...]] = {
     "JointTrajectoryControllerState": ("reference.positions", "desired.positions"),
 }
-"""Message type -> fields with what a controller really asks of its servos, the newer one first."""
+"""Message type -> fields with a controller's actual reference for its servos, the newer one first."""
 COMMANDS: Mapping[str, str] = {
     "JointState": "position",
     "JointTrajectory": "points.positions",
@@ -28,22 +28,23 @@ COMMANDS: Mapping[str, str] = {
 
 
 def guess_topics(channels: Channels, joints: Sequence[str] | None = None) -> ColumnMap | None:
-    """Guess which topics of a bag hold what a robot measured and what it was sent.
+    """Guess which topics of a bag contain a robot's measurements and commands.
 
-    Measured: a ``sensor_msgs/JointState`` whose topic has no word for a command. Sent: the reference of a
-    controller's state; else a command topic of one of the types in :data:`COMMANDS`. Commands without names
-    are taken in the order of the measured joints. Times are the headers' where both topics have them, else
-    both the recorder's.
+    Measurements: a ``sensor_msgs/JointState`` without a word for a command in its topic. Commands: the
+    reference in a controller's state; else a command topic of a type in :data:`COMMANDS`. Commands without
+    names have the order of the measured joints. Times are those of the headers if both topics have them, else
+    those of the recorder.
 
     Args:
-        channels: What the bag holds.
-        joints: Names of the model's joints; None: as the bag names them.
+        channels: The bag's channels.
+        joints: Names of the model's joints; None: the bag's names.
 
     Returns:
-        None where no topic has a type that is known as a measurement.
+        None if no topic has a known type of measurement.
 
     Raises:
-        DatasetError: Several topics would do, or none has commands; it says what to write in a column map.
+        DatasetError: Several topics are possible, or none has commands; the message shows what to write in a
+            column map.
     """
     states = {
         topic: f"{topic}.{field}"
@@ -92,7 +93,7 @@ def _is_wide(channels: Channels, name: str) -> bool:
 
 
 def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str, str]:
-    """Return the topics that may hold the commands, with the channel of each; of the best kind only."""
+    """Return the topics that may contain the commands, with their channels; of the best kind only."""
     reference: dict[str, str] = {}
     others: dict[str, str] = {}
     segments = []
@@ -112,13 +113,13 @@ def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str,
         return reference or others
     if segments:
         raise DatasetError(
-            f"{channels.path}: {short(', '.join(segments), 80)} sends trajectories of several points, which "
-            "the controller interpolates; what the servos were told is in its state. Record that topic too, "
-            "such as /joint_trajectory_controller/controller_state"
+            f"{channels.path}: {short(', '.join(segments), 80)} contains trajectories of several points, "
+            "which the controller interpolates; the commands of the servos are in its state. Record that "
+            "topic, too, such as /joint_trajectory_controller/controller_state"
         )
     listed = ", ".join(f"{topic} ({_plain(kind)})" for topic, kind in channels.types.items())
     raise DatasetError(
-        f"{channels.path}: no topic holds commands for {short(', '.join(names), 80)}; topics: "
+        f"{channels.path}: no topic contains commands for {short(', '.join(names), 80)}; topics: "
         f"{short(listed, 120)}. Record the controller's commands too (ros2 bag record ... "
         f"/position_controller/commands), or name their channel: {_entries(state, '/TOPIC.data')}"
     )
@@ -127,7 +128,7 @@ def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str,
 def _only(
     channels: Channels, found: Mapping[str, str], wanted: Sequence[str] | None, what: str, entry: str
 ) -> str:
-    """Return the one topic; of several the one whose joints are wanted."""
+    """Return the only topic, or the only one with the model's joints."""
     if len(found) > 1 and wanted is not None:
         fitting = [topic for topic, name in found.items() if set(channels.labels.get(name, ())) & set(wanted)]
         if len(fitting) == 1:
@@ -141,8 +142,8 @@ def _only(
             _entries(first, "/TOPIC.FIELD") if entry == "position" else _entries("/TOPIC.position", first)
         )
         raise DatasetError(
-            f"{channels.path}: {len(found)} topics may hold the {what} ({short(listed, 160)}); choose one in "
-            f"a column map, such as {example}"
+            f"{channels.path}: {len(found)} topics may contain the {what} ({short(listed, 160)}); choose "
+            f"one in a column map, such as {example}"
         )
     return next(iter(found))
 
@@ -161,7 +162,7 @@ def _entries(position: str, target: str) -> str:
 
 
 def _times(channels: Channels, state: str, command: str) -> tuple[TimeColumn, TimeColumn]:
-    """Return times on one clock: the headers' where both topics set them and overlap, else the recorder's."""
+    """Return times on one clock: the headers' if both topics set them and overlap, else the recorder's."""
     ends = []
     for topic in (state, command):
         stamp = channels.arrays.get(f"{topic}.header.stamp", np.zeros(1))

@@ -1,8 +1,8 @@
-"""Reads a LeRobot dataset folder (v2.x or v3.0); the videos stay untouched.
+"""Reads a LeRobot dataset folder (v2.x or v3.0), without its videos.
 
 Facts of the format, from the documentation of LeRobotDataset v3.0 and from the `meta/info.json` of published
 datasets: ``meta/info.json`` holds ``codebase_version``, ``fps`` and ``features`` (dtype, shape, names);
-``data/chunk-*/*.parquet`` hold one row a frame, one episode a file in v2 and several in v3, with
+``data/chunk-*/*.parquet`` contain one row per frame, one episode per file in v2 and several in v3 , with
 ``episode_index``, ``frame_index`` and ``timestamp`` [s since the episode's start, float32] beside the
 features. The action of a frame is sent right after the frame was observed.
 """
@@ -24,19 +24,19 @@ from deal_hw.schema import OPEN, refusal
 from deal_hw.types import FloatArray
 
 FLOAT32_STAMP_S = 1e-4
-"""Stamps nearer than this to frame_index / fps are the float32 rounding of it."""
+"""Stamps closer than this to frame_index / fps are its float32 rounding [s]."""
 _BATCH_ROWS = 65_536
 _DEEPEST = 8
 _DROPPED = ("index", "task_index", "episode_index", "frame_index")
 
 
 def is_lerobot(path: Path) -> bool:
-    """Say whether a folder looks like a LeRobot dataset."""
+    """Return whether a folder looks like a LeRobot dataset."""
     return (Path(path) / "meta" / "info.json").is_file()
 
 
 def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Channels]:
-    """Read a LeRobot dataset; one :class:`Channels` an episode, in the order of their numbers.
+    """Read a LeRobot dataset; one :class:`Channels` per episode, in the order of their numbers.
 
     Args:
         path: The dataset's folder.
@@ -44,25 +44,26 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
 
     Raises:
         MissingExtraError: pyarrow is not installed.
-        DatasetError: It is not a LeRobot dataset, or lacks an episode that was asked for.
+        DatasetError: It is not a LeRobot dataset, or a requested episode is missing.
     """
     path = Path(path)
     info = _info(path)
     files = sorted((path / "data").glob("*/*.parquet"))
     if not files:
-        raise DatasetError(f"{path} has no data/*/*.parquet; is the dataset downloaded whole?")
+        raise DatasetError(f"{path} has no data/*/*.parquet; download the whole dataset")
     found: dict[int, list[dict[str, FloatArray]]] = {}
     for file in files:
         for episode, arrays in _read_file(file, info.features):
             for name, feature in info.features.items():
-                # One motor's values are plain numbers in the file; their name says that they are a joint's.
+                # One motor's values are plain numbers in the file; a column name marks them as those of a
+                # joint.
                 if name in arrays and arrays[name].ndim == 1 and feature.get("names"):
                     arrays[name] = arrays[name][:, None]
             if episodes is None or episode in episodes:
                 found.setdefault(episode, []).append(arrays)
     missing = sorted(set(episodes or ()) - set(found))
     if missing:
-        raise DatasetError(f"{path} has no episodes {missing}; it has {len(found)} that were asked for")
+        raise DatasetError(f"{path} has no episodes {missing}; of the requested ones it has {len(found)}")
     digest = _digest(path, files)
     with reading(path / "meta" / "info.json", "the description of a LeRobot dataset"):
         labels = {name: _names(feature) for name, feature in info.features.items()}
@@ -85,7 +86,7 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
 
 @dataclass(frozen=True, slots=True)
 class _Info:
-    """What is needed of ``meta/info.json``: the features by name, and the rate [Hz]."""
+    """The used part of ``meta/info.json``: the features by name, and the rate [Hz]."""
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
@@ -125,7 +126,7 @@ def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[
             _check_extent(opened.metadata, len(wanted))
             batches, count = [], 0
             for batch in opened.iter_batches(batch_size=_BATCH_ROWS, columns=wanted):
-                # Lists have any length: what they hold is known only now.
+                # Lists may have any length, which is known only now.
                 count += batch.nbytes // 8
                 if count > NUMBERS:
                     raise ValueError(f"more than {NUMBERS} numbers")
@@ -143,9 +144,9 @@ def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[
 
 
 def _check_extent(metadata: Any, columns: int) -> None:
-    """Check how much a file says that it holds: a run of one value takes no bytes in it.
+    """Check the announced size of a file's data, since a run of one value takes no bytes in it.
 
-    What it says of single columns is not asked for: pyarrow ends the process where that is damaged.
+    The metadata of single columns are not read: pyarrow ends the process if these are damaged.
     """
     size = sum(metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups))
     if metadata.num_rows * columns > NUMBERS or size > 8 * NUMBERS:
@@ -170,14 +171,14 @@ def _joined(parts: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
 
 
 def _stamped(arrays: dict[str, FloatArray], fps: float) -> dict[str, FloatArray]:
-    """Return the channels with ``timestamp`` in full precision where it is frame_index / fps in float32."""
+    """Return the channels, with ``timestamp`` in full precision if it is frame_index / fps in float32."""
     frame = arrays.get("frame_index")
     if frame is not None:
         regular = frame / fps
         given = arrays.get("timestamp", regular)
         if np.all(np.abs(given - regular) < FLOAT32_STAMP_S):
             arrays["timestamp"] = regular
-    if "command_age" in arrays:  # Written by our own export: when each action came into force.
+    if "command_age" in arrays:  # Written by our own export: the start of each action.
         sent = np.round(arrays["timestamp"] - arrays["command_age"], 6)
         arrays["command_time_s"] = np.maximum.accumulate(sent)
     lost = arrays.pop("filled", np.zeros(1))
@@ -187,7 +188,7 @@ def _stamped(arrays: dict[str, FloatArray], fps: float) -> dict[str, FloatArray]
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of a feature's columns; () where there are none.
+    """Return the names of a feature's columns, or ().
 
     Published datasets have a list, a list in a list, a mapping of one list ({motors: [...]}) or of several
     (left and right arm), or of names to indices.
@@ -214,7 +215,7 @@ def _flat(names: Any, deepest: int) -> list[str]:
 
 
 def _digest(path: Path, files: list[Path]) -> str:
-    """Return a digest of the data files; a dataset may be large, so each counts by its own digest."""
+    """Return a digest of the data files, from the digest of each, since a dataset may be large."""
     whole = sha256_of(path / "meta" / "info.json")
     for file in files:
         whole.update(sha256_of(file).digest())

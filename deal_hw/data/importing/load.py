@@ -1,4 +1,4 @@
-"""From a path to tables and trajectories: the door of this package."""
+"""Reads tables and trajectories from a path; the entry point of this package."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _HEAD_BYTES = 1 << 20
 
 
 def read_channels(path: Path) -> list[Channels]:
-    """Read a file, a LeRobot folder, a dataset of ours or the folder of a ROS 2 bag; one entry a recording.
+    """Read a file, a LeRobot folder, our own dataset or the folder of a ROS 2 bag; one entry per recording.
 
     Raises:
-        DatasetError: There is no such file, or it is of no known kind.
+        DatasetError: There is no such file, or its kind is unknown.
     """
     path = Path(path)
     if path.is_dir():
@@ -54,8 +54,8 @@ def read_channels(path: Path) -> list[Channels]:
         if len(bags) == 1:
             return [read_mcap(bags[0])]
         raise DatasetError(
-            f"{path} is a folder but no dataset, no LeRobot dataset (meta/info.json) and no ROS 2 bag of one "
-            "MCAP file (metadata.yaml); name a file"
+            f"{path} is a folder, but not a dataset, a LeRobot dataset (meta/info.json) or a ROS 2 bag of "
+            "one MCAP file (metadata.yaml); name a file"
         )
     if not path.exists():
         raise DatasetError(f"{path} does not exist; check its name")
@@ -80,11 +80,11 @@ def load_tables(
     """Read the recordings in a file, in SI units, on their own stamps.
 
     Args:
-        path: A CSV, NPZ or MCAP file, an episode of ours, or the folder of a dataset of ours, of LeRobot's or
-            of a ROS 2 bag.
-        columns: What its channels mean; None: guessed from their names.
-        joints: Names of the model's joints; None: as the map, or the file, names them.
-        say: Called with sentences on what was guessed and left out.
+        path: A CSV, NPZ or MCAP file, our own episode, or the folder of our own dataset, of LeRobot's or of a
+            ROS 2 bag.
+        columns: Meaning of its channels; None: guessed from their names.
+        joints: Names of the model's joints; None: those of the map, or of the file.
+        say: Called with sentences on guesses and omissions.
 
     Raises:
         DatasetError: It cannot be read or understood.
@@ -103,7 +103,7 @@ def tables_of(
     joints: Sequence[str] | None = None,
     say: Say | None = None,
 ) -> list[Table]:
-    """Interpret channels, as :func:`load_tables` does with those of a file."""
+    """Interpret channels, as :func:`load_tables` does for a file."""
     tables = []
     for number, channels in enumerate(recordings):
         used = columns or guess_topics(channels, joints) or guess_columns(channels, joints)
@@ -120,14 +120,14 @@ def load_recordings(
     gains: Gains | None = None,
     say: Say | None = None,
 ) -> list[Recording]:
-    """Read recordings of one robot onto one grid; episodes and datasets of deal-hw come as they are.
+    """Read recordings of one robot onto one grid; episodes and datasets of deal-hw stay unchanged.
 
     Args:
         paths: As for :func:`load_tables`; or episodes and datasets recorded by deal-hw.
-        columns: What the channels mean; None: guessed.
+        columns: Meaning of the channels; None: guessed.
         joints: Names of the model's joints.
-        gains: What the robot's servos were set to, in the order of the joints with commands; None: unknown.
-        say: Called with sentences on what was guessed and left out.
+        gains: Settings of the robot's servos, in the order of the joints with commands; None: unknown.
+        say: Called with sentences on guesses and omissions.
 
     Raises:
         DatasetError: One cannot be read or understood, or they do not fit each other.
@@ -144,15 +144,15 @@ def load_recordings(
     different = [table for table in tables if table.joint_names != tables[0].joint_names]
     if different:
         raise DatasetError(
-            f"{different[0].name} has the joints {', '.join(different[0].joint_names)}, "
-            f"{tables[0].name} {', '.join(tables[0].joint_names)}; import them apart"
+            f"{different[0].name} has the joints {', '.join(different[0].joint_names)}, but "
+            f"{tables[0].name} {', '.join(tables[0].joint_names)}; import them into two datasets"
         )
     period = common_period(tables)
     return own + [part for table in tables for part in to_trajectories(table, gains, period)]
 
 
 def own_episodes(path: Path, say: Say | None = None) -> list[Path]:
-    """Return the episodes of a dataset of ours, or the one that is named; none of any other file.
+    """Return the episodes of our own dataset, or the named one; none of any other file.
 
     Raises:
         DatasetError: The dataset cannot be read.
@@ -164,12 +164,12 @@ def own_episodes(path: Path, say: Say | None = None) -> list[Path]:
 
 
 def is_dataset(path: Path) -> bool:
-    """Say whether a folder is a dataset of deal-hw."""
+    """Return whether a folder is a dataset of deal-hw."""
     return (Path(path) / INDEX_NAME).is_file()
 
 
 def is_episode(path: Path) -> bool:
-    """Say whether an MCAP file was written by deal-hw: it says so before its first message."""
+    """Return whether an MCAP file was written by deal-hw, which it states before its first message."""
     path = Path(path)
     if path.suffix.lower() != ".mcap" or not path.is_file():
         return False

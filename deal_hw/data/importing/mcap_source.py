@@ -21,11 +21,11 @@ from deal_hw.reading import MIB, NAMES, NUMBERS, RECORDING_BYTES, check_size, re
 from deal_hw.types import FloatArray
 
 STAMP_FIELDS = ("log_time", "header.stamp")
-"""Times of each topic [s]: when the recorder got the message, and when the sender says it was made."""
+"""Times of each topic [s]: the recorder's time of receipt, and the sender's time."""
 CHUNK_BYTES = 64 * MIB
 """Largest record, and largest chunk once it is unpacked; recorders write chunks of 1 to 4 MiB."""
 _LEAF_COST = 16
-"""What a field of a message costs in memory, in numbers, beside its values."""
+"""Additional memory of a field of a message, in numbers, beside its values."""
 LIST_BYTES = MIB
 """Largest message with a list of messages; a trajectory of ten thousand points."""
 NAME_FIELDS = ("name", "joint_names", "dof_names")
@@ -37,7 +37,7 @@ _LISTS = {
     ],
     "std_msgs/MultiArrayDimension": [("string", ""), ("uint32", ""), ("uint32", "")],
 }
-"""Messages that may come in lists: each entry takes bytes in the file, so none is longer than its bytes."""
+"""Message types that may come in lists; each entry takes bytes in the file, which limits the lists."""
 _SCHEMA_PART = re.compile(r"^={3,}\s*^MSG:\s+(\S+)\s*$", re.MULTILINE)
 _SCHEMA_FIELD = re.compile(r"^[ \t]*(\w+(?:/\w+)*)(?:<=\d+)?(\[[^\]\n]*\])?[ \t]+\w+", re.MULTILINE)
 
@@ -58,7 +58,7 @@ def read_mcap(path: Path) -> Channels:
         DatasetError: It cannot be read, or the messages of one topic differ in their joints.
     """
     path = Path(path)
-    with reading(path, "MCAP with ROS 2 messages", "if it was cut off, `mcap recover` mends it"):
+    with reading(path, "MCAP with ROS 2 messages", "if it is incomplete, `mcap recover` repairs it"):
         check_size(path, RECORDING_BYTES)
         digest = digest_of_file(path)
         return _channels(path, digest)
@@ -143,10 +143,10 @@ def _unpacked(chunk: Chunk) -> Chunk:
 
 
 def _reason_to_leave_out(schema: Schema | None) -> str:
-    """Return why messages of a schema are not decoded; "" where they are.
+    """Return why messages of a schema are not decoded; "" if they are.
 
-    The decoder goes by the schema alone. A list of messages without content may have four thousand million
-    entries, and messages that hold each other twice double with each level, both without a byte of data.
+    The decoder follows the schema alone. A list of empty messages may have four thousand million entries, and
+    messages that contain another one twice double with each level, both without a byte of data.
     """
     if schema is None:
         return ""
@@ -202,14 +202,14 @@ def _is_list(value: Any) -> bool:
 def _first_stamp(topics: dict[str, list[dict[str, Any]]]) -> int:
     """Return the earliest stamp in the file [ns], the zero of all.
 
-    It is taken off in integers: absolute nanoseconds would lose their last digits as floats.
+    It is subtracted in integers, since absolute nanoseconds would lose their last digits as floats.
     """
     every = (row for rows in topics.values() for row in rows)
     return min((row[kind] for row in every for kind in STAMP_FIELDS if row.get(kind, 0) > 0), default=0)
 
 
 def _names(path: Path, topic: str, rows: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Return the joints of a topic in the order of its first message; () where it names none."""
+    """Return the joints of a topic in the order of its first message; () if it names none."""
     first: Any = rows[0]["name"]
     if not _is_list(first) or not all(isinstance(name, str) for name in first):
         return ()
@@ -217,8 +217,8 @@ def _names(path: Path, topic: str, rows: list[dict[str, Any]]) -> tuple[str, ...
     for number, row in enumerate(rows):
         if set(row["name"]) != set(names):
             raise DatasetError(
-                f"{path}: message {number} on {topic} names the joints {sorted(row['name'])}, the first one "
-                f"{sorted(names)}; record each publisher on a topic of its own"
+                f"{path}: message {number} on {topic} names the joints {sorted(row['name'])}, but the "
+                f"first one {sorted(names)}; record each publisher on its own topic"
             )
     return names
 
@@ -226,7 +226,7 @@ def _names(path: Path, topic: str, rows: list[dict[str, Any]]) -> tuple[str, ...
 def _channel(
     rows: list[dict[str, Any]], field: str, names: tuple[str, ...], zero_ns: int
 ) -> FloatArray | None:
-    """Return one field of all messages, (T,) or (T, K); None where it is not numbers of one length."""
+    """Return one field of all messages, (T,) or (T, K); None if it is not numbers of one length."""
     if field in STAMP_FIELDS:
         stamps = np.array([row[field] for row in rows], dtype=np.int64) - zero_ns
         return stamps.astype(np.float64) * 1e-9

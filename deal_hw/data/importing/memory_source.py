@@ -1,4 +1,4 @@
-"""Reads a recording that is in memory: arrays by name, or a data frame."""
+"""Reads a recording in memory: arrays by name, or a data frame."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ JOINTS = "joints"
 def read_memory(values: Any, name: str) -> Channels:
     """Take arrays of numbers, (T,) or (T, K), by name, or the columns of a data frame.
 
-    ``{"time": t, "position": q, "target": u}`` with one column a joint, or one channel a joint as in a CSV
-    file: ``{"time": t, "elbow_pos": q0, "elbow_cmd": u0}``. An entry ``"joints"`` names the columns; without
-    it they are in the model's order.
+    ``{"time": t, "position": q, "target": u}`` with one column per joint, or one channel per joint as in a
+    CSV file: ``{"time": t, "elbow_pos": q0, "elbow_cmd": u0}``. An entry ``"joints"`` names the columns;
+    without it they are in the model's order.
 
     Args:
         values: The mapping or data frame.
-        name: What messages call it.
+        name: Its name in messages.
 
     Raises:
-        DatasetError: It is something else, or an entry is no array of numbers.
+        DatasetError: It is of another type, or an entry is no array of numbers.
     """
     if not isinstance(values, Mapping) and not hasattr(values, "columns"):
         raise DatasetError(

@@ -21,7 +21,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.types import BodyState, BodyTrajectory, JointCommand, RobotState, Status, Trajectory
 
 START_NS = 1_000_000_000_000
-"""Where the clocks of an imported episode start: its file had none that means anything here."""
+"""Start of the clocks of an imported episode, whose own clock has no meaning here [ns]."""
 
 
 def write_dataset(
@@ -35,12 +35,12 @@ def write_dataset(
     """Write recordings as the episodes of a dataset and return it, closed.
 
     Args:
-        folder: The dataset; made if it is not there.
-        recordings: On one grid, joints as in the description.
+        folder: The dataset; made if missing.
+        recordings: On one grid, with the description's joints.
         description: Of the robot, or its plain JSON values.
         facts: Plain JSON values to keep with each episode.
         notify: Called with a sentence for each repair.
-        episodes: Episodes of ours, of the same robot, to copy as they are.
+        episodes: Our own episodes of the same robot, to copy unchanged.
 
     Raises:
         DatasetError: It belongs to another robot or cannot be written.
@@ -52,9 +52,8 @@ def write_dataset(
         if has != wants or recording.trajectory.actuated != tuple(values["actuated"]):
             raise ConfigurationError(
                 f"the recording has the joints {', '.join(has)} (commands: "
-                f"{', '.join(recording.trajectory.actuated)}), "
-                f"the description {', '.join(wants)} (commands: {', '.join(values['actuated'])}); "
-                "correct the column map"
+                f"{', '.join(recording.trajectory.actuated)}), but the description {', '.join(wants)} "
+                f"(commands: {', '.join(values['actuated'])}); correct the column map"
             )
     with Dataset.create_or_open(folder, values, notify) as dataset:
         for episode in episodes:
@@ -69,12 +68,12 @@ def write_dataset(
 
 
 def write_episode(path: Path, trajectory: Trajectory, description: Mapping[str, Any]) -> None:
-    """Write a trajectory as an episode file: one control cycle a command."""
+    """Write a trajectory as an episode file, with one control cycle per command."""
     metadata = {key: value for key, value in trajectory.metadata.items() if key != "description"}
     clock = VirtualClock(START_NS)
     sent_ns = START_NS + np.round(trajectory.sent_s * 1e9).astype(np.int64)
     device_ns = START_NS + np.round(trajectory.device_s * 1e9).astype(np.int64)
-    # A state belongs to the first cycle whose command was sent at or after it; the last cycle takes the rest.
+    # A state belongs to the first cycle with a command sent at or after it; the last cycle gets the rest.
     cycle = np.searchsorted(sent_ns, device_ns, side="left")
     begin = np.searchsorted(cycle, np.arange(sent_ns.size + 2))
     number = _numbers(trajectory)
@@ -115,18 +114,17 @@ def minimal_description(
     mjcf: Path | None = None,
     rates_per_sample: int = 1,
 ) -> dict[str, Any]:
-    """Return a description of a robot of which only its recordings are known, as plain JSON values.
+    """Return a description of a robot from its recordings alone, as plain JSON values.
 
-    It has the entries of ``RobotDescription.to_json()``; what nobody said is NaN, and what nobody
-    limited is infinite.
+    It has the entries of ``RobotDescription.to_json()``; unknown values are NaN, unknown limits infinite.
 
     Args:
         recordings: Its recordings.
         name: Its name.
         units: Unit of each position, (J,).
         rate_hz: Sampling rate of the recordings' grid.
-        gains: What its servos were set to; None: unknown.
-        mjcf: Its model; None: none yet.
+        gains: Settings of its servos; None: unknown.
+        mjcf: Its model, or None.
         rates_per_sample: Device periods between two samples, 1 or more.
     """
     if not recordings:
@@ -169,7 +167,7 @@ def minimal_description(
 
 
 def _numbers(trajectory: Trajectory) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return the number of each sample on the grid, so that lost ones leave a hole in the count, (T,)."""
+    """Return the number of each sample on the grid, (T,); lost samples leave gaps in the numbers."""
     period = trajectory.metadata.get("import", {}).get("period_s")
     if not period:
         return np.arange(trajectory.device_s.size)

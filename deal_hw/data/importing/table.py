@@ -1,4 +1,4 @@
-"""One recording in SI units, on the stamps it came with."""
+"""One recording in SI units, on its own stamps."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Table:
         units: Unit of each position, "rad" or "m", (J,).
         time_s: Stamps of the samples since the first of them, as recorded, (T,) [s].
         position: (T, J) [rad or m].
-        velocity: (T, J) [rad/s or m/s]; None where the file has none.
-        effort: (T, J), in whatever unit the file has; None where it has none.
+        velocity: (T, J) [rad/s or m/s], or None.
+        effort: (T, J), in the file's unit, or None.
         command_s: Stamps of the commands on the same clock and zero, (C,) [s].
         target: Commanded positions, (C, A) [rad or m].
-        orientation: Base orientation, quaternion w x y z, (T, 4); None where the file has none.
-        gyro: Angular velocity of the base in its own frame, (T, 3) [rad/s]; None where the file has none.
-        source: Where it comes from and what was changed on the way: plain JSON values.
+        orientation: Base orientation, quaternion w x y z, (T, 4), or None.
+        gyro: Angular velocity of the base in its own frame, (T, 3) [rad/s], or None.
+        source: Origin and changes: plain JSON values.
     """
 
     joint_names: tuple[str, ...]
@@ -58,7 +58,7 @@ class Table:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
         return f"{self.source['file']} {self.source['part']}".strip()
 
     def rows(self, kept: npt.NDArray[np.bool_]) -> Table:
@@ -74,14 +74,14 @@ class Table:
 def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | None = None) -> Table:
     """Pick and convert the channels that a column map names.
 
-    Rows without any position are left out (a log of several rates has such), and so are rows without any
-    target; both are counted in ``source``.
+    Rows without any position are left out (they occur in logs with several rates), and so are rows without
+    any target; ``source`` counts both.
 
     Args:
-        channels: What the file holds.
-        columns: What it means.
+        channels: The file's channels.
+        columns: Their meaning.
         joints: Names of the model's joints: the table follows their order, and others are refused. None: the
-            map's order.
+        map's order.
 
     Raises:
         DatasetError: A channel is missing or does not fit the others, or a joint is not the model's.
@@ -118,7 +118,7 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
     kept = ~np.isnan(position).all(axis=1)
     sent = ~np.isnan(target).all(axis=1) if target.size else np.zeros(command_s.size, dtype=bool)
     if not kept.any():
-        raise DatasetError(f"{channels.path}: every position is empty; is it the right channel?")
+        raise DatasetError(f"{channels.path}: every position is empty; check the channel in the column map")
     zero_s = float(time_s[kept][0])
     return Table(
         joint_names=tuple(joint.name for joint, _ in ordered),
@@ -146,7 +146,7 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
 
 
 def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
-    """Return a trajectory as a table: commands at the device time from which they were in force."""
+    """Return a trajectory as a table, with commands at the device time of their start."""
     seen = trajectory.command_sequence
     order = {int(number): row for row, number in enumerate(trajectory.sent_sequence)}
     numbers, first = np.unique(seen, return_index=True)
@@ -190,7 +190,7 @@ def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArr
     """Return the stamps of samples and commands since the first sample, (T,) and (C,) [s]."""
     raw, unit = channels.column(columns.time.column), TIME_UNITS[columns.time.unit]
     finite = raw[np.isfinite(raw)]
-    # The first one is taken off before scaling: an epoch in ns times 1e-9 keeps 0.2 us only.
+    # The first one is subtracted before scaling: an epoch in ns times 1e-9 has a resolution of only 0.2 us.
     zero = float(finite[0]) if finite.size else 0.0
     time_s = (raw - zero) * unit
     if columns.command_time is None:
@@ -202,7 +202,7 @@ def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArr
 def _joint_channel(
     channels: Channels, columns: ColumnMap, joint: JointColumns, place: int, kind: str
 ) -> FloatArray | None:
-    """Return one quantity of one joint in SI, (T,); None where the map or the file has none."""
+    """Return one quantity of one joint in SI, (T,); None if the map or the file has none."""
     given: str | None = getattr(joint, kind)
     pattern: str | None = getattr(columns, kind) if given is None else given
     if pattern is None or pattern.lower() in ("", "none"):
@@ -223,7 +223,7 @@ def _joint_channel(
 def _from_array(
     channels: Channels, name: str, columns: ColumnMap, joint: JointColumns, place: int, kind: str
 ) -> FloatArray | None:
-    """Return a joint's column: by its index, else by its label, in an array without labels by its place."""
+    """Return a joint's column: by its index, else by its label, or without labels by its place."""
     values = channels.array(name)
     if values.ndim == 1:
         if len(columns.joints) == 1:
@@ -252,7 +252,7 @@ def _from_array(
 def _by_label(
     channels: Channels, name: str, labels: Sequence[str], columns: ColumnMap, joint: JointColumns, kind: str
 ) -> FloatArray | None:
-    """Return the column of that name; None where only other joints of the map have one, such as a target."""
+    """Return the column of that name; None if only other joints of the map have one, such as a target."""
     values, own = channels.array(name), _plain(joint.column or joint.name)
     if len(labels) != values.shape[1]:
         raise DatasetError(
@@ -280,7 +280,7 @@ def _plain(label: str) -> str:
 def _stack(
     channels: Channels, kind: str, columns: Sequence[FloatArray | None], rows: int, own_time: bool = False
 ) -> FloatArray | None:
-    """Return the joints' channels as (T, J); None where there are none; a joint without is NaN."""
+    """Return the joints' channels as (T, J), or None; a joint without a channel is NaN."""
     present = [values for values in columns if values is not None]
     if not present:
         return None
@@ -292,8 +292,8 @@ def _stack(
             else "; give `command_time` if commands have stamps of their own"
         )
         raise DatasetError(
-            f"{channels.path}: {kind} has {sorted(sizes)} rows, its time has {rows}; they must be of "
-            f"one length{hint}"
+            f"{channels.path}: {kind} has {sorted(sizes)} rows, but its time has {rows}; both need the "
+            f"same number{hint}"
         )
     return np.stack([np.full(rows, np.nan) if values is None else values for values in columns], axis=1)
 

@@ -1,1 +1,1 @@
-"""Calibration: recordings read and checked, the search run, the result judged and written."""
+"""Calibration: read and check the recordings, search, judge and write the result."""

@@ -1,4 +1,4 @@
-"""A calibration that can be stopped and looked at: its checkpoint file, and its live view."""
+"""Stop, resume and watch a calibration: its checkpoint file, its best fit so far, and its live view."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from deal_hw.sim.recordings.overlay import Overlay
 
 CHECKPOINT = "checkpoint.npz"
-"""Beside the results while the calibration runs; gone when it is over."""
+"""Checkpoint beside the results; removed at the end of the calibration."""
 
 SO_FAR = "so_far"
-"""Folder beside the results that gets the best fit of a calibration that was stopped."""
+"""Folder beside the results for the best fit of a stopped calibration."""
 
 
 def open_checkpoint(
@@ -46,15 +46,15 @@ def open_checkpoint(
     budget: Budget,
     rng: np.random.Generator,
 ) -> SearchCheckpoint:
-    """Return the checkpoint of a run that is about to begin or to go on.
+    """Return the checkpoint of a run that begins or continues.
 
     Args:
         path: The file.
-        resume: Go on with what the file holds; otherwise it is replaced after the first generation.
+        resume: Continue from the file; otherwise it is replaced after the first generation.
         problem: Data and simulator.
         method: The method.
         budget: How much it may use.
-        rng: The run's generator, before it has drawn anything.
+        rng: The run's generator, before its first draw.
     """
     from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
 
@@ -62,25 +62,25 @@ def open_checkpoint(
 
 
 def check_resume(path: Path, resume: bool) -> None:
-    """Check that there is something to go on with.
+    """Check that there is a checkpoint to resume.
 
     Raises:
-        ConfigurationError: There is not.
+        ConfigurationError: There is none.
     """
     if resume and not path.exists():
         raise ConfigurationError(
-            f"there is nothing to resume: {path} does not exist; leave --resume out to begin a calibration"
+            f"nothing to resume: {path} does not exist; leave --resume out to begin a calibration"
         )
 
 
 class BestSoFar:
-    """The best fit of a calibration that is still running: said as it comes, kept where it is stopped.
+    """The best fit of a running calibration: each better fit is reported, and kept for an interrupt.
 
     Args:
-        space: What is searched.
+        space: The parameters.
         judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
-            and "null"; None where nothing is held out.
-        say: Called with a sentence on each better one.
+        and "null"; None without held-out data.
+        say: Called with a sentence on each better fit.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class BestSoFar:
         self.result: CalibrationResult | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Look at a fit that could be the answer; see :attr:`Progress.estimate`."""
+        """Compare a fit with the best one so far; see :attr:`Progress.estimate`."""
         if progress.estimate is None:
             return
         latency_s = progress.latency_s or 0.0
@@ -118,8 +118,8 @@ class BestSoFar:
                 Alarm(
                     f"The calibration was interrupted after {progress.stage}, "
                     f"{time.monotonic() - self._began:.0f} s.",
-                    "No interval was computed; those given are the search ranges.",
-                    "Calibrate again; --resume goes on where it stopped.",
+                    "No interval was computed; the given ones are the search ranges.",
+                    "Run the same command with --resume to continue.",
                 ),
             ),
         )
@@ -127,7 +127,7 @@ class BestSoFar:
 
     @property
     def sentence(self) -> str:
-        """How good it is."""
+        """Error of the best fit, as a sentence."""
         if self.result is None:
             return "no fit yet"
         errors = self.result.heldout_nrmse
@@ -141,10 +141,10 @@ class BestSoFar:
 
 @contextlib.contextmanager
 def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[None]:
-    """On Ctrl-C write the best fit so far, where there is one, and let the interrupt through.
+    """On Ctrl-C write the best fit so far, if any, and raise the interrupt again.
 
     Args:
-        best: What has been seen of it.
+        best: The fits so far.
         folder: Where to write.
         robot: The nominal model.
     """
@@ -163,17 +163,17 @@ def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[N
 
 @contextlib.contextmanager
 def saying_how_to_resume(path: Path) -> Iterator[None]:
-    """On Ctrl-C say where the state is and how to go on with it, and let the interrupt through."""
+    """On Ctrl-C say where the state is and how to continue, and raise the interrupt again."""
     try:
         yield
     except KeyboardInterrupt:
         if path.exists():
             aloud(
-                f"\ncalibration stopped; its state is in {path}: "
-                "the same command with --resume goes on, to the same numbers",
+                f"\ncalibration stopped; its state is in {path}. The same command with --resume continues, "
+                "to the same result",
             )
         else:
-            aloud("\ncalibration stopped before its first generation; nothing is kept")
+            aloud("\ncalibration stopped before its first generation; nothing was saved")
         raise
 
 
@@ -186,18 +186,18 @@ def watching(
     trajectory: Trajectory,
     latency_s: float | None,
 ) -> Iterator[ProgressCallback | None]:
-    """Show a search while it runs, until the block ends.
+    """Show a running search until the block ends.
 
     Args:
-        watch: In a window, or for a browser where there is no desktop.
+        watch: In a window, or in a browser if there is no desktop.
         save: File of the view, .rrd.
-        space: What is searched.
+        space: The parameters.
         description: The robot.
-        trajectory: The recording to show predictions of.
-        latency_s: The latency, where it is known [s].
+        trajectory: The recording whose predictions are shown.
+        latency_s: The latency, if it is known [s].
 
     Yields:
-        What to call with the progress; None where nothing is to be shown.
+        A function to call with the progress; None if nothing is shown.
     """
     if not watch and save is None:
         yield None

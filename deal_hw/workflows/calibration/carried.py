@@ -1,4 +1,4 @@
-"""Calibration of a dataset that carries a user's robot."""
+"""Calibration of a dataset with its own robot.yaml."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def prepare_carried(
     threads: int | None = None,
     say: Say = silent,
 ) -> CalibrationInputs:
-    """Read a dataset that carries its robot; what is done with the recordings is that of any user's robot.
+    """Read a dataset with its own robot.yaml; its recordings are used like those of any user's robot.
 
     Args:
         source: The recordings.
         config: How they are used.
-        overrides: What the command line changes about the parameters.
-        std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
+        overrides: Changes of the parameters by the command line.
+        std: Standard deviation of the prediction error, as in :class:`deal_hw.calib.data.problem.Problem`.
         threads: Simulation threads.
-        say: Called with sentences on what was found.
+        say: Called with sentences on findings.
 
     Raises:
         DealHwError: A setting, the robot or a recording is unusable.

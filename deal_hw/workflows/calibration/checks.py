@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from deal_hw.sim.recordings.episode import SampledEpisode
 
 GRAVITY_EXPLAINED, GRAVITY_LEAST = 0.5, 0.01
-"""Gravity must explain this share of a deviation of at least this size, or no gain is told [rad, m]."""
+"""Gravity must explain this share of a deviation of at least this size, or no gain is reported [rad, m]."""
 MOTOR_CHECKS = (
     "size",
     "finite",
@@ -33,14 +33,14 @@ MOTOR_CHECKS = (
     "orientation",
     "actuation",
 )
-"""Checks that mean something where commands are efforts and not positions."""
+"""Checks that also apply to commands that are efforts, not positions."""
 
 
 def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Recording]) -> None:
-    """Check that a floating robot's recordings say how it floats.
+    """Check that a floating robot's recordings contain the motion of its base.
 
     Raises:
-        ConfigurationError: There is no IMU in a recording, or no feet are named, or the base is fixed.
+        ConfigurationError: A recording has no IMU, or no feet are named, or the base is fixed.
         UnknownNameError: A foot is no geom of the model.
     """
     from deal_hw.sim.parameters.fields import element_id
@@ -54,9 +54,9 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
     if without or not feet:
         lacks = "recordings of the base (orientation and gyro in the column map)" if without else "--feet"
         raise ConfigurationError(
-            f"the model floats (free joint {free!r}); that needs {lacks}: the base is followed by its IMU "
-            "and by the feet that stand (sphere geoms, floor at height 0). Or hold the robot by its trunk, "
-            "record that, and remove the free joint from a copy of the MJCF"
+            f"the model floats (free joint {free!r}) and needs {lacks}: the IMU and the standing feet "
+            "(sphere geoms, floor at height 0) give the base's motion. Add these, or record with the "
+            "trunk held and remove the free joint from a copy of the MJCF"
         )
     for name in feet:
         element_id(robot.model, "geom", name)
@@ -72,19 +72,19 @@ def examine_recording(
     spikes: SpikeSettings = DEFAULT_SPIKES,
     say: Callable[[str], None],
 ) -> list[CheckResult]:
-    """Check a recording and tell what is wrong; return what is worth keeping.
+    """Check a recording and report problems; return the findings to keep.
 
     Args:
         table: The recording.
         facts: The model's joints, for their limits; None without a model.
-        force: Go on although a check failed.
+        force: Continue although a check failed.
         servo: Commands are positions; efforts are not compared with positions.
-        kept: The recording without what is left out; None: all of it is used.
-        spikes: What counts as a spike.
-        say: Takes each finding in words.
+        kept: The recording without the left-out parts; None: all of it is used.
+        spikes: Definition of a spike.
+        say: Called with a sentence on each finding.
 
     Raises:
-        DatasetError: A check failed, and that is not to be overlooked.
+        DatasetError: A check failed, and ``force`` is not set.
     """
     from deal_hw.data.checks.command_kind import command_kind
     from deal_hw.data.checks.plausibility import examine, require
@@ -96,7 +96,7 @@ def examine_recording(
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
     every = list(examine(table, limits, kept, spikes))
     if facts is not None and {v.name for v in every} >= {"assignment"}:
-        # The later checks ran, so clock and values are sound.
+        # These checks run only if clock and values are valid.
         command = facts.command[[facts.names.index(name) for name in table.actuated]]
         every.append(command_kind(table, servo=servo, limits=command))
     found = [v for v in every if v.severity is not Severity.OK]
@@ -108,14 +108,16 @@ def examine_recording(
         try:
             require(found, table.name)
         except DatasetError as err:
-            raise DatasetError(f"{err}. Correct the column map, or overrule with --force") from err
+            raise DatasetError(
+                f"{err}. Correct the column map, or use the recording all the same with --force"
+            ) from err
     return found
 
 
 def warn_of_gravity(
     robot: RobotModel, space: ParameterSpace, episodes: list[SampledEpisode], say: Callable[[str], None]
 ) -> None:
-    """Warn where gravity contradicts a joint's sign or a servo's gain."""
+    """Warn if gravity contradicts a joint's sign or a servo's gain."""
     from deal_hw.sim.recordings.gravity_gain import gravity_gain
 
     found = gravity_gain(robot, episodes)
@@ -131,17 +133,15 @@ def warn_of_gravity(
         low, high = (own / 2, own * 2) if parameter is None else (parameter.low, parameter.high)
         if gain < 0:
             say(
-                f"warning: {joint} hangs against gravity: it is {found.deviation[a]:.2g} rad or m off its "
-                "command, where "
-                f"the model's gravity torque is {found.load[a]:.2g} N·m. Its sign or its zero is wrong: is "
-                "its sign "
-                "in the column map right?"
+                f"warning: {joint} deviates from its command against gravity: by {found.deviation[a]:.2g} "
+                f"rad or m, at a gravity torque of the model of {found.load[a]:.2g} N·m. Its sign or its "
+                "zero is wrong; check the sign in the column map"
             )
         elif not low <= gain <= high:
             say(
-                f"warning: {joint} hangs as with a gain of about {gain:.3g}; the model has {own:.4g}. "
-                f"The search ({low:.3g} to {high:.3g}) does not reach that: give `nominal: {gain:.2g}` in "
-                "the parameters"
+                f"warning: {joint} sags under gravity as with a gain of about {gain:.3g}; the model has "
+                f"{own:.4g}. The search range ({low:.3g} to {high:.3g}) does not contain that gain: give "
+                f"`nominal: {gain:.2g}` in the parameters"
             )
 
 
@@ -154,19 +154,19 @@ def require_sensitive_parameters(
     threads: int | None,
     say: Callable[[str], None],
 ) -> None:
-    """Check before any search that the recordings are long enough, move, and show every parameter."""
+    """Check before any search that the recordings are long enough, move, and depend on every parameter."""
     from deal_hw.calib.data.checks import check_excitation, compute_sensitivity, jumps, require_sensitive
     from deal_hw.calib.data.problem import Problem, samples_in
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
-    # Raises where not even one window of that length fits.
+    # Raises if not even one window of that length fits.
     problem.windows(
         samples_in(problem, window_s), offset=round(problem.settings.smoothing_s / 2 / episodes[0].period_s)
     )
     try:
         check_excitation(problem)
     except InsufficientDataError as err:
-        # What it advises is for robots that deal-hw drives.
+        # Its own advice is for robots of deal-hw.
         raise InsufficientDataError(
             str(err).partition("; record again with")[0] + "; record more motion"
         ) from err
@@ -174,18 +174,15 @@ def require_sensitive_parameters(
     require_sensitive(found)
     if found.faint:
         say(
-            f"warning: hardly visible: {', '.join(found.faint)}. From one end of its range to the other "
-            "each changes "
-            "no prediction by more than the sensor's noise, so its value can hardly be found: record "
-            "motion that "
-            "shows it, or give it with --known"
+            f"warning: the recordings hardly depend on {', '.join(found.faint)}. Over its whole range each "
+            "changes the predictions by less than the sensor's noise, so its estimate will be poor: "
+            "record motion that depends on it, or give its value with --known"
         )
     rough = jumps(problem)
     if rough:
         worst = max(rough, key=lambda name: rough[name])
         say(
             f"warning: predictions jump (by {rough[worst]:.1g} rad or m) when {worst} changes by a "
-            "millionth. The "
-            "model's solver stops too early, and no fit can follow that. Write <option "
+            "millionth. The model's solver stops too early, and no fit can follow such jumps. Write <option "
             'tolerance="1e-15" iterations="200" ls_tolerance="1e-6" ls_iterations="200"/> into the MJCF'
         )

@@ -1,4 +1,4 @@
-"""From a dataset of deal-hw to what a calibration fits and judges by."""
+"""Prepare a dataset of deal-hw for a calibration: fitted and held-out episodes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 HELDOUT_MOTION = "chirp"
 SAMPLES_A_PERIOD = 4
-"""States of a control period that are fitted to."""
+"""Fitted states per control period."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,11 +39,11 @@ class DatasetRecordings:
 
     Attributes:
         folder: The dataset.
-        episodes: What is fitted; empty: all but what is held out.
-        holdout: What only judges; empty: episodes of the motion `chirp`.
-        policy: File of the policy that moved the robot; None: the copy that the dataset keeps.
-        sample_hz: States a second that are fitted to; None: four a control period.
-        spikes: What counts as a spike.
+        episodes: Fitted episodes; empty: all but the held-out ones.
+        holdout: Held-out episodes; empty: those of the motion `chirp`.
+        policy: File of the policy that moved the robot; None: the copy in the dataset.
+        sample_hz: Rate of the fitted states; None: four per control period.
+        spikes: Definition of a spike.
     """
 
     folder: Path
@@ -57,14 +57,14 @@ class DatasetRecordings:
 def prepare_dataset(
     source: DatasetRecordings, space_name: str, overrides: SpaceOverrides, method: str, say: Say = silent
 ) -> CalibrationInputs:
-    """Read a dataset of a robot of ours.
+    """Read a dataset of a robot of deal-hw.
 
     Args:
         source: The recordings.
         space_name: Name of the robot's parameter set; "" for its first.
-        overrides: What is changed about it.
+        overrides: Changes of the set.
         method: Name of the method: some need the recordings' policy.
-        say: Called with a sentence on what was found in the recordings.
+        say: Called with sentences on findings in the recordings.
 
     Raises:
         DealHwError: A setting or a recording is unusable.
@@ -118,11 +118,11 @@ def sound_recordings(
     Args:
         trajectories: By number.
         folder: The dataset, for messages.
-        spikes: What counts as a spike.
+        spikes: Definition of a spike.
         say: Called with a sentence on each spike.
 
     Returns:
-        The episodes without spikes, and what the checks found, by number.
+        The episodes without spikes, and the checks' findings, by number.
 
     Raises:
         InsufficientDataError: An episode cannot be used.
@@ -144,10 +144,10 @@ def sound_recordings(
 
 
 def named_space(robot: str, name: str = "") -> ParameterSpace:
-    """Return a parameter set of a robot; "" is its first.
+    """Return a parameter set of a robot; "": its first.
 
     Raises:
-        UnknownNameError: There is none of that name; the message lists them.
+        UnknownNameError: There is no such set; the message lists them.
     """
     table = parameter_spaces(robot)
     name = name or next(iter(table))
@@ -159,10 +159,10 @@ def named_space(robot: str, name: str = "") -> ParameterSpace:
 def choose_episodes(
     dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int], say: Say = silent
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the episodes to fit and those to judge by.
+    """Return the fitted and the held-out episodes.
 
     Raises:
-        ConfigurationError: Nothing is left to fit, or an episode is in both.
+        ConfigurationError: No episode is left to fit, or one is in both lists.
     """
     every = range(len(dataset.episodes))
     metadata = [dataset.read(i).metadata for i in every]
@@ -170,23 +170,27 @@ def choose_episodes(
     held = tuple(holdout) or tuple(judges)
     repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
     if repeated:
-        say(f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)")
+        say(
+            f"episodes {repeated} hardly moved and were recorded again, so they are not fitted (--episodes "
+            "overrides this)"
+        )
     fit = tuple(episodes) or tuple(i for i in every if i not in held and i not in repeated)
     both = sorted(set(fit) & set(held))
     if both:
         raise ConfigurationError(
-            f"episodes {both} are to be fitted and held out; a held-out episode must not be seen"
+            f"episodes {both} are both fitted and held out; a held-out episode must not be fitted: remove "
+            "it from --episodes or --holdout"
         )
     if not fit:
         raise ConfigurationError(
-            f"nothing to fit: the dataset has {len(every)} episodes, {len(held)} of them held out; "
-            "collect one with `deal-hw collect --motion rich`"
+            f"nothing to fit: the dataset has {len(every)} episodes, {len(held)} of them held out; record "
+            "one with `deal-hw collect --motion rich`"
         )
     return fit, held
 
 
 def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
-    """Say whether a recording is the stronger repetition of the one before, by their metadata."""
+    """Return whether a recording repeats the one before with a stronger motion, by their metadata."""
     same = all(one.get(key) == former.get(key) for key in ("seed", "seconds"))
     same = same and motion_of(one) == motion_of(former)
     return same and one.get("attempt", 0) == former.get("attempt", 0) + 1

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 HELDOUT_PART = 0.25
 DEFAULT = "default"
-"""Name of the method where none is named."""
+"""Name of the default method."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,28 +62,30 @@ class Recordings(Checked):
     of every joint and gain of every actuator of the model."""
 
     write_parameters: Path | None = None
-    """Write such a file for --model, to edit, and do nothing else."""
+    """Write a --parameters file for --model, to edit, and end."""
 
     feet: tuple[str, ...] = ()
-    """Of a floating robot: its feet's sphere geoms. Base height and velocity are estimated from those that
-    stand; recordings must hold the base's orientation and gyro."""
+    """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
+    recordings must contain the base's orientation and gyro."""
 
     holdout_part: Annotated[float | None, Range(0, 0.95)] = None
-    """Without --holdout this last share of each recording only judges the result; 0.25 by default, 0 for
-    none."""
+    """Share of each recording, its last part, that is held out to test the result, without --holdout; 0.25 by
+    default, 0 for none."""
 
     leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
-    """Stretches that the model has no part for, such as a contact: FILE FROM TO [s from its start]."""
+    """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
 
     fit_seconds: Annotated[float, Range(0.1, 1e5, "s")] = 60.0
-    """Fit stretches that lie evenly over the recordings and add up to so many seconds; more is slower."""
+    """Fit this many seconds, in parts that lie evenly over the recordings; more is slower."""
 
     window: Annotated[float, Range(1e-3, 60, "s")] = 0.4
-    """Length of the search's longest windows of prediction [s]; the first ones are a quarter of it. Longer
-    ones see slow things (weight, friction that holds) and cost memory with the square of their samples."""
+    """Length of the longest prediction windows of the search [s]; the search begins with a quarter of it.
+    Longer windows show slow effects (weight, static friction); their memory grows with the square of their
+    samples."""
 
     physics_step: Annotated[float | None, Range(1e-6, 0.1, "s")] = None
-    """Wanted physics step [s]; by default the MJCF's timestep. A whole number fits into a sampling period."""
+    """Requested physics step [s]; by default the MJCF's timestep. It is adjusted to a whole number of steps
+    per sampling period."""
 
     force: bool = False
     """Use recordings although a plausibility check failed."""
@@ -94,7 +96,7 @@ def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
 
     Args:
         config: Names the file, and the model.
-        dataset: Carries the robot where no model is named.
+        dataset: Contains the robot if no model is named.
 
     Raises:
         ConfigurationError: There is no model, or the file exists.
@@ -106,7 +108,7 @@ def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
         model = recorded_robot(Dataset.open(Path(str(dataset))).description, Path(str(dataset))).mjcf
     if model is None or path is None:
         raise ConfigurationError(
-            "--write-parameters needs --model robot.xml, or a dataset that carries a robot"
+            "--write-parameters needs --model robot.xml, or a dataset with its own robot.yaml"
         )
     if path.exists():
         raise ConfigurationError(f"{path} exists; name another file, or remove it")
@@ -129,17 +131,17 @@ def prepare_model(
     threads: int | None = None,
     say: Say = silent,
 ) -> CalibrationInputs:
-    """Read and check everything that a calibration of any robot needs; nothing here takes long.
+    """Read and check everything that a calibration of any robot needs, in a short time.
 
     Args:
         config: Model and recordings.
         holdout: Recordings that only judge the result.
-        overrides: What the command line changes about the parameters.
-        std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
+        overrides: Changes of the parameters by the command line.
+        std: Standard deviation of the prediction error, as in :class:`deal_hw.calib.data.problem.Problem`.
         data: More recordings to fit, also from memory.
-        spikes: What counts as a spike.
+        spikes: Definition of a spike.
         threads: Simulation threads.
-        say: Called with sentences on what was guessed and what looks odd.
+        say: Called with sentences on guesses and doubts.
 
     Raises:
         ConfigurationError: A setting, the model or a parameter cannot be used.
@@ -165,7 +167,8 @@ def prepare_model(
     )
     if both := sorted(files & judges):
         raise ConfigurationError(
-            f"{both[0]} is to be fitted and held out; a held-out recording must not be seen"
+            f"{both[0]} is both fitted and held out; a held-out recording must not be fitted: remove it "
+            "from --data or --holdout"
         )
 
     model = compile_mjcf(config.model)
@@ -225,21 +228,21 @@ def prepare_model(
     )
 
 
-def method_for(work: CalibrationInputs, *, told: bool, real: bool) -> str:
+def method_for(work: CalibrationInputs, *, fit_given: bool, real: bool) -> str:
     """Return the method that suits recordings of a robot.
 
     Args:
         work: Robot and recordings.
-        told: Whether the user said how to treat what no model explains.
-        real: Whether they are of a robot that the user's own MJCF describes.
+        fit_given: Whether the user gave --residual-std or --no-refine.
+        real: Whether the robot is described by the user's own MJCF.
     """
     facts = work.robot.description
     held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
-    if told:
+    if fit_given:
         return DEFAULT
     if work.walks:
         return "gait"
-    # Predictions of seconds, which output-error compares, mean nothing for a robot that falls.
+    # Output-error compares predictions over seconds, which are useless for a robot that falls.
     return "output-error" if real and work.robot.base is None and held else DEFAULT
 
 
@@ -255,21 +258,21 @@ def parts_to_calibrate(
     threads: int | None,
     say: Say,
 ) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
-    """Return what is fitted and what judges, checked against the parameters.
+    """Return the fitted and the held-out recordings, checked against the parameters.
 
     Args:
         robot: The nominal model.
         space: The parameters.
         episodes: Recordings to fit.
-        judge: Recordings that only judge.
+        judge: Held-out recordings.
         config: How recordings are used.
-        share: Share of each fitted recording, its last part, that judges as well.
-        std: What a prediction may be off.
+        share: Share of each fitted recording, its last part, that is held out as well.
+        std: Standard deviation of the prediction error.
         threads: Simulation threads.
-        say: Called with sentences on what looks odd.
+        say: Called with sentences on doubts.
 
     Raises:
-        InsufficientDataError: The recordings are too short, do not move, or show a parameter nowhere.
+        InsufficientDataError: The recordings are too short, do not move, or do not depend on a parameter.
     """
     parts, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
     warn_of_gravity(robot, space, parts, say)
@@ -278,10 +281,10 @@ def parts_to_calibrate(
 
 
 def heldout_share(config: Recordings, holdout: Sequence[object]) -> float:
-    """Return which last share of each recording only judges.
+    """Return the share of each recording, its last part, that is held out.
 
     Raises:
-        ConfigurationError: Recordings to judge by are named as well.
+        ConfigurationError: Held-out recordings are named as well.
     """
     if holdout and config.holdout_part:
         raise ConfigurationError("give --holdout or --holdout-part, not both")
@@ -295,7 +298,7 @@ def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any) ->
     """Return the parameters to search of a user's model.
 
     Raises:
-        ConfigurationError: The file of parameters, or what is changed about them, cannot be used.
+        ConfigurationError: The parameter file, or a change of the parameters, cannot be used.
     """
     from deal_hw.sim.parameters import check_space
     from deal_hw.sim.parameters.template import template

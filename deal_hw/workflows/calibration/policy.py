@@ -19,22 +19,22 @@ if TYPE_CHECKING:
 
 
 def check_policy(method: str, *, given: bool, model: bool) -> None:
-    """Check that a method and where the recordings come from go together.
+    """Check that a method suits the source of the recordings.
 
     Args:
         method: Name of the method.
         given: Whether a policy was named.
-        model: Whether the recordings are of a robot that the user's own MJCF describes, named or carried.
+        model: Whether the robot is described by the user's own MJCF, named or in the dataset.
 
     Raises:
-        ConfigurationError: A policy would have no effect, or the method needs one that nobody knows.
+        ConfigurationError: A policy would have no effect, or the method needs one that is unknown.
     """
     if method not in CLOSED_LOOP_METHODS:
         refuse(["--policy"] if given else [], f"--method {method} runs no policy")
     elif model:
         raise ConfigurationError(
-            f"--method {method} runs the policy that moved the robot, which recordings of --model do not "
-            "name, nor those of a dataset that carries its robot; use eki, deal or deal-paper-replay"
+            f"--method {method} runs the policy that moved the robot, which is unknown for --model and for "
+            "a dataset with its own robot.yaml; use eki, deal or deal-paper-replay"
         )
 
 
@@ -44,17 +44,18 @@ def recorded_policy(
     description: RobotDescription,
     given: Path | None,
 ) -> PopulationDemonstration:
-    """Return the policy that moved the robot all through some episodes of a dataset.
+    """Return the policy that moved the robot during whole episodes of a dataset.
 
     Args:
         dataset: The dataset.
         runs: Metadata of the episodes, by number.
         description: Their robot.
-        given: File of the policy; by default the copy that the dataset keeps.
+        given: File of the policy; by default the copy in the dataset.
 
     Raises:
-        InsufficientDataError: No policy moved the robot all through them, or it is not the same for all.
-        ConfigurationError: The file is not that policy, or no copy of it is kept.
+        InsufficientDataError: No policy moved the robot all the time, or the episodes have different
+            policies.
+        ConfigurationError: The file is another policy, or the dataset has no copy of it.
         PolicyError: The file cannot be run.
     """
     from deal_hw.policies.demonstration import PopulationDemonstration
@@ -67,39 +68,40 @@ def recorded_policy(
     if len(digests) > 1 or len(wishes) > 1:
         raise InsufficientDataError(
             f"episodes {', '.join(map(str, runs))} were recorded with {len(digests)} policies and "
-            f"{len(wishes)} wanted velocities; name episodes of one of each (--episodes)"
+            f"{len(wishes)} requested velocities; name episodes with one policy and one velocity "
+            "(--episodes)"
         )
     (digest,), (wish,) = digests, wishes
     source = make_source(wish)
     if not isinstance(source, FixedVelocity):
         raise InsufficientDataError(
-            f"the recordings follow the velocities of {wish!r}, and a simulator is told one fixed velocity; "
-            "record with --velocity X,Y,YAW"
+            f"the requested velocity of the recordings changes (it is {wish!r}), but the simulators take "
+            "one fixed velocity; record with --velocity X,Y,YAW"
         )
     file = given or dataset.policy_path(digest)
     if not file.is_file():
         raise ConfigurationError(
-            f"{dataset.folder} keeps no copy of the policy that moved the robot (SHA-256 begins "
+            f"{dataset.folder} has no copy of the policy that moved the robot (its SHA-256 begins with "
             f"{digest or 'unknown'}); name its file: --policy FILE"
         )
     policy = OnnxPolicy(file)
     if digest and not policy.digest.startswith(digest):
         raise ConfigurationError(
-            f"{file} is not the policy that moved the robot: its SHA-256 begins {policy.digest[:16]}, that "
-            f"of the recordings' policy {digest}; leave --policy out, or name that file"
+            f"{file} is not the policy that moved the robot: its SHA-256 begins with {policy.digest[:16]}, "
+            f"that of the recordings' policy with {digest}; leave --policy out, or name the right file"
         )
     ahead, left, turn = source.reach()[0]
     return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))
 
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:
-    """Refuse an episode in which something else than the policy moved the robot, too."""
+    """Refuse an episode in which not only the policy moved the robot."""
     motion, stands = motion_of(run), bool(run.get("stand", False))
     if motion == "balance" and not stands:
         return
     what = f"was recorded with motion {motion or 'unknown'!r}" if not stands else "stands up and lies down"
     raise InsufficientDataError(
-        f"episode {index} {what}, so that the policy did not move the robot all the time, and the policy "
-        "alone is run in the simulators; record with `deal-hw collect --motion balance`, or use a method "
-        "that needs no policy: eki, deal, deal-paper-replay"
+        f"episode {index} {what}, so the policy did not move the robot all the time, but the simulators "
+        "run the policy alone; record with `deal-hw collect --motion balance`, or use a method that needs "
+        "no policy: eki, deal, deal-paper-replay"
     )

@@ -1,4 +1,4 @@
-"""From files to what a calibration fits and judges by: reading, leaving out, gridding, dividing."""
+"""Prepare recording files for a calibration: read, leave parts out, grid, divide into fitted and held-out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HELDOUT_STRETCH_S = 20.0
 
 
 Source = Path | str | Mapping[str, Any] | Any
-"""A recording: a file's path, or what is in memory (:mod:`deal_hw.data.importing.memory_source`)."""
+"""A recording: a file's path, or data in memory (:mod:`deal_hw.data.importing.memory_source`)."""
 
 
 def read_tables(
@@ -51,17 +51,17 @@ def read_tables(
 def common_rates(
     tables: Sequence[Table], model: Any, physics_step_s: float | None, window_s: float
 ) -> Sampling:
-    """Check that recordings belong together; return how they lie on the physics grid.
+    """Check that recordings have the same joints and rate; return their place on the physics grid.
 
     Args:
-        tables: All of them.
+        tables: All recordings.
         model: The MjModel.
-        physics_step_s: Wanted physics step; None for the model's [s].
+        physics_step_s: Requested physics step; None for the model's [s].
         window_s: Length of a search's longest windows [s].
 
     Raises:
         ConfigurationError: They have different joints, or a setting cannot be used.
-        DatasetError: A clock is no clock, or rates differ.
+        DatasetError: A clock is invalid, or rates differ.
     """
     from deal_hw.data.checks.plausibility import examine, require
     from deal_hw.data.importing.grid import common_period
@@ -72,10 +72,11 @@ def common_rates(
         if (table.joint_names, table.actuated) != (first.joint_names, first.actuated):
             raise ConfigurationError(
                 f"{table.name} has positions of {', '.join(table.joint_names)} and commands of "
-                f"{', '.join(table.actuated) or 'none'}, {first.name} of {', '.join(first.joint_names)} and "
-                f"{', '.join(first.actuated) or 'none'}; calibrate them apart"
+                f"{', '.join(table.actuated) or 'none'}, but {first.name} of "
+                f"{', '.join(first.joint_names)} and {', '.join(first.actuated) or 'none'}; calibrate them "
+                "separately"
             )
-        # A clock that is no clock has no period; say that before anything else fails on it.
+        # An invalid clock has no period; report it before anything else fails on it.
         early = ("size", "finite", "clock", "rate", "commands")
         require([v for v in examine(table) if v.name in early], table.name)
     timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
@@ -85,10 +86,10 @@ def common_rates(
 def without(
     left_out: Sequence[tuple[str, float, float]], *groups: Sequence[Table]
 ) -> tuple[list[Table], ...]:
-    """Return the recordings without the samples of some stretches; what is left is split there.
+    """Return the recordings without some parts; the rest is split there.
 
     Raises:
-        ConfigurationError: A file is not among them, or a stretch has no samples.
+        ConfigurationError: A file is not among the recordings, or a part has no samples.
     """
     wanted = list(left_out)
     found: list[list[Table]] = []
@@ -104,18 +105,20 @@ def without(
         found.append(kept)
     if wanted:
         known = ", ".join(table.source["file"] for tables in groups for table in tables)
-        raise ConfigurationError(f"--leave-out {wanted[0][0]}: no such recording; they are {known}")
+        raise ConfigurationError(f"--leave-out {wanted[0][0]}: no such recording; known are {known}")
     return tuple(found)
 
 
 def _rows(table: Table, keep: Any) -> Table:
     if not keep.any():
-        raise ConfigurationError(f"--leave-out leaves nothing of {table.name}; leave out the file instead")
+        raise ConfigurationError(
+            f"--leave-out removes all of {table.name}; remove the file from --data instead"
+        )
     return table.rows(keep)
 
 
 def named_on_grid(tables: Sequence[Table], robot: RobotModel, rates: Sampling) -> list[tuple[str, Recording]]:
-    """Return recordings on the grid with their names; a table that pauses gives several."""
+    """Return recordings on the grid with their names; a table with pauses gives several."""
     found = []
     for table in tables:
         recordings = on_grid(table, robot, rates)
@@ -144,7 +147,7 @@ def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]
 
 
 def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...], name: str = "") -> SampledEpisode:
-    """Return a recording on the physics grid, called NAME, with the base where the robot floats."""
+    """Return a recording on the physics grid, called NAME; a floating robot's one includes the base."""
     from deal_hw.sim.recordings.episode import align, fill_gaps
     from deal_hw.sim.recordings.imu_base import with_base
 
@@ -162,15 +165,15 @@ def divide(
     window_s: float,
     say: Callable[[str], None],
 ) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
-    """Return stretches to fit and stretches to judge by.
+    """Return the parts to fit and the held-out parts.
 
     Args:
         episodes: Recordings to fit.
-        judge: Recordings that only judge.
-        share: Share of each fitted recording, its last part, that only judges as well.
+        judge: Held-out recordings.
+        share: Share of each fitted recording, its last part, that is held out as well.
         fit_seconds: How much to fit, spread evenly [s].
         window_s: Length of a search's longest windows [s].
-        say: Told where not all is fitted.
+        say: Called with a sentence if not all is fitted.
     """
     from deal_hw.sim.recordings.parts import split_last, spread, stretches
 
@@ -183,7 +186,7 @@ def divide(
     if len(chosen) < len(parts):
         say(
             f"fitting {sum(map(seconds_of, chosen)):.0f} s of {sum(map(seconds_of, parts)):.0f} s, in "
-            f"{len(chosen)} stretches that lie evenly over them (--fit-seconds)"
+            f"{len(chosen)} evenly spread parts (--fit-seconds)"
         )
     return chosen, [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
 

@@ -1,4 +1,4 @@
-"""What every calibration does once its recordings are on the device's grid: search, judge, report, write."""
+"""The steps of every calibration with recordings on the device's grid: search, judge, report, write."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ HELDOUT_WINDOW_S = 0.2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationInputs:
-    """What is to be calibrated, read and checked.
+    """The inputs of a calibration, read and checked.
 
     Attributes:
         robot: The nominal model.
-        space: What to search.
+        space: The parameters to search.
         episodes: Recordings to fit.
-        holdout: Recordings that only judge the result.
+        holdout: Held-out recordings, which only test the result.
         shown: The recording that ``--watch`` shows.
         telemetry: Verdicts on the recordings, for the report.
-        provenance: Where all of it comes from: plain JSON values.
-        advice: How to get a held-out recording where there is none.
+        provenance: Sources of the inputs: plain JSON values.
+        advice: How to get a held-out recording if there is none.
         balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
-        name: Name under which `deal-hw collect` records this robot; "" where it does not.
+        name: Name under which `deal-hw collect` records this robot; "" if it cannot.
         walks: Whether all recordings are of a policy that walks.
-        policy: What moved the robot all through the recordings, where the method needs it.
+        policy: The policy that moved the robot all the time, if the method needs it.
     """
 
     robot: RobotModel
@@ -82,20 +82,20 @@ class CalibrationInputs:
 
     @property
     def smoothing_s(self) -> float | None:
-        """Over how long start states are smoothed [s]; None for the usual time."""
+        """Time over which start states are smoothed [s]; None for the default."""
         return GAIT_SMOOTHING_S if self.walks else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpaceOverrides:
-    """What the command line changes about a parameter space.
+    """Changes of a parameter space by the command line.
 
     Attributes:
-        free: Search exactly these; empty: as the space has it.
+        free: Search exactly these; empty: the space's own choice.
         known: Values measured by other means, by name (SI).
         ranges: Other ranges: name, low, high (SI).
-        range_ratio: Log ranges reach this factor to either side of the nominal value; None: as the space has
-            them.
+        range_ratio: Log ranges go from nominal / range_ratio to nominal * range_ratio; None: the space's own
+            ranges.
     """
 
     free: Sequence[str]
@@ -108,7 +108,8 @@ class SpaceOverrides:
 
         Raises:
             UnknownNameError: A name is not known; the message lists the names.
-            ConfigurationError: A range is empty, reversed, or excludes the nominal value; or nothing is left.
+            ConfigurationError: A range is empty, reversed, or excludes the nominal value; or no parameter is
+                left.
         """
         if self.free:
             space = space.with_free(self.free)
@@ -118,7 +119,9 @@ class SpaceOverrides:
         for parameter, low, high in self.ranges:
             space = space.with_range(parameter, low, high)
         if not len(space):
-            raise ConfigurationError("every parameter is known: there is nothing to search")
+            raise ConfigurationError(
+                "every parameter is known, so there is nothing to search; remove one from --known"
+            )
         return space
 
 
@@ -127,7 +130,7 @@ class CalibrateReport:
     """What a calibration wrote.
 
     Attributes:
-        result: What was found.
+        result: The result.
         files: The files by name.
     """
 
@@ -157,29 +160,29 @@ def calibrate_episodes(
     smoothing_s: float | None = None,
     policy: PopulationPolicy | None = None,
 ) -> CalibrationResult:
-    """Calibrate from recordings on the device's time grid; the heart of the verb, without files.
+    """Calibrate from recordings on the device's time grid, without writing results.
 
     Args:
         robot: The nominal model.
-        space: What to search.
+        space: The parameters to search.
         episodes: Recordings to fit.
-        holdout: Recordings that only judge the result; the search never sees them.
+        holdout: Recordings that only test the result; the search never uses them.
         method: Name of the method.
         budget: How much it may use.
         rng: The only source of randomness.
         latency_s: Total latency if it is known [s].
-        latency_range_s: Otherwise what is searched [s].
+        latency_range_s: Otherwise the range of its search [s].
         threads: Simulation threads.
         progress: Called with the progress.
-        say: Called with a sentence where a better fit was found, and where it is kept.
-        checkpoint: File that holds the state after each generation; None to keep none.
-        resume: Go on with what that file holds.
-        keep: Folder that gets the best fit so far on Ctrl-C; None to keep none.
-        known_std: What a prediction may be off, positions then velocities, (2 C,); None: the sensor noise, as
-            the recordings show it.
-        heldout_window_s: Held-out predictions restart this often [s].
-        smoothing_s: Start states are smoothed over so long [s]; None for the usual time.
-        policy: What moved the robot all through the recordings, for methods that need it.
+        say: Called with a sentence on each better fit, and on its file.
+        checkpoint: File for the state after each generation; None for no file.
+        resume: Continue from that file.
+        keep: Folder for the best fit so far on Ctrl-C; None for no folder.
+        known_std: Standard deviation of the prediction error, positions then velocities, (2 C,); None: the
+        sensor noise, estimated from the recordings.
+        heldout_window_s: Held-out predictions restart from the measured state after this time [s].
+        smoothing_s: Time over which start states are smoothed [s]; None for the default.
+        policy: The policy that moved the robot all the time, for methods that need it.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -215,8 +218,8 @@ def calibrate_episodes(
     judge = None if held_out is None else lambda *fit: held_out.errors(beside_nominal(*fit)).nrmse
     best = BestSoFar(space, judge, say)
     searcher = make_method(method, refine=budget.refine)
-    # The matrices are small: a second BLAS thread only spins, and where processors are shared each
-    # decomposition then takes ten times as long.
+    # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
+    # then takes ten times as long.
     with (
         threadpool_limits(1, user_api="blas"),
         keeping_best(best, keep, robot) if keep is not None else contextlib.nullcontext(),
@@ -244,10 +247,10 @@ def calibrate_episodes(
 
 
 def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None:
-    """Check before any search that held-out recordings can be judged by.
+    """Check before any search that the held-out recordings are long enough.
 
     Raises:
-        InsufficientDataError: None of them holds a window.
+        InsufficientDataError: None of them contains a window.
     """
     from deal_hw.sim.recordings.episode import fill_gaps
     from deal_hw.sim.recordings.windows import cut_windows
@@ -264,23 +267,23 @@ def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None
 
 
 def residual_std(words: Sequence[str], robot: RobotModel) -> FloatArray | None:
-    """Return what ``--residual-std`` means, positions then velocities, (2 C,); None where it is not given.
+    """Return ``--residual-std`` as an array, positions then velocities, (2 C,); None if it is not given.
 
     Raises:
         ConfigurationError: It is neither one number nor pairs of a joint and a number above 0.
-        UnknownNameError: A joint is not known.
+        UnknownNameError: A joint is unknown.
     """
     if not words:
         return None
     if len(words) == 1:
         return residual_std_of(_number(words[0]), robot)
-    # A last word without a number is a joint that has none.
+    # A last word without a number is a joint without a value.
     pairs = zip(words[::2], [*map(_number, words[1::2]), *([math.nan] * (len(words) % 2))], strict=True)
     return residual_std_of(dict(pairs), robot)
 
 
 def residual_std_of(given: float | Mapping[str, float] | None, robot: RobotModel) -> FloatArray | None:
-    """Return what a prediction may be off, positions then velocities, (2 C,); None where it is not given.
+    """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
 
     Args:
         given: One number for all joints of a fixed robot, or one for each name [rad or m].
@@ -305,7 +308,7 @@ def residual_std_of(given: float | Mapping[str, float] | None, robot: RobotModel
     ):
         whole = "" if robot.base is not None else "one number, or "
         raise ConfigurationError(
-            f"--residual-std: give {whole}a name and a number for each of {', '.join(names)}"
+            f"--residual-std: give {whole}a name and a number above 0 for each of {', '.join(names)}"
         )
     for value in values.values():
         Range(1e-9, 1e3, "rad or m").check("--residual-std", float(value))
@@ -335,20 +338,20 @@ def finish(
     advise: bool = True,
     threads: int | None = None,
 ) -> CalibrateReport:
-    """Note where a result comes from and write the result folder.
+    """Add a result's provenance and write the result folder.
 
     Args:
-        work: What was calibrated.
-        result: What was found.
+        work: The inputs.
+        result: The result.
         folder: Where to write.
-        settings: What else the provenance says: plain JSON values.
-        checkpoint: File of the state to resume from; removed once the results are there.
+        settings: More provenance: plain JSON values.
+        checkpoint: File of the state to resume from; removed after the results are written.
         page: Write report.html.
-        advise: Compute what to record next for parameters that stayed open.
+        advise: Compute which motion to record next for weak parameters.
         threads: Simulation threads.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C. It is said whether there are results; where there are, they are whole.
+        KeyboardInterrupt: Ctrl-C. A message says whether there are results; if so, they are complete.
     """
     from deal_hw.calib.report.page import write_result
     from deal_hw.data.files import interrupts_deferred
@@ -356,13 +359,13 @@ def finish(
     with saying_how_to_resume(checkpoint):
         result, report = judged(work, result, settings, page=page, advise=advise, threads=threads)
     try:
-        # An impatient Ctrl-C must neither cost an hour's work nor leave half of it.
+        # A Ctrl-C here must neither lose an hour's work nor leave half of the files.
         with interrupts_deferred():
             files = write_result(folder, work.robot, result, report)
             checkpoint.unlink(missing_ok=True)
             shutil.rmtree(folder / SO_FAR, ignore_errors=True)
     except KeyboardInterrupt:
-        aloud(f"\ninterrupted after the end: the results in {folder} are whole")
+        aloud(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
         raise
     return CalibrateReport(result=result, files=files)
 
@@ -376,7 +379,7 @@ def judged(
     advise: bool,
     threads: int | None,
 ) -> tuple[CalibrationResult, ReportInputs | None]:
-    """Return the result with advice and provenance, and what its report shows."""
+    """Return the result with advice and provenance, and the contents of its report."""
     if advise:
         from deal_hw.calib.design.advice import next_recordings
 

@@ -1,4 +1,4 @@
-"""Settings of a calibration, and what reads and checks what they name."""
+"""Settings of a calibration, and the functions that read and check their inputs."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
 
 OF_DATASETS = ("episodes", "space", "sample_hz")
-"""Settings that only datasets take."""
+"""Settings for datasets only."""
 FROM_FILES = ("data", "columns", "feet", "leave_out", "force")
-"""Settings that say how files are read, which a dataset that carries its robot has behind it."""
+"""Settings on reading files, which have no effect for a dataset with its own robot.yaml."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(Checked):
-    """What ``deal-hw calibrate`` and :func:`deal_hw.calibrate` can be told; both refuse the same."""
+    """Settings of ``deal-hw calibrate`` and :func:`deal_hw.calibrate`, with the same checks in both."""
 
     dataset: File | None = None
     """Dataset folder, such as runs/first/dataset; left out with --model."""
@@ -56,31 +56,30 @@ class CalibrateSettings(Checked):
     """Episodes of the dataset to fit; by default all but the held-out ones."""
 
     holdout: Annotated[tuple[int | Path, ...], Range(0, 1_000_000)] = ()
-    """What only judges the result: episodes of the dataset (by default those collected with --motion chirp),
-    or with --model recordings (by default the last part of each, --holdout-part)."""
+    """Held-out data, which only test the result: episodes of the dataset (by default those collected with
+    --motion chirp), or with --model recordings (by default the last part of each, --holdout-part)."""
 
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
-    """Held-out predictions restart from the measured state this often [s]."""
+    """Held-out predictions restart from the measured state after this time [s]."""
 
     method: str = DEFAULT
-    """How to search: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
-    default is eki and its refinement; of a walk it is gait; with --model, for a robot that servos hold on a
-    fixed base, it is output-error unless --residual-std or --no-refine say how to treat what no model
-    explains."""
+    """Search method: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
+    default is eki with refinement. For a walk it is gait. With --model, for servos on a fixed base, it is
+    output-error, unless --residual-std or --no-refine is given."""
 
     policy: File | None = None
     """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
-    simulator; by default the copy that the dataset keeps."""
+    simulator; by default the copy in the dataset."""
 
     space: str = ""
     """Named parameter set of a robot with a driver, such as k9 or k11; by default the first. Page
     'Parameters' of the documentation lists them."""
 
     free: tuple[str, ...] = ()
-    """Search exactly these parameters instead; the others keep their nominal values."""
+    """Search exactly these parameters; all others keep their nominal values."""
 
     known: Annotated[tuple[tuple[str, float], ...], Range(-1e12, 1e12)] = ()
-    """Parameters measured by other means, as NAME VALUE pairs (SI)."""
+    """Values that were measured by other means, as NAME VALUE pairs (SI)."""
 
     range: Annotated[tuple[tuple[str, float, float], ...], Range(-1e12, 1e12)] = ()
     """Other search ranges, as NAME LOW HIGH (SI)."""
@@ -94,32 +93,32 @@ class CalibrateSettings(Checked):
     """Total latency [s] if it is known; by default it is searched."""
 
     latency_range: Annotated[tuple[float, float], Range(0, LONGEST_LATENCY_S, "s")] = LATENCY_RANGE_S
-    """Latencies that are searched, LOW HIGH [s]. An estimate at the end is an alarm: widen the range then."""
+    """Range of the latency search, LOW HIGH [s]. Widen it if an alarm reports an estimate at its end."""
 
     spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
     """Leave out up to three samples in a row that jump away and come back, so many times farther than the
     joint's fastest motion would take it. A larger number leaves out less."""
 
     residual_std: float | Mapping[str, float] | tuple[str, ...] | None = ()
-    """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE
-    pairs of joints; by default the sensor noise, estimated. On real robots some milliradians often serve
-    better."""
+    """Expected standard deviation of the prediction error [rad, m]: sensor noise and model error. One number,
+    or NAME VALUE pairs of joints; by default the sensor noise, estimated from the recordings. For real robots
+    a few milliradians are often better."""
 
     sample_hz: Annotated[float | None, Range(1, 1e5, "Hz")] = None
-    """Fit to about so many states a second of a dataset; by default to four a control period. What was held
-    out is judged at the same rate."""
+    """Rate of the fitted and held-out states of a dataset, approximately [Hz]; by default four per control
+    period."""
 
     population: Annotated[int | None, Range(2, 100_000)] = None
-    """Members of the search; by default 100, for methods of the paper 200."""
+    """Population size of the search; by default 100, for methods of the paper 200."""
 
     generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of the search."""
 
     refine: bool = True
-    """Follow the search by multiple shooting on prediction error."""
+    """After the search, refine by multiple shooting on the prediction error."""
 
     seed: Seed = 0
-    """Fixes everything random."""
+    """Seed of all random numbers."""
 
     threads: Threads = None
     """Simulation threads; by default all CPUs."""
@@ -131,13 +130,13 @@ class CalibrateSettings(Checked):
             raise ConfigurationError(f"--latency-range {low:g} {high:g}: give the lower one first")
 
     def check(self, data: Sequence[Source] = ()) -> None:
-        """Check what goes together before anything is read.
+        """Check the combination of settings before anything is read.
 
         Args:
             data: Recordings to fit that are not among the settings.
 
         Raises:
-            ConfigurationError: Something would have no effect, or lacks.
+            ConfigurationError: A setting would have no effect, or is missing.
             UnknownNameError: There is no such method.
         """
         check_source(dataset=self.dataset is not None, model=self.recordings.model is not None)
@@ -151,25 +150,25 @@ class CalibrateSettings(Checked):
                     given(self, CalibrateSettings(), ("space",)), "this robot has one set; use --parameters"
                 )
             foreign += ["--data"] if data and "--data" not in foreign else []
-            refuse(foreign, "a dataset says it; that goes with --model and --data")
+            refuse(foreign, "a dataset defines it; use that option with --model and --data")
         else:
             refuse(
                 given(self, CalibrateSettings(), OF_DATASETS),
                 "only datasets take that; with --model use --data and --parameters",
             )
         if self.latency is not None:
-            refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency says the latency")
+            refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency gives the latency")
         check_method(self.method)
         own = self.recordings.model is not None or carries_robot(self.dataset)
         check_policy(self.method, given=self.policy is not None, model=own)
 
     @property
     def budget(self) -> Budget:
-        """How much the method may use."""
+        """Budget of the method."""
         return usual_budget(self.method, self.population, self.generations, refine=self.refine)
 
     def known_std(self, robot: RobotModel) -> FloatArray | None:
-        """Return what a prediction may be off, positions then velocities, (2 C,); None for sensor noise.
+        """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
 
         Raises:
             ConfigurationError: A number is missing, or is not above 0.
@@ -180,7 +179,7 @@ class CalibrateSettings(Checked):
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What the result notes of the settings: plain JSON values."""
+        """The settings in the result's provenance: plain JSON values."""
         std = self.residual_std
         noted = {
             "seed": self.seed,
@@ -195,7 +194,7 @@ class CalibrateSettings(Checked):
 
     @property
     def overrides(self) -> SpaceOverrides:
-        """What is changed about the parameters."""
+        """Changes of the parameters."""
         return SpaceOverrides(
             free=self.free, known=dict(self.known), ranges=self.range, range_ratio=self.range_ratio
         )
@@ -205,7 +204,7 @@ def check_source(*, dataset: bool, model: bool) -> None:
     """Check that there is one source of recordings.
 
     Raises:
-        ConfigurationError: There is none, or two.
+        ConfigurationError: There is none, or there are two.
     """
     if dataset == model:
         how = "not both" if dataset else "one of the two"
@@ -223,13 +222,13 @@ def prepare(
     holdout: Sequence[Any] | None = None,
     say: Say = silent,
 ) -> CalibrationInputs:
-    """Read and check what is to be calibrated.
+    """Read and check the inputs of a calibration.
 
     Args:
-        settings: What was asked for.
+        settings: The settings.
         data: More recordings to fit, also from memory.
-        holdout: What only judges the result, also from memory; by default what the settings say.
-        say: Called with sentences on what was guessed and what looks odd.
+        holdout: Held-out recordings, also from memory; by default those of the settings.
+        say: Called with sentences on guesses and doubts.
 
     Raises:
         DealHwError: A setting or a recording is unusable.
@@ -250,7 +249,7 @@ def prepare(
     wrong = [str(one) for one in judges if not isinstance(one, int)]
     if settings.dataset is None or wrong:
         raise ConfigurationError(
-            f"--holdout {' '.join(wrong)}: of a dataset name episodes by number; files go with --model"
+            f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
             if wrong
             else "no dataset was named"
         )
@@ -275,16 +274,16 @@ def prepare(
 
 
 def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say = silent) -> str:
-    """Return the method, where none is named that which suits the recordings."""
+    """Return the named method, or the one that suits the recordings."""
     if settings.method != DEFAULT:
         return settings.method
-    told = settings.residual_std not in ((), None) or not settings.refine
+    fit_given = settings.residual_std not in ((), None) or not settings.refine
     real = settings.recordings.model is not None or carries_robot(settings.dataset)
-    method = method_for(work, told=told, real=real)
-    if work.walks and not told:
+    method = method_for(work, fit_given=fit_given, real=real)
+    if work.walks and not fit_given:
         say(WALK_TELLS)
     if method != DEFAULT:
-        say(f"method: {method} (--method eki to search and refine to the sensor noise)")
+        say(f"method: {method} (alternative: --method eki, which searches and refines to the sensor noise)")
     return method
 
 
@@ -299,7 +298,7 @@ def calibrate_inputs(
     resume: bool = False,
     keep: Path | None = None,
 ) -> CalibrationResult:
-    """Calibrate what was read, as the settings say; see :func:`calibrate_episodes`."""
+    """Calibrate from the inputs with the settings; see :func:`calibrate_episodes`."""
     return calibrate_episodes(
         work.robot,
         work.space,

@@ -1,4 +1,4 @@
-"""What a calibration makes of recordings of a robot that walks: their walking part, the robot's weight."""
+"""Recordings of a walking robot: their walking part, and the robot's weight."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from deal_hw.sim.recordings.episode import SampledEpisode
 
 GAIT_SMOOTHING_S = 0.04
-"""Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
+"""Landing feet change joint velocities within about 10 ms; longer smoothing biases the states there [s]."""
 WALK_TELLS = (
-    "a walk tells the gains of the joints and the floor's friction; it hardly tells their dry friction, not "
-    "their armature, and masses only where the motors' efforts weigh the robot"
+    "a walk shows the joints' gains and the floor's friction, but hardly their dry friction, not their "
+    "armature, and masses only if the motors' efforts weigh the robot"
 )
 WEIGHING_S = 0.35
-"""A robot that is about to walk has stood still for so long [s]."""
+"""Time that a robot stands still before it walks [s]."""
 
 
 def all_walk(robot: RobotModel, recordings: Iterable[Trajectory]) -> bool:
@@ -33,7 +33,7 @@ def all_walk(robot: RobotModel, recordings: Iterable[Trajectory]) -> bool:
 
 
 def while_walking(episode: SampledEpisode, trajectory: Trajectory) -> SampledEpisode:
-    """Return the episode without standing up and lying down where it is of a walk."""
+    """Return the episode; of a walk, without standing up and lying down."""
     wanted = wanted_velocity(trajectory)
     if wanted is None:
         return episode
@@ -44,10 +44,10 @@ def while_walking(episode: SampledEpisode, trajectory: Trajectory) -> SampledEpi
 
 
 def weighed(space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, say: Say) -> ParameterSpace:
-    """Return the space with the trunk's mass as the robot weighs itself, where that is searched.
+    """Return the space with the trunk's mass, if it is searched, as weighed by the motors' efforts.
 
-    No motion on feet tells masses and gains apart: all forces scale together. The motors' efforts do, in the
-    last moments before the robot walks.
+    No motion on feet can separate masses from gains, since all forces scale together. The motors' efforts
+    can, in the last moments before the robot walks.
     """
     from deal_hw.sim.legged.weighing import standing_mass
 
@@ -62,7 +62,7 @@ def weighed(space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, sa
     whole = standing_mass(robot, body.orientation[rows], trajectory.position[rows], trajectory.effort[rows])
     mass = whole - float(robot.model.body_mass.sum() - robot.model.body(trunk).mass[0])
     say(
-        f"{names[0]}: {mass:.2f} kg, by the motors' efforts while the robot stands (the whole robot "
-        f"{whole:.2f} kg); not fitted, --known {names[0]} KG gives another"
+        f"{names[0]}: {mass:.2f} kg, weighed by the motors' efforts while the robot stands (whole robot "
+        f"{whole:.2f} kg); it is not fitted; to set another mass: --known {names[0]} KG"
     )
     return space.with_known({names[0]: mass})

@@ -1,1 +1,1 @@
-"""What `deal-hw doctor` looks at."""
+"""The checks of `deal-hw doctor`."""

@@ -1,4 +1,4 @@
-"""What `deal-hw doctor` looks at on CAN: adapters, the bit rate, and what else is on the bus."""
+"""Checks of `deal-hw doctor` on CAN: adapters, bit rate, and other nodes on the bus."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deal_hw.errors import TransportTimeoutError
 from deal_hw.findings import Finding, Level
 
 _BUSY = 0.7
-"""Share of the bus from which on late frames are to be expected."""
+"""Bus load above which frames are expected to be late."""
 
 
 def list_adapters() -> Iterator[Finding]:
@@ -30,13 +30,13 @@ def list_adapters() -> Iterator[Finding]:
 
 
 def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
-    """Yield what is heard on a bus while nothing is sent.
+    """Yield findings from listening to a bus; nothing is sent.
 
     Args:
         transport: The bus without a filter, not opened.
-        clock: For the waiting.
+        clock: Clock for waiting.
         seconds: How long to listen [s].
-        nodes: Numbers that the robot is expected under.
+        nodes: Expected node numbers of the robot.
 
     Raises:
         TransportError: The adapter cannot be opened, or is lost.
@@ -60,8 +60,8 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
             "can",
             Level.WARN,
             f"{transport.port}: no frame within {seconds:g} s{rate}{trouble}",
-            "is the device powered, is it this bit rate, are CAN-H and CAN-L the right way round, is there a "
-            "resistor of 120 ohm at both ends?",
+            "check the device's power, this bit rate, CAN-H and CAN-L (not swapped), and the 120 ohm "
+            "resistors at both ends",
         )
         return
     share = bits / seconds / address.bitrate
@@ -74,14 +74,14 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
         "use a higher bit rate, or take other devices off the bus" if busy else "",
     )
     if foreign := sorted(set(frames) - set(nodes)):
-        told = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])
-        yield Finding("can", Level.NOTE, f"other nodes on the bus: {told}", "they are filtered out")
+        others = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])
+        yield Finding("can", Level.NOTE, f"other nodes on the bus: {others}", "they are filtered out")
     if missing := sorted(set(nodes) - set(frames)):
         heard = ", ".join(map(str, sorted(frames)))
         yield Finding(
             "can",
             Level.WARN,
-            f"nothing comes from node {', '.join(map(str, missing))}; heard: {heard}",
+            f"no frame from node {', '.join(map(str, missing))}; heard: {heard}",
             f"give the number in the port: {transport.port.partition('?')[0]}?node=NUMBER",
         )
     if transport.error_frames:
@@ -94,7 +94,7 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
 
 
 def _ip_details() -> dict[str, dict[str, Any]]:
-    """Return what ``ip`` tells of CAN interfaces; nothing where it is missing."""
+    """Return the output of ``ip`` on CAN interfaces; empty if ``ip`` is missing."""
     if shutil.which("ip") is None:
         return {}
     done = subprocess.run(
@@ -121,6 +121,6 @@ def _judge_link(name: str, details: dict[str, Any]) -> Finding:
         remedy = f"check wiring, termination and bit rate; ip link set {name} type can restart-ms 100"
         return Finding("can", Level.WARN, text, remedy)
     if details and not details.get("restart_ms"):
-        remedy = f"after bus-off it stays off: ip link set {name} type can restart-ms 100"
+        remedy = f"to restart it after a bus-off: ip link set {name} type can restart-ms 100"
         return Finding("can", Level.NOTE, text, remedy)
     return Finding("can", Level.OK, text)

@@ -1,4 +1,4 @@
-"""``deal_hw.doctor``: what is wrong with this computer, the link and the robot, and what to do about it."""
+"""``deal_hw.doctor``: check this computer, the connection and the robot, and advise what to do."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ class DoctorSettings(Checked):
     """The robot to listen to, such as go2."""
 
     port: str = ""
-    """Where it is: a network interface (dds), an endpoint (zenoh), a serial port or a CAN bus."""
+    """The robot's port: a network interface (dds), an end point (zenoh), a serial port or a CAN bus."""
 
     transport: str = ""
-    """How it is reached; by default the robot's usual way."""
+    """Transport to the robot, such as serial, can, dds or zenoh; by default the robot's usual one."""
 
     state_check: Literal["strict", "length"] = "strict"
-    """What the states of a Go2 must pass: strict, or length to leave head and checksum out."""
+    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
 
     simulator: Literal["none", "unitree_mujoco"] = "none"
-    """What stands in the place of a Go2, such as the simulator unitree_mujoco."""
+    """Simulator in place of a real Go2: unitree_mujoco."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
     """How long to listen to the robot [s]."""
 
     wire: WireOptions = field(default_factory=WireOptions)
-    """More about a network."""
+    """Network options."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +62,7 @@ class DoctorReport:
     """What was found.
 
     Attributes:
-        findings: All findings, in the order of the examination.
+        findings: All findings, in the order of the checks.
     """
 
     findings: tuple[Finding, ...]
@@ -73,16 +73,16 @@ class DoctorReport:
 
     @property
     def exit_code(self) -> int:
-        """For the shell: 0, or 1 where something does not work."""
+        """For the shell: 0, or 1 if a check failed."""
         return int(any(finding.level is Level.FAIL for finding in self.findings))
 
 
 @from_settings(DoctorSettings)
 def doctor(settings: DoctorSettings) -> DoctorReport:
-    """Find out what is wrong with this computer, the link and the robot; what ``deal-hw doctor`` does.
+    """Check this computer, the connection and the robot, as ``deal-hw doctor``.
 
-    The arguments are those of :class:`DoctorSettings`, which has a text under each: ``doctor("go2",
-    port="enp2s0")``; without a robot only this computer is examined. No command is sent to a motor.
+    :class:`DoctorSettings` describes the arguments: ``doctor("go2", port="enp2s0")``. Without a robot only
+    this computer is checked. No command is sent to a motor.
 
     Raises:
         UnknownNameError: There is no such robot.
@@ -92,7 +92,7 @@ def doctor(settings: DoctorSettings) -> DoctorReport:
 
 
 def examine(config: DoctorSettings) -> Iterator[Finding]:
-    """Yield what is found, as it is found; see :func:`doctor`."""
+    """Yield each finding at once; see :func:`doctor`."""
     from deal_hw.drivers.transports.can_transport import open_can
     from deal_hw.workflows.doctor.can import list_adapters, listen_to_bus
 
@@ -124,32 +124,32 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
 
 
 def _transport(config: DoctorSettings) -> str:
-    """Return how the robot is reached; "" without a robot.
+    """Return the name of the transport; "" without a robot.
 
     Raises:
-        ConfigurationError: An option would be ignored.
+        ConfigurationError: An option would have no effect.
     """
     default = DoctorSettings()
     if not config.robot:
         options = ("transport", "state_check", "simulator", "seconds", "wire")
-        refuse(given(config, default, options), "without a robot only this computer is examined")
+        refuse(given(config, default, options), "without a robot only this computer is checked")
         return ""
     name = config.transport or default_transport(config.robot)
     if name not in TOPIC_TRANSPORTS:
-        refuse(given(config, default, ("state_check", "simulator")), "only a Go2's states have that")
+        refuse(given(config, default, ("state_check", "simulator")), "only a Go2's states have such checks")
     elif config.simulator != "none":
         refuse(given(config, default, ("state_check",)), f"{config.simulator} has no checksums")
     return name
 
 
 def judge_interfaces(port: str) -> Iterator[Finding]:
-    """Yield this computer's network interfaces; the one of the port is to have a link."""
+    """Yield findings on this computer's network interfaces; that of the port must have a link."""
     from deal_hw.drivers.transports.interfaces import list_interfaces
 
     for interface in list_interfaces():
         level, remedy = Level.OK, ""
         if port in (interface.name, *interface.addresses) and not interface.carrier:
-            level, remedy = Level.FAIL, "is the cable in, and is the robot switched on?"
+            level, remedy = Level.FAIL, "check the cable, and that the robot is switched on"
         elif not interface.multicast and not interface.loopback and interface.up:
             level = Level.WARN
             remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
@@ -158,7 +158,7 @@ def judge_interfaces(port: str) -> Iterator[Finding]:
         ):
             level = Level.NOTE
             remedy = (
-                "deal-hw's own programs meet here; programs on the vendor's SDK find nothing until "
-                f"`ip link set {interface.name} multicast on`"
+                "deal-hw's own programs find each other; programs on the vendor's SDK need `ip link set "
+                f"{interface.name} multicast on`"
             )
         yield Finding("interfaces", level, str(interface), remedy)

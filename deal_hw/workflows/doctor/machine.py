@@ -1,4 +1,4 @@
-"""What `deal-hw doctor` looks at on this computer, without any robot."""
+"""Checks of `deal-hw doctor` on this computer, without a robot."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LEAST_RECEIVE_BYTES: Final = 200_000
 
 
 def examine_machine() -> Iterator[Finding]:
-    """Yield what was found."""
+    """Yield the findings."""
     yield _system()
     yield from _packages()
     yield _scheduling()
@@ -55,7 +55,7 @@ def _packages() -> Iterator[Finding]:
         if version := _version(name):
             yield Finding("packages", Level.OK, f"{name} {version}")
         elif extra:
-            hint = f"{install_line(extra)}, if this computer needs it"
+            hint = f"if this computer needs it: {install_line(extra)}"
             yield Finding("packages", Level.NOTE, f"{name} is not installed", hint)
         else:
             yield Finding("packages", Level.FAIL, f"{name} is not installed", install_line())
@@ -76,13 +76,13 @@ def _scheduling() -> Finding:
         "scheduling",
         Level.WARN,
         "SCHED_FIFO is refused: cycles will be late when the computer is busy",
-        f"a line `{_user()} - rtprio {FIFO_PRIORITY + 20}` in /etc/security/limits.conf and a new login, or "
-        "CAP_SYS_NICE for the Python interpreter",
+        f"write `{_user()} - rtprio {FIFO_PRIORITY + 20}` into /etc/security/limits.conf and log in again, "
+        "or give the Python interpreter CAP_SYS_NICE",
     )
 
 
 def _may_use_fifo() -> bool:
-    """Try it in a child process: this one keeps its scheduling."""
+    """Try it in a child process, so that this one keeps its scheduling."""
     child = os.fork()
     if child == 0:
         try:
@@ -101,7 +101,7 @@ def _memory() -> Finding:
         "memory",
         Level.WARN,
         f"only {soft >> 20} MiB of memory can be locked: a page fault may delay a cycle",
-        f"a line `{_user()} - memlock unlimited` in /etc/security/limits.conf and a new login",
+        f"write `{_user()} - memlock unlimited` into /etc/security/limits.conf and log in again",
     )
 
 
@@ -110,7 +110,9 @@ def _clock() -> Iterator[Finding]:
     source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown"
     text = f"the monotonic clock has {resolution_s * 1e9:.0f} ns resolution, source {source}"
     if resolution_s > _COARSE_S or source in ("jiffies", "acpi_pm"):
-        yield Finding("clock", Level.WARN, text, "stamps will be coarse; choose the clock source tsc or hpet")
+        yield Finding(
+            "clock", Level.WARN, text, "time stamps will be coarse; choose the clock source tsc or hpet"
+        )
     else:
         yield Finding("clock", Level.OK, text)
     governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
@@ -119,7 +121,7 @@ def _clock() -> Iterator[Finding]:
             "clock",
             Level.NOTE,
             f"the processor's frequency governor is {governor}",
-            "`cpupower frequency-set -g performance` wakes it up faster",
+            "for faster wake-ups: `cpupower frequency-set -g performance`",
         )
 
 

@@ -1,4 +1,4 @@
-"""What `deal-hw doctor` looks at on a robot that is no Go2: who it is, its states, the link's errors."""
+"""Checks of `deal-hw doctor` on a robot other than the Go2: identity, states, transport errors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from deal_hw.findings import Finding, Level
 from deal_hw.robot import Robot
 
 _FEW_ERRORS = 0.01
-"""Share of corrupt and missing states that a link may have."""
+"""Accepted share of corrupt and missing states."""
 _SLOW = 0.9
 _PATIENCE_S = 1.0
 
 
 def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iterator[Finding]:
-    """Yield what a robot tells while nothing is asked of its motors; connecting may switch them off.
+    """Yield findings on a robot without motor commands; connecting may switch the motors off.
 
     Args:
         name: The robot's name.
@@ -30,10 +30,10 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
         seconds: How long to listen [s].
 
     Raises:
-        DealHwError: It cannot be reached, or is another device.
+        DealHwError: It cannot be reached, or it is another device.
     """
     with robot:
-        yield Finding("link", Level.OK, f"{name} answers{_told(getattr(robot, 'info', None))}")
+        yield Finding("link", Level.OK, f"{name} answers{_info_text(getattr(robot, 'info', None))}")
         errors = robot.transport_errors
         host_ns: list[int] = []
         device_ns: list[int] = []
@@ -42,7 +42,7 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
             try:
                 state = robot.read_state(min(_PATIENCE_S, seconds))
             except TransportTimeoutError as error:
-                yield Finding("states", Level.FAIL, str(error), "is the device powered, is the cable good?")
+                yield Finding("states", Level.FAIL, str(error), "check the device's power and the cable")
                 return
             host_ns.append(state.receive_ns)
             device_ns.append(state.device_ns)
@@ -54,7 +54,7 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
         "states",
         Level.WARN if slow else Level.OK,
         f"{rate_hz:.0f} states a second of {wanted_hz:.0f}",
-        "another cable or a less busy computer" if slow else "",
+        "try another cable or a less busy computer" if slow else "",
     )
     share = errors / (errors + len(host_ns))
     bad = share > _FEW_ERRORS
@@ -67,8 +67,8 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
     yield judge_clock(np.array(host_ns), np.array(device_ns))
 
 
-def _told(info: Any) -> str:
-    """Return what a robot said of itself, where that is a dataclass, in words."""
+def _info_text(info: Any) -> str:
+    """Return a robot's own information as text, if it is a dataclass."""
     if not dataclasses.is_dataclass(info) or isinstance(info, type):
         return ""
     words = (f"{name.replace('_', ' ')} {value}" for name, value in dataclasses.asdict(info).items())

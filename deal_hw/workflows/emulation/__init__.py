@@ -1,1 +1,1 @@
-"""Emulated robots: on a wire in a process of their own, and in virtual time."""
+"""Emulated robots: on a wire in their own process, and in virtual time."""

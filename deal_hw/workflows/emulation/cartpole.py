@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 class CartpoleOnAWire(Protocol):
-    """What the verb needs of an emulated cart-pole, whatever its wire."""
+    """Interface of an emulated cart-pole on any wire."""
 
     slips: int
     dropped: int
     changes: list[tuple[int, int, str]]
 
     def open(self) -> str:
-        """Make the port; return what a host gives as ``--port``."""
+        """Make the port; return the value of a host's ``--port``."""
         ...
 
     def close(self) -> None:
@@ -45,29 +45,29 @@ class CartpoleOnAWire(Protocol):
         ...
 
     def step(self) -> bool:
-        """Run until the next tick; return whether there is still a port."""
+        """Run until the next tick; return whether the port still exists."""
         ...
 
     def cut(self) -> None:
-        """Cut the wire from now on, for as long as the hazards say."""
+        """Cut the wire from now on, for the time in the hazards."""
         ...
 
     def report(self) -> dict[str, Any]:
-        """Return what happened, as plain JSON values."""
+        """Return the events, as plain JSON values."""
         ...
 
 
 def emulate_cartpole(
     config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
 ) -> None:
-    """Run the emulator until it is stopped, the time given, or until its port vanished.
+    """Run the emulator until a stop, the given time or the end of its port.
 
     Args:
         config: What to emulate.
         stop: Ends it.
         cut: Cuts the wire.
-        announce: Called with the port first, and with what was revealed at the end.
-        say: Called with what happened at the end.
+        announce: Called with the port first, and with the truth at the end.
+        say: Called with a summary at the end.
     """
     module, _, function = CARTPOLE_EMULATORS[config.transport or "serial"].partition(":")
     try:

@@ -1,4 +1,4 @@
-"""What every emulator's command needs: a way to end, priority over other processes, the truth at the end."""
+"""Common parts of all emulators: signals, real-time priority, and the truth at the end."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from deal_hw.workflows.say import Say
 T = TypeVar("T")
 _PARENT_CHECK_STEPS = 100
 _FIFO_PRIORITY = 40
-"""Below that of a control process: the host must not wait for the emulator."""
+"""Below the priority of a control process, since the host must not wait for the emulator."""
 
 
 @contextlib.contextmanager
 def signalled() -> Iterator[tuple[threading.Event, threading.Event]]:
-    """Yield an event that SIGINT and SIGTERM set, and one that SIGUSR1 sets: the wire is to be cut now.
+    """Yield two events: SIGINT and SIGTERM set the first one (stop), SIGUSR1 the second one (cut the wire).
 
-    A Python program that emulates has its own handlers back afterwards.
+    Afterwards the program's own handlers are restored.
     """
     stop, cut = threading.Event(), threading.Event()
     before = {}
@@ -46,13 +46,13 @@ def signalled() -> Iterator[tuple[threading.Event, threading.Event]]:
 
 @contextlib.contextmanager
 def happenings(path: File | None, *logs: Sequence[tuple[int, int, str]]) -> Iterator[Callable[[], None]]:
-    """Yield a function that appends to a file what is new in the logs, one line of JSON an entry.
+    """Yield a function that appends new log entries to a file, one line of JSON each.
 
-    A program that tests a robot's commander reads there what the robot was told, while it happens.
+    A test program of a robot's commander reads there which commands arrive, while they arrive.
 
     Args:
         path: The file; None for none.
-        logs: Entries of device time [ms], host time [ns] and what happened; they grow.
+        logs: Growing lists of entries: device time [ms], host time [ns] and the event.
     """
     if path is None:
         yield lambda: None
@@ -71,7 +71,7 @@ def happenings(path: File | None, *logs: Sequence[tuple[int, int, str]]) -> Iter
 
 
 def realtime_priority() -> AbstractContextManager[None]:
-    """Run ahead of ordinary processes where permitted: a real robot does not share the host's processor."""
+    """Use real-time priority where permitted, since a real robot does not share the host's processor."""
     return priority(_FIFO_PRIORITY, children=True)
 
 
@@ -97,14 +97,14 @@ def choose_truth(
     parse: Callable[[Mapping[str, Any]], T],
     range_ratio: float,
 ) -> T:
-    """Return what an emulated robot hides: the nominal values, those of a file, or drawn ones.
+    """Return an emulated robot's hidden truth: the nominal values, those of a file, or drawn ones.
 
     Args:
-        config: Says which.
+        config: Chooses among them.
         nominal: Returns the nominal truth of a profile and a seed.
         draw: Returns a truth of a profile, a seed and a range ratio.
         parse: Makes a truth of a file's values.
-        range_ratio: The ratio where the settings name none.
+        range_ratio: The ratio if the settings have none.
 
     Raises:
         ConfigurationError: The file holds no truth, or none can be drawn.
@@ -119,14 +119,14 @@ def choose_truth(
 
 
 def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
-    """Return what ``reveal`` wrote.
+    """Return the truth that ``reveal`` wrote.
 
     Args:
         path: The file.
-        parse: Makes the truth of its values.
+        parse: Makes the truth from its values.
 
     Raises:
-        ConfigurationError: The file is not there, or holds no truth.
+        ConfigurationError: The file is missing, or contains no truth.
     """
     what, advice = "an emulator's truth", "--reveal-to writes one"
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
@@ -135,7 +135,7 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
 
 
 def reveal(values: Mapping[str, Any], announce: Say, path: File | None) -> None:
-    """Tell the truth as one line of JSON; write it to a file, too, where one is given."""
+    """Announce the truth as one line of JSON; also write it to a file, if one is given."""
     text = json.dumps(values)
     announce(text)
     if path is not None:

@@ -56,14 +56,14 @@ def make_transport(name: str, port: str, options: WireOptions) -> TopicTransport
 def emulate_go2(
     config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
 ) -> None:
-    """Run the emulator until it is stopped or the time given.
+    """Run the emulator until a stop or the given time.
 
     Args:
         config: What to emulate.
         stop: Ends it.
         cut: Cuts the wire.
-        announce: Called with the port first, and with what was revealed at the end.
-        say: Called with what happened at the end.
+        announce: Called with the port first, and with the truth at the end.
+        say: Called with a summary at the end.
     """
     try:
         from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
@@ -78,7 +78,7 @@ def emulate_go2(
     emulator = Go2Emulator(device, make_transport(transport, port, config.go2.wire(transport)))
     gc.collect()
     gc.freeze()
-    # The transport's threads inherit the priority that holds when it is opened.
+    # Threads of the transport inherit the priority of the moment when it is opened.
     with realtime_priority():
         try:
             emulator.open()
@@ -111,7 +111,7 @@ def emulate_go2(
 
 @contextlib.contextmanager
 def tracking(path: Path | None, device: Go2Device, tick_start_ms: int) -> Iterator[Callable[[], None]]:
-    """Yield a function that appends to a file where the robot's base is, every so often.
+    """Yield a function that appends the base's position to a file, at a fixed rate.
 
     Args:
         path: The file; None for none.
@@ -137,22 +137,22 @@ def tracking(path: Path | None, device: Go2Device, tick_start_ms: int) -> Iterat
 
 
 def read_track(path: Path) -> Track:
-    """Return what :func:`tracking` wrote, on the robot's clock.
+    """Return the track that :func:`tracking` wrote, on the robot's clock.
 
     Raises:
-        ConfigurationError: The file holds something else.
+        ConfigurationError: The file contains something else.
     """
     with reading(path, "an emulated base's track", "--track-to writes one", error=ConfigurationError):
         head, *lines = path.read_text(encoding="utf-8").splitlines()
         if head != ",".join(TRACK_COLUMNS):
             raise ConfigurationError(f"the first line is {shown(head)}, expected {','.join(TRACK_COLUMNS)}")
-        # The emulator may be writing the last one.
+        # The emulator may still be writing the last line.
         rows = np.array([[float(part) for part in line.split(",")] for line in lines[:-1]])
         return Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
 
 
 def summary(report: dict[str, Any]) -> list[str]:
-    """Return what happened, in words."""
+    """Return a summary of the run as text."""
     commands = report["commands"]
     lines = [
         f"emulator: {report['device_ms'] / 1e3:.1f} s, {report['sent']['rt/lowstate']} states sent, "

@@ -1,4 +1,4 @@
-"""Starts a verb that serves as a process of its own, for programs that need a robot on a port."""
+"""Starts a verb that serves a port in its own process, for programs that need a robot."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ START_TIMEOUT_S = 60.0
 class VerbProcess:
     """A running verb that prints ``port PORT`` first; a context manager.
 
-    It ends when this process ends, however that happens.
+    It ends when this process ends, in any way.
 
     Args:
         verb: The verb.
         arguments: Its options, as on the command line.
-        what: What messages call it; by default after the verb.
-        prefix: A command to run it under, such as ``ip netns exec NAME``.
+        what: Its name in messages; by default from the verb.
+        prefix: A command under which it runs, such as ``ip netns exec NAME``.
     """
 
     def __init__(self, verb: str, *arguments: str, what: str = "", prefix: Sequence[str] = ()) -> None:
@@ -51,10 +51,9 @@ class VerbProcess:
         """Start it and return its port.
 
         Raises:
-            TransportError: It did not come up; the message holds what it said.
+            TransportError: It did not start; the message contains its output.
         """
-        # A session of its own: Ctrl-C in the terminal is the host's to handle, and the host needs the robot
-        # for that.
+        # In its own session: the host handles Ctrl-C in the terminal and needs the robot for that.
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, bufsize=0
         )
@@ -65,12 +64,14 @@ class VerbProcess:
         word, _, port = line.strip().partition(" ")
         if word != "port" or not port:
             _, errors = self.stop()
-            raise TransportError(f"{self._what} did not start: {errors.strip()[-2000:] or 'it said nothing'}")
+            raise TransportError(
+                f"{self._what} did not start: {errors.strip()[-2000:] or 'without a message'}"
+            )
         self.port = port
         return port
 
     def stop(self, timeout_s: float = 10.0) -> tuple[str, str]:
-        """Stop it; return what it printed since its first line, and its messages."""
+        """Stop it; return its output after the first line, and its messages."""
         process, self._process = self._process, None
         if process is None:
             return "", ""
@@ -101,7 +102,7 @@ class VerbProcess:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop it; where it had ended by itself, that is why the robot could not be reached any more.
+        """Stop it. If it had ended by itself, this explains why the robot became unreachable.
 
         Raises:
             TransportError: It had ended, and the block ended in an error of a transport.
@@ -110,8 +111,8 @@ class VerbProcess:
         _, errors = self.stop()
         if status is not None and isinstance(error, TransportError):
             raise TransportError(
-                f"{self._what} ended by itself with status {status}, and its port with it; its last words: "
-                f"{errors.strip()[-500:] or 'none'}"
+                f"{self._what} ended by itself with status {status}, so its port is gone; its last "
+                f"messages: {errors.strip()[-500:] or 'none'}"
             ) from error
 
 
@@ -128,10 +129,10 @@ class EmulatorProcess(VerbProcess):
 
 
 def arguments(settings: Any, default: Any) -> list[str]:
-    """Return the command-line options that say what differs from a verb's usual settings.
+    """Return the command-line options for the settings that differ from a verb's defaults.
 
     Args:
-        settings: A settings dataclass, perhaps with others in it.
+        settings: A settings dataclass, possibly nested.
         default: The same without options.
     """
     words: list[str] = []

@@ -25,7 +25,7 @@ from deal_hw.workflows.options import (
 
 GO2 = Only(("go2",))
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
-"""Transports of the Go2, and where its emulator is by default: on this machine alone."""
+"""Transports of the Go2, and the emulator's default port on each: reachable on this machine only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,50 +33,51 @@ class Go2Options:
     """Options of ``emulate go2`` alone."""
 
     on_stand: bool = False
-    """The base is held in the air: no floor, no contact."""
+    """Hold the base in the air: no floor, no contact."""
 
     start: Literal["lying", "standing"] = "lying"
-    """Limp on the floor, or standing with sport mode in control."""
+    """lying: limp on the floor; standing: sport mode in control."""
 
     sport: Literal["normal", "ai", "advanced", "mcf", "off"] = "normal"
-    """The sport mode that is active at power-up; it fights every other command until it is released."""
+    """The sport mode at power-up. It overrides other commands until it is released."""
 
     sport_silent: bool = False
-    """Sport mode's own commands are not seen on rt/lowcmd."""
+    """Hide sport mode's own commands on rt/lowcmd."""
 
     remote_script: Path | None = None
-    """JSON file with what the remote says from when on: [{"at_s": 2.0, "buttons": "L2+B", "left_y": 0.5}]"""
+    """JSON file with the remote's states and their start times: [{"at_s": 2.0, "buttons": "L2+B", "left_y":
+    0.5}]"""
 
     no_remote: bool = False
-    """No remote is heard: its 40 bytes are zeros."""
+    """Emulate no remote: its 40 bytes are zeros."""
 
     tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
     """The robot's clock at the start [ms]; it wraps at 2**32."""
 
     track_to: Path | None = None
-    """Write to this CSV file where the base really is, 100 times a second: time_s (the robot's clock), x, y
-    [m], heading [rad]."""
+    """Write the true position of the base to this CSV file, at 100 Hz: time_s (the robot's clock), x, y [m],
+    heading [rad]."""
 
     domain: Annotated[int, Range(0, 232)] = 0
     """DDS domain."""
 
     mode: Literal["peer", "client"] = "peer"
-    """Zenoh: wait for peers at the port, or be a client of the router there."""
+    """Zenoh: peer waits for peers at the port, client connects to the router there."""
 
     insecure: bool = False
     """Zenoh: allow plain TCP beyond this machine."""
 
     ca: Path | None = None
-    """Zenoh over TLS: the authority that peers are checked against (PEM)."""
+    """Zenoh over TLS: the authority that signed the peers' certificates (PEM)."""
 
     certificate: Path | None = None
-    """Zenoh over TLS: our certificate (PEM)."""
+    """Zenoh over TLS: this side's certificate (PEM)."""
 
     key: Path | None = None
     """Zenoh over TLS: its private key (PEM)."""
 
     faults: Go2Faults = field(default_factory=Go2Faults)
-    """Faults of the Go2, which begin so long after the first stiff command."""
+    """Faults of the Go2. Their times count from the first stiff command."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -96,31 +97,31 @@ class Go2Options:
 
 @dataclass(frozen=True, kw_only=True)
 class CanOptions:
-    """An emulated CAN bus and what goes wrong on it, so long after the motor was first armed."""
+    """An emulated CAN bus and its faults, whose times count from the first arming of the motor."""
 
     node: Annotated[int, Range(1, 62)] = 1
     """CAN: number of the device on the bus."""
 
     bitrate: Literal[125000, 250000, 500000, 800000, 1000000] = 500000
-    """CAN: bit rate of the bus; a host that sets another one hears nothing."""
+    """CAN: bit rate of the bus; a host with another rate receives nothing."""
 
     bus_off_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """CAN: the adapter's controller goes bus-off [s]."""
+    """CAN: the adapter's controller goes bus-off after this time [s]."""
 
     bus_off_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
-    """CAN: for how long opening the bus again does not help [s]."""
+    """CAN: how long the bus stays off, even if it is opened again [s]."""
 
     tx_full_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """CAN: the adapter's transmit buffer is full [s]."""
+    """CAN: the adapter's transmit buffer is full after this time [s]."""
 
     tx_full_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
-    """CAN: for how long [s]."""
+    """CAN: how long the transmit buffer is full [s]."""
 
     lost_node_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """CAN: the device's wire to the bus breaks [s]; the adapter stays."""
+    """CAN: the device's wire to the bus breaks after this time [s]; the adapter stays."""
 
     no_acknowledge: bool = False
-    """CAN: nobody else is on the bus."""
+    """CAN: no node acknowledges the host's frames."""
 
     duplicate_node: bool = False
     """CAN: a second device has the same number."""
@@ -134,10 +135,10 @@ class CanOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoOptions:
-    """Emulated Dynamixel servos and what goes wrong with them, so long after the motor was first armed."""
+    """Emulated Dynamixel servos and their faults, whose times count from the first arming of the motor."""
 
     servo_baud_rate: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 1000000
-    """Dynamixel: baud rate of both servos; they do not hear a port of another one."""
+    """Dynamixel: baud rate of both servos; a port with another rate does not reach them."""
 
     servo_duplicate_id: bool = False
     """Dynamixel: both servos have id 1."""
@@ -149,13 +150,13 @@ class ServoOptions:
     """Dynamixel: protocol of the pole servo."""
 
     servo_reboot_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """Dynamixel: the belt servo restarts [s]."""
+    """Dynamixel: the belt servo restarts after this time [s]."""
 
     servo_overload_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """Dynamixel: the belt servo switches itself off for overload [s]."""
+    """Dynamixel: the belt servo switches itself off by overload after this time [s]."""
 
     servo_absent_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """Dynamixel: the pole servo falls silent for good [s]."""
+    """Dynamixel: the pole servo stops answering after this time [s]."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -172,7 +173,7 @@ CARTPOLE_EMULATORS = {
 ON_CAN = ("can", "odrive")
 """Wires of the cart-pole with a CAN bus."""
 TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
-"""Robots to emulate and the wires that each speaks on; the first is the default."""
+"""Robots to emulate and their wires; the first wire is the default."""
 CARTPOLE_RANGE_RATIO = 5.0
 
 
@@ -184,22 +185,23 @@ class EmulateSettings:
     """The robot to emulate."""
 
     transport: str | None = None
-    """The wire to speak on. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a
-    pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
+    """The wire. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a pseudo-terminal.
+    Go2: "dds" (the default) or "zenoh"."""
 
     port: Annotated[str | None, GO2] = None
-    """Go2: network interface or its address (dds), or end point to listen at (zenoh; number 0: a free
-    one). By default on this machine alone."""
+    """Go2: network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one).
+    By default reachable on this machine only."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
     Stribeck friction and dropped frames, backlash (cart-pole), encoder bias and torque-speed limit (Go2)."""
 
     seed: Seed = 0
-    """Decides the hidden parameters, the noise and the start angles."""
+    """Seed of the hidden parameters, the noise and the start angles."""
 
     range_ratio: Annotated[float | None, Ratio] = None
-    """Hidden parameters lie within this ratio of the nominal ones; 5 for the cart-pole, 2 for the Go2."""
+    """Hidden parameters lie within this factor of the nominal ones; by default 5 for the cart-pole, 2 for the
+    Go2."""
 
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
@@ -215,45 +217,46 @@ class EmulateSettings:
     """Make a symbolic link to the port here."""
 
     reveal: bool = False
-    """Print the truth and what happened as one line of JSON at the end."""
+    """At the end print the truth and the events as one line of JSON."""
 
     reveal_to: File | None = None
-    """Write the same to this JSON file at the end."""
+    """At the end write the truth and the events to this JSON file."""
 
     duration_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """Stop after this time [s]; without it, at Ctrl-C."""
 
     corrupt: Share = 0.0
-    """Share of frames from the device in which a byte is changed."""
+    """Share of the device's frames with one changed byte."""
 
     drop: Share = 0.0
-    """Share of frames from the device that are lost."""
+    """Share of the device's frames that are lost."""
 
     duplicate: Share = 0.0
-    """Share of frames from the device that come twice."""
+    """Share of the device's frames that arrive twice."""
 
     freeze_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """The firmware hangs this long after the motor was first armed, or commanded [s]."""
+    """The firmware hangs this long after the first arming or command of the motor [s]."""
 
     cut_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """The wire is cut this long after the motor was first armed, or commanded [s]: nothing goes out and
-    nothing is heard. The signal SIGUSR1 cuts it at any moment."""
+    """The wire is cut this long after the first arming or command of the motor [s]; nothing passes in either
+    direction. The signal SIGUSR1 cuts it at any moment."""
 
     cut_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
     """How long the wire is cut [s]."""
 
     vanish_after_s: Annotated[float | None, Range(0, 1e7, "s"), CARTPOLE] = None
-    """The port vanishes this long after the motor was first armed, like a cable that is pulled [s]."""
+    """The port vanishes this long after the first arming of the motor, as when its cable is pulled [s]."""
 
     return_after_s: Annotated[float | None, Range(0, 1e7, "s"), CARTPOLE] = None
-    """The port comes back under --link so long after it vanished [s]; without it the emulator ends there."""
+    """The port comes back under --link this long after it vanished [s]; by default the emulator ends when the
+    port vanishes."""
 
     events_to: File | None = None
-    """Append to this file what the robot is told, while it happens: lines of JSON with device time [ms], host
-    time [ns] and what it was."""
+    """Append each received command to this file at once: lines of JSON with device time [ms], host time [ns]
+    and the command."""
 
     parent: Annotated[int | None, Range(1, 2**22)] = None
-    """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
+    """Stop when the process with this id is no longer the parent. For programs that start an emulator."""
 
     can: Annotated[CanOptions, CARTPOLE] = field(default_factory=CanOptions)
     """The CAN bus of a cart-pole."""
@@ -277,7 +280,7 @@ class EmulateSettings:
         if wire != "dynamixel":
             refuse(given(self.servo, ServoOptions()), "only `--transport dynamixel` has servos")
         if wire != "serial":
-            refuse(given(self, EmulateSettings, ["firmware"]), "only `--transport serial` runs that firmware")
+            refuse(given(self, EmulateSettings, ["firmware"]), "only `--transport serial` has this firmware")
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
         if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):

@@ -34,12 +34,12 @@ _START_NS = 10**9
 
 @dataclass(frozen=True, slots=True)
 class VirtualEpisode:
-    """One recording of an emulated robot, with what really happened.
+    """One recording of an emulated robot, with the true states.
 
     Attributes:
         trajectory: The recording, as read back from its file.
         first_tick: Device tick of the recording's first sample.
-        true: What really happened since the robot was made.
+        true: True states since the robot was made.
         report: How the run went.
     """
 
@@ -56,7 +56,7 @@ class VirtualEpisode:
 
 
 class VirtualCartpole:
-    """An emulated cart-pole in virtual time; each run homes it, arms it and leaves it passive.
+    """An emulated cart-pole in virtual time. Each run homes and arms it, and makes it passive at the end.
 
     Args:
         truth: Its hidden parameters, profile and seed.
@@ -83,7 +83,7 @@ class VirtualCartpole:
         """Run a behaviour and record it.
 
         Args:
-            behaviour: What to do.
+            behaviour: The behaviour.
             seconds: Length of the run [s].
             path: File to write; a temporary one by default.
             metadata: For the recording.
@@ -109,11 +109,11 @@ class VirtualCartpole:
 def demonstrate(
     virtual: VirtualCartpole, plan: RunPlan, attempts: int = ATTEMPTS
 ) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
-    """Record the motion `rich`, again and stronger or gentler until it is whole and moves.
+    """Record the motion `rich`; repeat it stronger or gentler until it finishes and moves enough.
 
     Args:
         virtual: The robot.
-        plan: The run; how strong it starts is its ``excitation_level``.
+        plan: The run, with the ``excitation_level`` of the first recording.
         attempts: Most recordings.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The emulated Go2 in virtual time: same bytes, driver, loop and recorder, and where it really was."""
+"""The emulated Go2 in virtual time: same bytes, driver, loop and recorder, with its true positions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _START_NS = 10**9
 
 
 class _Watched:
-    """The emulated robot, with a note of where its base is at each tick."""
+    """The emulated robot, with its base's position at each tick."""
 
     def __init__(self, device: Go2Device) -> None:
         self._device = device
@@ -62,9 +62,9 @@ class VirtualWalk:
 
     Attributes:
         report: How the run went.
-        trajectory: The recording, as read back from its file; None where nothing was recorded.
-        wanted: What was wanted, on the robot's clock; None where the policy never began.
-        track: Where the base really was, on the robot's clock.
+        trajectory: The recording, as read back from its file; None without a recording.
+        wanted: The requested velocities, on the robot's clock; None if the policy never began.
+        track: True positions of the base, on the robot's clock.
     """
 
     report: LoopReport
@@ -83,16 +83,16 @@ def walk(
     *,
     record: bool = True,
 ) -> VirtualWalk:
-    """Let a new robot stand up, walk and lie down.
+    """Make a new robot stand up, walk and lie down.
 
     Args:
         truth: Its hidden parameters, profile and seed.
-        policy: What walks.
-        source: What it is told.
-        seconds: For how long it walks [s].
+        policy: The walking policy.
+        source: Source of the requested velocity.
+        seconds: Duration of the walk [s].
         path: File to write; a temporary one by default.
         metadata: For the recording.
-        record: Whether to record at all; it takes a third of the time.
+        record: Whether to record; recording takes a third of the time.
     """
     clock = VirtualClock(_START_NS)
     watched = _Watched(Go2Device(truth))

@@ -1,4 +1,4 @@
-"""What demo and bench let a Go2 walk: velocities over time, and the file that ``--velocity`` reads."""
+"""Requested velocities of the Go2 over time, for demo and bench, and their file for ``--velocity``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PROFILE: Final = (
     (7.0, (0.0, 0.5, 0.0)),
     (12.0, (0.0, 0.0, 1.0)),
 )
-"""What every policy walks: time [s], velocity ahead and to the left [m/s], turn [rad/s]."""
+"""The walk of every policy: time [s], velocity ahead and to the left [m/s], turn [rad/s]."""
 PROFILE_S: Final = 17.0
 HELDOUT: Final = (
     (0.0, (0.0, 0.0, 0.0)),
@@ -20,7 +20,7 @@ HELDOUT: Final = (
     (4.0, (0.3, 0.0, 0.3)),
     (6.0, (0.0, -0.2, 0.0)),
 )
-"""Velocities that only judge the calibration. They are gentle: with faster ones every second robot falls."""
+"""The held-out walk, for testing the calibration. It is gentle: otherwise every second robot falls."""
 HELDOUT_S: Final = 8.0
 
 

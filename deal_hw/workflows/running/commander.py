@@ -1,4 +1,4 @@
-"""Being the one commander of a robot: the claim, the connection that is kept, and Ctrl-Z."""
+"""Being a robot's only commander: the claim, the open connection, and Ctrl-Z."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from deal_hw.workflows.say import Say
 
 HOLDS_LAST_COMMAND = (
     "note: {robot} holds its last command for ever. deal-hw damps it when a run ends, when one of its two "
-    "processes dies, and when a lost link comes back. Where both are killed (out of memory, kill -9, power) "
-    "or the link stays away, only a bridge on the robot's side (deal-hw bridge), its own remote or its power "
-    "switch can: keep the remote in your hand"
+    "processes dies, and when a lost connection comes back. If both processes are killed (out of memory, "
+    "kill -9, power) or the connection stays lost, only a bridge on the robot's side (deal-hw bridge), "
+    "its own remote or its power switch can stop it: keep the remote in your hand"
 )
 
 
@@ -30,10 +30,10 @@ HOLDS_LAST_COMMAND = (
 def claimed(plan: RunPlan) -> Iterator[tuple[int, ...]]:
     """Hold the exclusive claim on the robot, on this computer and on its wire.
 
-    Yields the descriptors that the control process keeps open, too. Who sends nothing claims nothing.
+    Yields the descriptors that the control process also keeps open. A run that sends nothing needs no claim.
 
     Raises:
-        PortBusyError: Somebody else commands the robot, or is about to.
+        PortBusyError: Another program commands the robot, or is about to.
     """
     if plan.dry_run:
         yield ()
@@ -49,14 +49,14 @@ def claimed(plan: RunPlan) -> Iterator[tuple[int, ...]]:
 
 
 def _who() -> str:
-    """Return who commands, for others to read."""
+    """Return a description of this commander for other programs."""
     words = [Path(sys.argv[0]).name, *sys.argv[1:2]]
     return f"{' '.join(words)[:60]} (process {os.getpid()} on {socket.gethostname()})"
 
 
 @contextlib.contextmanager
 def connected(robot: Robot) -> Iterator[None]:
-    """Keep the robot connected; the transport's threads run ahead of ordinary processes."""
+    """Keep the robot connected; the transport's threads get real-time priority."""
     with priority(TRANSPORT_PRIORITY, children=True):
         robot.connect()
     try:
@@ -66,10 +66,10 @@ def connected(robot: Robot) -> Iterator[None]:
 
 
 def suspend(say: Say) -> None:
-    """Stop this process, as Ctrl-Z asked for; say what happened once it goes on."""
+    """Stop this process after Ctrl-Z; print a note when it continues."""
     say("the robot is passive and the run is over; stopped (Ctrl-Z)")
     os.kill(os.getpid(), signal.SIGSTOP)
     say(
-        "deal-hw goes on after Ctrl-Z. The robot was made passive before, and the run does not go on: start "
-        "it again"
+        "deal-hw continues after Ctrl-Z. The robot was made passive before, and the run has ended: start it "
+        "again"
     )

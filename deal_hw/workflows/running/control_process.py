@@ -1,8 +1,8 @@
-"""The control process: the one place where robot, behaviour, safety and loop come together in real time.
+"""The control process, which runs robot, behaviour, safety filter and loop in real time.
 
-Started by the supervisor as ``python -m deal_hw.workflows.running.control_process`` with its orders as JSON
-on standard input and with the open port, the recorder's socket and the status socket as inherited
-descriptors. It writes neither to disk nor to the terminal, and imports neither torch, mujoco nor scipy.
+The supervisor starts it as ``python -m deal_hw.workflows.running.control_process``. Its orders come as JSON
+on standard input. The open port, the recorder's socket and the status socket are inherited descriptors. It
+writes neither to disk nor to the terminal, and imports neither torch, mujoco nor scipy.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 
 _START_SILENCE_S = 30.0
 _ORPHAN_S = 5.0
-"""What an orphan may take beyond the time for which it repeats the passive command [s]."""
+"""Time an orphaned control process may take beyond that of repeating the passive command [s]."""
 _SUPERVISOR_SILENT = signal.SIGUSR2
-"""Sent by the vigil's thread to the main one, which may be waiting for the robot."""
+"""Sent by the vigil's thread to the main thread, which may be waiting for the robot."""
 
 
 class _Stopper:
-    """Turns signals into a stop: an exit before there is a loop, its passive route afterwards."""
+    """Turns signals into a stop: an exit before the loop exists, the loop's passive route afterwards."""
 
     def __init__(self, parent_pid: int) -> None:
         self._parent_pid = parent_pid
@@ -47,13 +47,13 @@ class _Stopper:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         reason = "stopped by the operator"
         if number == PARENT_DIED or os.getppid() != self._parent_pid:
-            # Nobody is left to kill this process if its passive route hangs.
+            # No supervisor is left to kill this process if its passive route hangs.
             kill_self_after(self.passive_s + _ORPHAN_S)
             reason = "the supervisor died"
         elif number == _SUPERVISOR_SILENT:
             reason = (
-                f"the supervisor gave no sign of life for {SUPERVISOR_SILENCE_S:g} s: it is stopped, swapped "
-                "out or held up, and could not act for the operator"
+                f"no heartbeat from the supervisor for {SUPERVISOR_SILENCE_S:g} s: it is stopped, swapped "
+                "out or blocked, so the operator cannot stop the run"
             )
         if self.loop is None:
             raise KeyboardInterrupt
@@ -80,7 +80,7 @@ def main() -> int:
             }
         )
     except Exception as err:
-        # Nothing was armed yet: the loop itself reports its errors instead of raising them.
+        # Nothing was armed yet, since the loop reports its errors instead of raising them.
         status.result(
             {"outcome": "failed", "reason": str(err), "error": type(err).__name__, "passive_confirmed": True}
         )
@@ -90,7 +90,7 @@ def main() -> int:
 def _run(
     orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper
 ) -> dict[str, Any]:
-    # Imported here, so that a stop during these imports is answered, too.
+    # Imported here, so that a stop signal during these imports is handled, too.
     from deal_hw.control.loop import ControlLoop, LoopConfig
     from deal_hw.control.passive import PassiveConfig
     from deal_hw.control.safety import Safety

@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
 
 _IN_VAIN = PassiveConfig(timeout_s=1.0)
-"""Where the control process tried for its whole time, the supervisor's own path gets this chance."""
+"""Time of the supervisor's own passive route after the control process failed for its whole time [s]."""
 
 
 class EpisodeRun:
-    """One episode: a recorder, a control process and the account of both."""
+    """One episode: a recorder, a control process, and the report on both."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class EpisodeRun:
     ) -> None:
         self._keep_fds, self._say = keep_fds, say
         self.signal = ""
-        """Name of the signal by which the operator ended it; "" where there was none."""
+        """Name of the signal by which the operator ended it, or ""."""
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
         self._path = store.next_episode_path() if store is not None else None
         self._metadata = {
@@ -84,7 +84,7 @@ class EpisodeRun:
         }
 
     def run(self, on_beat: Callable[[Beat], None]) -> EpisodeReport:
-        """Run it and return the account."""
+        """Run it and return the report."""
         recorder = None
         if self._path is not None:
             recorder = start_recorder(self._path, self._robot.description.to_json(), self._metadata)
@@ -131,12 +131,12 @@ class EpisodeRun:
                     replay=self._replayed(self._path),
                 )
             except (DealHwError, OSError) as err:
-                # As on a full disk. The report matters more, and the next open takes the recording in.
+                # Such as a full disk. The report matters more, and the next open indexes the recording.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
 
     def _walk(self, path: Path) -> VelocityError | None:
-        """Return how well the robot followed what it was told, by its own sensors."""
+        """Return how well the robot followed the requested velocity, by its own sensors."""
         if self._plan.robot not in ODOMETRY:
             return None
         trajectory = read_trajectory(path)
@@ -150,7 +150,7 @@ class EpisodeRun:
         return balanced(self._plan.robot, read_trajectory(path))
 
     def _replayed(self, path: Path) -> ReplayError | None:
-        """Return how far a replay's motion is from the recorded one."""
+        """Return the distance of a replay's motion from the recorded one."""
         if self._plan.motion != "replay":
             return None
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
@@ -159,7 +159,7 @@ class EpisodeRun:
     def _make_passive(
         self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]
     ) -> bool:
-        """Make the robot passive for a dead control process, where that one had set out to command it."""
+        """Make the robot passive if a dead control process had begun to command it."""
         untouched = (
             STARTING,
             LOADING,

@@ -1,4 +1,4 @@
-"""How an episode ended, told from the ends of its two processes."""
+"""How an episode ended, from the ends of its two processes."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd
 from deal_hw.workflows.running.report import EpisodeReport
 
 _LINK_WARNING = 0.01
-"""Share of corrupt and missing state frames above which the operator is told."""
+"""Share of corrupt and missing state frames above which the operator gets a warning."""
 
 
 def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeReport:
-    """Return how an episode went from how its processes ended.
+    """Return the report on an episode from the ends of its processes.
 
     Args:
-        end: That.
-        path: The recording; None where there is none.
+        end: Ends of the processes.
+        path: The recording, or None.
         watchdog_s: ``Robot.watchdog_s``.
     """
     result = end.result or {}
@@ -28,10 +28,10 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
     warnings = list(result.get("warnings", ()))
     if not end.passive_confirmed:
         cut = (
-            f"Where the cable is cut, its own watchdog has stopped the motor after {watchdog_s:g} s"
+            f"If the cable is cut, its own watchdog has stopped the motor after {watchdog_s:g} s"
             if watchdog_s
-            else "Where the link is gone it still holds its last command, with stiff motors: use its remote "
-            "(damping), then its switch"
+            else "If the connection is lost, it still holds its last command, with stiff motors: use its "
+            "remote (damping), then its switch"
         )
         warnings.append(f"the robot did not confirm that it is passive: switch it off by hand. {cut}")
     loop_timing = LoopTimingReport.from_json(result["loop_timing"]) if result.get("loop_timing") else None
@@ -43,7 +43,7 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
         )
     if end.recorder is not None and not end.recorder.complete:
         why = "; ".join(end.recorder.errors) or "for an unknown reason"
-        warnings.append(f"the recording is incomplete ({why}); mend it with `deal-hw data repair {path}`")
+        warnings.append(f"the recording is incomplete ({why}); repair it with `deal-hw data repair {path}`")
         if outcome is Outcome.FINISHED:
             outcome, reason, error = Outcome.FAILED, f"the recorder failed: {why}", "DatasetError"
     return EpisodeReport(
@@ -61,7 +61,7 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
 
 
 def _verdict(end: ChildEnd, result: dict[str, Any]) -> tuple[Outcome, str, str]:
-    """Return outcome, reason in words and the error's class."""
+    """Return the outcome, its reason as text, and the error's class."""
     operator = end.stop_cause in (OPERATOR, SUSPENDED)
     if end.killed and not operator:
         return Outcome.FAILED, f"the control process was killed: {end.killed}", "SafetyError"

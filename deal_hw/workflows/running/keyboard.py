@@ -1,4 +1,4 @@
-"""The operator's keys, while the control process, which owns no terminal, runs."""
+"""The operator's keys during a run, since the control process has no terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HELP = "keys: w s ahead, back; a d left, right; q e turn; space stand still; p o
 
 
 def check_terminal() -> None:
-    """Check that there are keys to read.
+    """Check that a terminal is there to read keys from.
 
     Raises:
         ConfigurationError: Standard input is no terminal.
@@ -35,8 +35,8 @@ def check_terminal() -> None:
 def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = aloud) -> Iterator[None]:
     """Call ``pressed`` for each key, and ``stop`` for those that make the robot passive, from a thread.
 
-    ``stop`` is called once: a key that is held repeats, and a second stop would kill the control process. It
-    is also called where the terminal goes away, for then nobody could stop the robot any more.
+    ``stop`` is called once: a held key repeats, and a second stop would kill the control process. It is also
+    called when the terminal goes away, since then nobody could stop the robot.
 
     Raises:
         ConfigurationError: Standard input is no terminal.
@@ -78,10 +78,10 @@ def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = al
 
 
 def _read(fd: int) -> str:
-    """Return the keys at hand; "" where the terminal is gone."""
+    """Return the pressed keys; "" if the terminal is gone."""
     try:
         data = os.read(fd, 64)
     except OSError:
         return ""
-    # A byte that is no text is a key without a meaning.
+    # A byte that is no text is a key without meaning.
     return data.decode("utf-8", "replace")

@@ -1,6 +1,6 @@
-"""What a control process is told to do, and the robot and behaviour that it makes of it.
+"""The plan of a run for a control process, and the robot and behaviour that follow from it.
 
-Plain values, for they cross a process boundary as JSON. Imports neither torch, mujoco nor scipy.
+All values are plain, since they cross a process boundary as JSON. Imports neither torch, mujoco nor scipy.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from deal_hw.transport import WireOptions
 from deal_hw.workflows.running.view import RunView
 
 Motion = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
-"""What a run does; `balance` runs the policy all the time."""
+"""Motions of a run; `balance` runs the policy all the time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,31 +43,32 @@ class RunPlan:
     Attributes:
         robot: Its name.
         transport: Name of the transport.
-        motion: What it does.
+        motion: The motion.
         policy: Policy file; "" for none.
-        trust_calibration: Whether to run a policy that was trained under a calibration whose verdict is red.
-        policy_digest: SHA-256 of the policy file that was checked, the only one that will be opened; "" where
-            none was.
+        trust_calibration: Whether to run a policy whose calibration has a red verdict.
+        policy_digest: SHA-256 of the checked policy file, the only one that will be opened; "" if none was
+        checked.
         recording: Episode to replay; "" for none.
         seconds: Length of the run [s].
-        seed: Fixes what is random in the behaviour.
-        dry_run: Whether to compute everything and send nothing.
+        seed: Seed of the behaviour's random numbers.
+        dry_run: Whether to compute everything but send no command.
         home: Whether to bring the robot to its start pose first.
         rich: Settings of the motion `rich`; its length is ``seconds``.
-        excitation_level: Steps that the motion `rich` is stronger, or gentler where negative.
+        excitation_level: Steps by which the motion `rich` is stronger, or gentler if negative.
         excite: What the motion `excite` plays: `chirp`, `multisine`, or a file of
             `deal-hw design-excitation`.
-        port: Where the robot is, for transports without a descriptor to inherit.
-        wire: More about a transport of topics.
-        velocity: Where a walking policy's wanted velocity comes from; see
-            :func:`deal_hw.control.velocity.make_source`.
+        port: The robot's port, for transports without a descriptor to inherit.
+        wire: Options of a transport of topics.
+        velocity: Source of a walking policy's requested velocity; see
+        :func:`deal_hw.control.velocity.make_source`.
         stand: Whether to stand up first and to lie down at the end; not counted in ``seconds``.
-        posture: How long that takes.
+        posture: Durations of standing up and lying down.
         robot_settings: The driver's own settings.
         hand_back: Whether to return the robot to its own controller at the end.
-        record_wire: Whether to record the raw bytes, too.
+        record_wire: Whether to record the raw bytes as well.
         realtime: Whether to ask for SCHED_FIFO and locked memory.
-        passive_timeout_s: How long the passive command is repeated at the end until the robot shows it [s].
+        passive_timeout_s: How long the passive command is repeated at the end until the robot confirms it
+            [s].
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
@@ -102,7 +103,7 @@ class RunPlan:
             raise UnknownNameError("motion", self.motion, get_args(Motion))
         if not 0 < self.seconds < float("inf"):
             raise ConfigurationError(
-                f"--seconds {self.seconds!r}: a run lasts longer than 0 s and not for ever"
+                f"--seconds {self.seconds!r}: the length of a run is a finite number of seconds above 0"
             )
 
     def to_json(self) -> dict[str, Any]:
@@ -115,10 +116,10 @@ class RunPlan:
         return self.seconds + (self.posture.added_s if self.stand else 0.0)
 
     def velocity_source(self) -> BoundedSource:
-        """Return where the wanted velocity comes from.
+        """Return the source of the requested velocity.
 
         Raises:
-            ConfigurationError: ``velocity`` names no source.
+            ConfigurationError: ``velocity`` is not the name of a source.
         """
         return make_source(self.velocity)
 
@@ -129,21 +130,21 @@ class RunPlan:
 
 
 def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | None = None) -> RunPlan:
-    """Check all that a plan names before anybody touches the robot.
+    """Check everything that a plan names, before the robot is used.
 
-    A policy is tried in a process of its own, see :mod:`deal_hw.policies.trial`: its network is not opened in
-    this one.
+    A policy is tried in its own process, see :mod:`deal_hw.policies.trial`; this process does not open its
+    network.
 
     Args:
         plan: The plan.
         description: The robot.
-        view: What is told and asked; by default nothing.
+        view: Shows messages and asks questions; by default none.
 
     Returns:
         The plan, with the digest of the policy that was checked.
 
     Raises:
-        DealHwError: As :func:`make_behaviour`; also where the policy fails its trial.
+        DealHwError: As :func:`make_behaviour`; also if the policy fails its trial.
     """
     with contextlib.ExitStack() as stack:
         digests = [""]
@@ -160,8 +161,8 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
             if limited and view is not None:
                 view.warn(
-                    f"--velocity {plan.velocity} may ask for more [m/s, m/s, rad/s] than "
-                    f"{Path(plan.policy).stem} was trained for: {'; '.join(limited)}"
+                    f"--velocity {plan.velocity} may request more [m/s, m/s, rad/s] than "
+                    f"{Path(plan.policy).stem} was trained for; it is limited: {'; '.join(limited)}"
                 )
             return policy
 
@@ -170,14 +171,14 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
 
 
 def _ask(policy: Path, view: RunView) -> None:
-    """Ask whether to run a policy that was trained under a calibration that is not to be used.
+    """Ask whether to run a policy whose calibration has a red verdict.
 
     Raises:
-        PolicyError: The answer is no, or nobody is there to ask.
+        PolicyError: The answer is no, or no operator can answer.
     """
     seen = (
-        f"{policy.name} was trained under a calibration whose verdict is red: it explains the robot worse "
-        "than the model did, or nothing says otherwise"
+        f"{policy.name} was trained under a calibration with a red verdict: the calibrated model predicts "
+        "the robot worse than the original one, or no held-out data show that it is better"
     )
     answer = view.confirm(f"warning: {seen}", "run it all the same?")
     if answer is None:
@@ -198,13 +199,13 @@ def make_behaviour(
     source: VelocitySource | None = None,
     load: Callable[[RunPlan], Policy] = _open_policy,
 ) -> Behaviour:
-    """Return what the plan asks of the robot.
+    """Return the behaviour that the plan describes.
 
     Args:
         plan: The plan.
         description: The robot.
-        source: The wanted velocity of a policy that walks; by default made from the plan.
-        load: Called for the plan's policy, where its motion needs one.
+        source: The requested velocity of a walking policy; by default from the plan.
+        load: Called for the plan's policy, if its motion needs one.
 
     Raises:
         PolicyError: The policy is missing or cannot run.
@@ -240,12 +241,12 @@ def _inner_behaviour(
 
 
 def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:
-    """Return what the motion `excite` plays: the file's plan, or one made from name and seed.
+    """Return the excitation of the motion `excite`: from its file, or made from name and seed.
 
     A robot that cannot stand without a policy balances first, as in the motion `rich`.
 
     Raises:
-        ConfigurationError: The file is no plan, is for another robot, or is not as long as the run.
+        ConfigurationError: The file is no plan, is for another robot, or has another length than the run.
     """
     if plan.excite in FAMILIES:
         balance_s = min(plan.rich.balance_s, 0.5 * plan.seconds) if plan.policy else 0.0
@@ -260,8 +261,8 @@ def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationP
     found.check_fits(description)
     if abs(found.seconds - plan.seconds) > 1e-6:
         raise ConfigurationError(
-            f"the excitation in {plan.excite} is {found.seconds:g} s long; --seconds {plan.seconds:g} must "
-            "agree"
+            f"the excitation in {plan.excite} is {found.seconds:g} s long, but --seconds is "
+            f"{plan.seconds:g}; give --seconds {found.seconds:g}"
         )
     return found
 

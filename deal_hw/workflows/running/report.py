@@ -1,4 +1,4 @@
-"""What collect, deploy and replay report: each episode and the whole run."""
+"""Reports of collect, deploy and replay, on each episode and on the whole run."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ class EpisodeReport:
     """How one episode went.
 
     Attributes:
-        path: The recording; None where nothing was recorded.
-        outcome: How it ended.
-        reason: In words.
+        path: The recording, or None.
+        outcome: How the episode ended.
+        reason: The reason, as text.
         passive_confirmed: Whether the robot itself confirmed that it is passive.
-        loop_timing: How regular the control loop was; None where it never ran or was killed.
-        clipped: Cycles in which each limit changed a command, by limit.
+        loop_timing: How regular the control loop was; None if it never ran or was killed.
+        clipped: Number of cycles in which a limit changed a command, by limit.
         cycles_sent: Commands sent.
         states_recorded: State samples in the file.
-        warnings: What the operator should know.
-        error: Name of the error's class where it failed.
-        motion: How much the recording moves; None where nothing was recorded.
-        walk: How well a walking robot followed what it was told, by its own sensors; None where it did not
-            walk or nothing was recorded.
-        balance: How well a policy held the cart-pole's pole up, as the robot reported; None where none did.
-        replay: How far a replay's motion is from the recorded one; None for other runs.
-        ran_s: How long commands went out [s].
-        planned_s: How long they should have [s]; 0 where that is not known.
+        warnings: Warnings for the operator.
+        error: Name of the error's class, after a failure.
+        motion: How much the recording moves; None without a recording.
+        walk: How well a walking robot followed the requested velocity, by its own sensors; None without a
+        walk or a recording.
+        balance: How well a policy held the cart-pole's pole up, as the robot reported; None without such a
+        policy.
+        replay: Distance of a replay's motion from the recorded one; None for other runs.
+        ran_s: How long commands were sent [s].
+        planned_s: Planned length [s]; 0 if unknown.
     """
 
     path: Path | None
@@ -77,7 +78,7 @@ class EpisodeReport:
         }
 
     def lines(self) -> list[str]:
-        """Return the account for the operator; warnings are extra."""
+        """Return the report for the operator, without the warnings."""
         lines = [f"{self.outcome.value}: {self.reason}"]
         if self.planned_s and self.cycles_sent:
             hit = "" if self.clipped or self.outcome is Outcome.TRIPPED else "; no limit was hit"
@@ -102,13 +103,13 @@ class EpisodeReport:
         if self.replay is not None:
             worst = int(np.argmax(self.replay.position))
             lines.append(
-                f"  off the recording by {self.replay.position[worst]:.3g} at most (RMS of joint "
-                f"{self.replay.joint_names[worst]!r}, rad or m), over {self.replay.seconds:.1f} s"
+                f"  difference from the recording at most {self.replay.position[worst]:.3g} rad or m (RMS "
+                f"of joint {self.replay.joint_names[worst]!r}), over {self.replay.seconds:.1f} s"
             )
         return lines
 
     def raise_error(self) -> None:
-        """Raise the error that ended the episode, as the class that it was in the control process."""
+        """Raise the error that ended the episode, with its class in the control process."""
         if self.outcome is not Outcome.FAILED:
             return
         kind = getattr(errors, self.error, errors.DealHwError)
@@ -125,8 +126,8 @@ class RunReport:
     """How a run of episodes went.
 
     Attributes:
-        dataset: The dataset's folder; None where nothing was recorded.
-        episodes: The episodes, in order; the last is the one that did not finish, if any.
+        dataset: The dataset's folder, or None.
+        episodes: The episodes, in order; if one did not finish, it is the last.
     """
 
     dataset: Path | None
@@ -148,7 +149,7 @@ class RunReport:
         return tuple(episode.path for episode in self.episodes if episode.path is not None)
 
     def table(self) -> str:
-        """Return a line an episode, as text."""
+        """Return one line per episode, as text."""
         return text_table(_HEAD, self._cells())
 
     def _repr_html_(self) -> str:

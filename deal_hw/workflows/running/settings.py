@@ -1,4 +1,4 @@
-"""Options of collect, deploy and replay: how the robot is reached, and what a robot with legs needs."""
+"""Options of collect, deploy and replay: the connection to the robot, and options of robots with legs."""
 
 from __future__ import annotations
 
@@ -17,89 +17,89 @@ from deal_hw.workflows.say import Say, silent
 
 @dataclass(frozen=True, kw_only=True)
 class LegOptions:
-    """What a robot with legs needs to be told."""
+    """Options of a robot with legs."""
 
     stand: bool | None = None
-    """Stand up first and lie down at the end; by default where the robot has a rest pose."""
+    """Stand up first and lie down at the end; by default if the robot has a rest pose."""
 
     velocity: str = "0,0,0"
-    """Wanted velocity of a walking policy: ahead, left, turn as 0.3,0,0 [m/s, m/s, rad/s], or remote (the
-    robot's own), keyboard, or a CSV file with the columns time_s,x,y,yaw."""
+    """Requested velocity of a walking policy: ahead, left, turn, such as 0.3,0,0 [m/s, m/s, rad/s]; or remote
+    (the robot's own), keyboard, or a CSV file with the columns time_s,x,y,yaw."""
 
     hand_back: bool = False
-    """Give the robot back to its own controller at the end (Go2: the sport service)."""
+    """Return the robot to its own controller at the end (Go2: the sport service)."""
 
     stop_buttons: str = ""
-    """Buttons of the robot's remote that make it passive while held together; by default the driver's (Go2:
-    L2+B)."""
+    """Buttons of the robot's remote that, held together, make the robot passive; by default the driver's
+    (Go2: L2+B)."""
 
     support_check: bool = True
-    """Refuse a go2 on a stand and a go2_on_stand on the floor; off only to try a policy in the air."""
+    """Refuse a go2 on a stand and a go2_on_stand on the floor. Switch off only to try a policy in the air."""
 
     posture: PostureConfig = field(default_factory=PostureConfig)
-    """How long standing up and lying down take."""
+    """Durations of standing up and lying down."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkOptions(Checked):
-    """How the robot is reached, beyond the port."""
+    """The connection to the robot, beyond the port."""
 
     transport: str = ""
-    """How the robot is reached. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the
-    default) or zenoh."""
+    """The transport. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the default) or
+    zenoh."""
 
     state_check: Annotated[Literal["strict", "length"], GO2] = "strict"
-    """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
-    checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
+    """How to check a Go2's state messages: strict (length, head and checksum), or length alone, for firmware
+    or simulators with another head or checksum. With length alone corrupted states are not detected."""
 
     simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
     """The simulator that runs in place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and
     battery. A real robot is then refused."""
 
     record_wire: bool = True
-    """Record the raw bytes, too."""
+    """Also record the raw bytes."""
 
     wire: Annotated[WireOptions, GO2] = field(default_factory=WireOptions)
-    """More about a network."""
+    """Network options."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(Checked):
-    """What every verb that runs a robot needs to be told."""
+    """Options of every verb that runs a robot."""
 
     port: str
-    """Where the robot is: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
-    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
+    """The robot's port: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
+    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds), or an end point such as
     tcp/127.0.0.1:7447 (zenoh)."""
 
     link: LinkOptions = field(default_factory=LinkOptions)
-    """How the robot is reached, beyond the port."""
+    """The connection to the robot, beyond the port."""
 
     legs: Annotated[LegOptions, GO2] = field(default_factory=LegOptions)
-    """What a robot with legs needs to be told."""
+    """Options of a robot with legs."""
 
     out: File | None = None
-    """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET deploy and replay record in
-    runs/VERB_ROBOT; collect needs one of the two."""
+    """Run folder; the episodes go to OUT/dataset. collect needs OUT or DATASET; deploy and replay record in
+    runs/VERB_ROBOT by default."""
 
     dataset: File | None = None
-    """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
+    """Dataset folder instead of OUT/dataset; new episodes are added to it."""
 
     say: Say = silent
-    """From Python: called with sentences on what happens; ``print`` shows them. By default warnings alone are
-    told, on standard error."""
+    """From Python: called with messages; ``print`` shows them. By default only warnings are printed, on
+    standard error."""
 
 
 def refuse_unrecorded(options: RunOptions, record: bool) -> None:
-    """Refuse options of a recording that is not to be made.
+    """Refuse recording options if nothing is recorded.
 
     Raises:
-        ConfigurationError: There is one.
+        ConfigurationError: At least one was given.
     """
     if not record:
         names = [name for name in ("out", "dataset") if getattr(options, name) is not None]
         wire = given(options.link, LinkOptions(), ["record_wire"])
-        refuse([*map(option, names), *wire], "--no-record keeps nothing")
+        refuse([*map(option, names), *wire], "--no-record writes no file")
 
 
 def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:
@@ -107,13 +107,13 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
 
     Args:
         robot: The robot's name.
-        link: How it is reached.
-        legs: What a robot with legs is told.
-        walks: Whether a policy runs that may be told a velocity.
+        link: The connection.
+        legs: Options of a robot with legs.
+        walks: Whether a policy runs that takes a requested velocity.
 
     Raises:
         UnknownNameError: There is no such robot.
-        ConfigurationError: It has a description, but no driver; or an option would be ignored.
+        ConfigurationError: It has a description, but no driver; or an option would have no effect.
     """
     if is_user_robot(robot):
         raise ConfigurationError(
@@ -123,9 +123,9 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
     description = driver_description(robot)
     stands = _stands(description) if legs.stand is None else legs.stand
     if not description.rest_position:
-        refuse(given(legs, LegOptions()), f"only robots with legs take that, and robot {robot!r} has none")
+        refuse(given(legs, LegOptions()), f"only for robots with legs, and robot {robot!r} has none")
     if not walks:
-        refuse(given(legs, LegOptions(), ["velocity"]), "no policy that walks runs here")
+        refuse(given(legs, LegOptions(), ["velocity"]), "no walking policy runs here")
     if link.simulator != "none":
         refuse(
             [*given(link, LinkOptions(), ["state_check"]), *given(legs, LegOptions(), ["hand_back"])],
@@ -147,7 +147,7 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
 
 
 def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
-    """Return the driver's own settings that were given; a driver without such a setting refuses it."""
+    """Return the given settings of the driver; a driver without such a setting refuses it."""
     given: dict[str, Any] = {
         "stop_buttons": legs.stop_buttons,
         "support_check": legs.support_check,

@@ -32,44 +32,44 @@ _START_NS = 1_000_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions(Checked):
-    """What a simulated robot hides; its sensors' noise and step are those of robot.yaml."""
+    """Hidden truth of a simulated robot; noise and step of its sensors are those of robot.yaml."""
 
     simulated: bool = False
-    """Record the robot of a robot.yaml in simulation, in virtual time, with hidden parameters: a rehearsal
-    without a robot and without --port."""
+    """Record a simulation of the robot of a robot.yaml, with hidden parameters, faster than real time. Needs
+    no robot and no --port."""
 
     truth_seed: Seed = 0
-    """Simulated: decides the hidden parameters and the noise."""
+    """Simulated: seed of the hidden parameters and the noise."""
 
     truth_ratio: Annotated[float, Ratio] = 1.5
-    """Simulated: hidden parameters lie within this ratio of the MJCF's."""
+    """Simulated: hidden parameters lie within this factor of the MJCF's."""
 
     truth_latency: Annotated[float, Range(0, LONGEST_LATENCY_S, "s")] = 0.005
-    """Simulated: a command acts so much later [s]."""
+    """Simulated: delay from a command to its effect [s]."""
 
     reveal_to: File | None = None
-    """Simulated: write what was hidden to this JSON file."""
+    """Simulated: write the hidden truth to this JSON file."""
 
 
 class Simulable(Protocol):
-    """Settings of a verb that runs a robot, or its simulation."""
+    """Settings of a verb that runs a robot or its simulation."""
 
     @property
     def port(self) -> str:
-        """Where the robot is."""
+        """The robot's port."""
         ...
 
     @property
     def simulation(self) -> SimulationOptions:
-        """Whether it is simulated."""
+        """Whether the robot is simulated."""
         ...
 
 
 def check_simulation(config: Simulable, default: Simulable) -> None:
-    """Refuse what goes with a wire alone, or with a simulation alone.
+    """Refuse options of a real robot in a simulation, and the reverse.
 
     Raises:
-        ConfigurationError: Something would have no effect.
+        ConfigurationError: An option would have no effect.
     """
     if config.simulation.simulated:
         refuse(["--port"] if config.port else [], "--simulated needs no wire")
@@ -79,10 +79,10 @@ def check_simulation(config: Simulable, default: Simulable) -> None:
 
 
 def require_driver(robot: str, port: str) -> None:
-    """Check that a robot is one that can be reached, and that it was said where.
+    """Check that a robot has a driver and a port.
 
     Raises:
-        ConfigurationError: It is a user's, which has no driver, or there is no port.
+        ConfigurationError: It is a user's robot, without a driver, or no port was given.
     """
     if is_user_robot(robot):
         raise ConfigurationError(
@@ -90,7 +90,7 @@ def require_driver(robot: str, port: str) -> None:
             "import recordings of it: deal-hw data import"
         )
     if not port:
-        raise ConfigurationError("say where the robot is: --port, such as /dev/ttyUSB0")
+        raise ConfigurationError("no port is given: name the robot's port, such as --port /dev/ttyUSB0")
 
 
 def run_simulated(
@@ -104,17 +104,17 @@ def run_simulated(
     view: RunView,
     attempts: int = 1,
 ) -> RunReport:
-    """Run episodes on a simulated robot and record them in a dataset that carries it.
+    """Run episodes on a simulated robot and record them in a dataset with its robot.yaml.
 
     Args:
-        plan: What to do; each episode adds its number to the seed.
-        robot: A robot.yaml, or a dataset that carries its robot.
-        options: What is hidden.
+        plan: The run; each episode adds its number to the seed.
+        robot: A robot.yaml, or a dataset with one.
+        options: The hidden truth.
         dataset: Folder of the dataset, made or extended.
-        episodes: How many.
+        episodes: Number of episodes.
         purpose: For the metadata.
-        view: What is told.
-        attempts: How often an episode of the motion `rich` is recorded at most.
+        view: Shows messages.
+        attempts: Most recordings of an episode of the motion `rich`.
 
     Raises:
         DealHwError: The robot cannot be used, or an episode failed.
@@ -131,7 +131,7 @@ def run_simulated(
     description = own.description()
     space = default_space(description)
     truth = draw_truth(space, options.truth_seed, options.truth_ratio, options.truth_latency)
-    # Whatever is wrong with robot or motion should be said before anything is written.
+    # Errors of robot or motion must be reported before anything is written.
     SimulatedRobot(load_model(description), space, truth, VirtualClock(_START_NS))
     make_behaviour(plan, description)
     reports: list[EpisodeReport] = []

@@ -1,4 +1,4 @@
-"""What collect, deploy and replay share: one run under a supervisor, with another behaviour."""
+"""The run under a supervisor that collect, deploy and replay share, each with its own behaviour."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 
 class InterruptedRunError(KeyboardInterrupt):
-    """The operator ended the program (Ctrl-C, SIGTERM, Ctrl-Z) in a run; the robot was made passive first.
+    """The operator ended a run (Ctrl-C, SIGTERM, Ctrl-Z); the robot was made passive first.
 
-    A ``KeyboardInterrupt``, so that loops over runs end, too, and the program with 130.
+    A ``KeyboardInterrupt``, so that loops over runs end, too, and the exit code is 130.
 
     Attributes:
-        report: How the runs went until then.
+        report: The runs until then.
         signal: Name of the signal, such as "SIGINT".
     """
 
@@ -70,14 +70,14 @@ def dataset_folder(out: File | None, dataset: File | None) -> Path:
 def recording_folder(
     out: File | None, dataset: File | None, purpose: str, robot: str, *, record: bool = True
 ) -> Path | None:
-    """Return where a run is recorded that needs no recording; None where it is not.
+    """Return the dataset folder of a run with an optional recording; None for no recording.
 
     Args:
         out: --out.
         dataset: --dataset.
-        purpose: "deploy" or "replay"; with the robot's name, that of the folder in runs by default.
+        purpose: "deploy" or "replay"; the default folder is runs/PURPOSE_ROBOT.
         robot: The robot.
-        record: Whether to record; False leaves only a folder that was named.
+        record: Whether to record; with False only a named folder is used.
 
     Raises:
         ConfigurationError: Both were given.
@@ -99,27 +99,27 @@ def run_episodes(
     on_beat: OnBeat = ignore,
     attempts: int = 1,
 ) -> RunReport:
-    """Run episodes one after the other on one port, each in a control process of its own.
+    """Run episodes one after the other on one port, each in its own control process.
 
     Args:
-        plan: What to do; each episode adds its number to the seed.
+        plan: The run; each episode adds its number to the seed.
         port: The port.
         dataset: Folder of the dataset, made or extended; None to record nothing.
-        episodes: How many.
+        episodes: Number of episodes.
         purpose: "collect", "deploy" or "replay", for the metadata.
         task: For the metadata.
-        view: What is told and asked; by default nothing.
+        view: Shows messages and asks questions; by default none.
         on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
-        attempts: How often an episode of the motion `rich` is recorded at most, stronger each time, until it
-            moves enough; see :mod:`deal_hw.control.excitation_level`.
+        attempts: Most recordings of an episode of the motion `rich`, each stronger, until it moves enough;
+            see :mod:`deal_hw.control.excitation_level`.
 
     Raises:
-        DealHwError: What made it fail, after the robot was made passive and the recording closed.
+        DealHwError: The run failed; the robot was made passive and the recording closed.
         InterruptedRunError: The operator ended the program.
     """
     view = view or RunView()
     if episodes < 1:
-        raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
+        raise errors.ConfigurationError(f"--episodes {episodes}: give at least 1")
     plan = dataclasses.replace(plan, port=port)
     if plan.velocity == "keyboard":
         check_terminal()
@@ -132,7 +132,7 @@ def run_episodes(
         plan.robot_settings,
         can_send=not plan.dry_run,
     )
-    # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
+    # Errors of settings, policy or recording must be reported before the robot is used.
     ExcitationLevelSearch(plan.excitation_level, attempts)
     plan = check_plan(plan, robot.description, view)
     reports: list[EpisodeReport] = []
@@ -140,8 +140,8 @@ def run_episodes(
         view.note(robot.notice)
     elif not robot.watchdog_s and not plan.dry_run:
         view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot))
-    # The supervisor connects to the robot itself, so that a wrong port is known before a process is started.
-    # From then on it only keeps the port, until the control process is dead.
+    # The supervisor connects to the robot itself, so that a wrong port is reported before a process starts.
+    # Then it only keeps the port open, until the control process is dead.
     with (
         _suspended_last(view.warn),
         claimed(plan) as claim,
@@ -174,18 +174,18 @@ def play_episodes(
     view: RunView,
     run_one: Callable[[RunPlan, int, int], EpisodeReport],
 ) -> None:
-    """Run episodes, those of the motion `rich` again and stronger until they move enough.
+    """Run episodes; repeat those of the motion `rich` stronger until they move enough.
 
     Args:
-        plan: What to do; each episode adds its number to the seed.
-        episodes: How many; none follows one that did not finish.
-        attempts: How often one is recorded at most.
+        plan: The run; each episode adds its number to the seed.
+        episodes: Number of episodes; an unfinished one is the last.
+        attempts: Most recordings of an episode.
         description: The robot.
-        view: What is told.
+        view: Shows messages.
         run_one: Runs an episode, of the given number (from 0) and attempt.
     """
     for number in range(episodes):
-        # The robot's own controller gets it back after the last episode only.
+        # The robot returns to its own controller after the last episode only.
         last = number == episodes - 1
         episode = dataclasses.replace(plan, seed=plan.seed + number, hand_back=plan.hand_back and last)
         search = ExcitationLevelSearch(plan.excitation_level, attempts, rearm=False)
@@ -202,7 +202,7 @@ def play_episodes(
 
 @contextlib.contextmanager
 def _suspended_last(say: Say) -> Iterator[None]:
-    """Stop for Ctrl-Z only when all is given back: a stopped program must hold neither claim nor wire."""
+    """Stop for Ctrl-Z only after all is released: a stopped program must hold neither claim nor wire."""
     try:
         yield
     except InterruptedRunError as interrupted:
@@ -214,7 +214,7 @@ def _suspended_last(say: Say) -> Iterator[None]:
 def _to_repeat(
     search: ExcitationLevelSearch, plan: RunPlan, report: EpisodeReport, description: RobotDescription
 ) -> bool:
-    """Say whether an episode is recorded again, at the search's new excitation level; its words tell why."""
+    """Return whether to record an episode again at the search's new excitation level."""
     judged = report.outcome in (Outcome.FINISHED, Outcome.TRIPPED) and report.motion is not None
     if plan.motion != "rich" or not judged or plan.dry_run or description.floating_base is not None:
         return False

@@ -1,4 +1,4 @@
-"""What a run tells and asks while it goes on; the command line shows it on a terminal."""
+"""Messages and questions of a run; the command line shows them on a terminal."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def ignore(beat: Beat) -> None:
 
 
 class RunView:
-    """Tells sentences alone and asks nobody.
+    """Passes messages on and asks no questions.
 
     Args:
-        say: Called with each sentence.
-        warn: Called with what the operator must know, such as a robot that is to be switched off by hand;
-            ``say`` by default.
+        say: Called with each message.
+        warn: Called with what the operator must know, such as that the robot must be switched off by hand;
+        ``say`` by default.
     """
 
     def __init__(self, say: Say = silent, warn: Say | None = None) -> None:
@@ -36,35 +36,35 @@ class RunView:
 
     @classmethod
     def of_python(cls, say: Say) -> RunView:
-        """Return the view of a program that named a ``say``; where it named none, warnings are told aloud."""
+        """Return the view of a program with its ``say``; without one, warnings go to standard error."""
         return cls(say, aloud if say is silent else say)
 
     def warn(self, text: str) -> None:
-        """Tell what the operator must know."""
+        """Show a warning to the operator."""
         self._warn(text)
 
     def note(self, text: str) -> None:
-        """Tell what is good to know."""
+        """Show a note."""
         self._say(text)
 
     def progress(self, title: str, seconds: float) -> AbstractContextManager[OnBeat]:
-        """Show how far an episode of so many seconds is [s]."""
+        """Show the progress of an episode of the given length [s]."""
         return contextlib.nullcontext(ignore)
 
     def notify(self, done: int, total: int, text: str) -> None:
-        """Show how far the search for a motion is."""
+        """Show the progress of the search for a motion."""
 
     def designed(self, robot: str, report: ExcitationReport) -> None:
-        """Tell which motion was found for a robot."""
+        """Show the motion that was found for a robot."""
         self._say(report.plan.words)
 
     def ended(self, report: EpisodeReport) -> None:
-        """Tell how an episode ended."""
+        """Show how an episode ended."""
         for line in report.lines():
             self._say(line)
         for warning in report.warnings:
             self.warn(f"warning: {warning}")
 
     def confirm(self, warning: str, question: str) -> bool | None:
-        """Ask the operator; None where nobody is there to answer."""
+        """Ask the operator; None if nobody can answer."""
         return None

@@ -1,9 +1,9 @@
-"""Dynamixel packets over a byte stream: ROBOTIS' SDK makes and reads them, our transport carries them.
+"""Dynamixel packets over a byte stream: ROBOTIS' SDK encodes and decodes them, our transport carries them.
 
-The SDK's own port waits in a busy loop on the wall clock, and 34 ms for a servo that is absent. Here its
-packet handler is given a port of ours: waiting is done in the transport, against a monotonic clock, and an
-answer has its time on the wire plus an allowance. A group's answer is taken without blocking: bytes are
-collected as they come, and the SDK sees them once the last packet is whole.
+The SDK's own port waits in a busy loop on the wall clock, and 34 ms for an absent servo. Here its packet
+handler gets our port: the transport waits, on a monotonic clock, and an answer may take its time on the wire
+plus an allowance. A group's answer is read without blocking: bytes are collected as they arrive, and the SDK
+gets them when the last packet is complete.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _ALERT = 0x80
 
 
 class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
-    """The SDK's codec, one mistake of which is mended."""
+    """The SDK's codec, with one error corrected."""
 
     def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
-        """Return an answer without the bytes that keep headers out of bodies; the SDK goes on with its CRC.
+        """Return an answer without the stuffing bytes; the SDK then checks its CRC.
 
         SDK 4.1 does it in place, and after the first such byte compares with bytes that it has already
         overwritten: FF FF FD FD FF FD FD lost its last byte, and all registers behind it were shifted.
@@ -54,10 +54,10 @@ class Answer(NamedTuple):
 
 
 class _Port:
-    """What the SDK's packet handler needs of a port."""
+    """The port interface of the SDK's packet handler."""
 
     is_using = property(lambda self: False, lambda self, value: None)
-    """The SDK's lock stays taken where a read raises; this bus has one user."""
+    """The SDK's lock stays taken after a read that raises; this bus has one user."""
 
     def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
         self.baud_rate, self.answer_s = baud_rate, answer_s
@@ -71,7 +71,7 @@ class _Port:
     # The names below are the SDK's.
 
     def clearPort(self) -> None:  # noqa: N802
-        """Leave what came: :meth:`drop` forgets it where a new answer is asked for."""
+        """Keep the received bytes; :meth:`drop` discards them before a new request."""
 
     def getBaudRate(self) -> int:  # noqa: N802
         """Return the bits per second."""
@@ -87,7 +87,7 @@ class _Port:
         self.flush()
         if not self.buffer and length > 0:
             self.receive(self._deadline_ns)
-        # A corrupt length field makes the SDK ask for fewer than none.
+        # A corrupt length field makes the SDK request a negative number.
         length = max(length, 0)
         taken = bytes(self.buffer[:length])
         del self.buffer[:length]
@@ -98,25 +98,25 @@ class _Port:
         self._deadline_ns = self._clock.now_ns() + self.answer_ns(length)
 
     def setPacketTimeoutMillis(self, milliseconds: float) -> None:  # noqa: N802
-        """Begin to wait so long."""
+        """Begin to wait for this time [ms]."""
         self._deadline_ns = self._clock.now_ns() + round(milliseconds * 1e6)
 
     def isPacketTimeout(self) -> bool:  # noqa: N802
-        """Say whether nothing more may come: the time is over, and what came is read."""
+        """Return whether the time is over and all received bytes are read."""
         return not self.buffer and self._clock.now_ns() >= self._deadline_ns
 
-    # What the bus adds.
+    # Methods that the bus adds.
 
     def answer_ns(self, length: int) -> int:
         """Return how long an answer of that many bytes may take [ns]."""
         return round((length * _BITS_PER_BYTE / self.baud_rate + self.answer_s) * 1e9)
 
     def expire(self) -> None:
-        """Wait no longer: the SDK reads what is in the buffer."""
+        """Stop waiting; the SDK then reads the buffer."""
         self._deadline_ns = 0
 
     def flush(self) -> None:
-        """Send what was written as one message."""
+        """Send the written packets as one message."""
         if self.written:
             data, self.written = bytes(self.written), bytearray()
             message = Message("tx", data, self._clock.now_ns())
@@ -124,7 +124,7 @@ class _Port:
             self.wire.append(message)
 
     def receive(self, deadline_ns: int) -> bool:
-        """Wait for bytes; return whether some came."""
+        """Wait for bytes; return whether any arrived."""
         try:
             message = self._transport.receive(max(0, deadline_ns - self._clock.now_ns()) / 1e9)
         except TransportTimeoutError:
@@ -136,7 +136,7 @@ class _Port:
         return True
 
     def drop(self) -> None:
-        """Forget what came too late for the answer before."""
+        """Discard bytes that arrived too late for the previous answer."""
         while self.receive(0):
             pass
         self.buffer.clear()
@@ -144,7 +144,7 @@ class _Port:
 
 @contextlib.contextmanager
 def _short_is_corrupt(servo: int) -> Iterator[None]:
-    """Raise FrameError where the SDK reaches beyond the end of an answer that passed its CRC."""
+    """Raise FrameError if the SDK reads beyond the end of an answer with a valid CRC."""
     try:
         yield
     except IndexError as error:
@@ -155,14 +155,14 @@ class Bus:
     """Reads and writes servos' registers.
 
     Attributes:
-        errors: Answers that were corrupt or stayed away so far.
-        heard: Bytes that came so far, whatever they were.
+        errors: Corrupt or missing answers so far.
+        heard: Received bytes so far, valid or not.
 
     Args:
         transport: A byte stream, open.
         clock: The clock of its stamps.
-        baud_rate: Of the bus, for the time that bytes take.
-        answer_s: What an answer may take beyond that [s].
+        baud_rate: Baud rate of the bus, for the time of bytes.
+        answer_s: Additional time for an answer [s].
     """
 
     def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
@@ -177,12 +177,12 @@ class Bus:
 
     @property
     def heard(self) -> int:
-        """Bytes that came so far, whatever they were."""
+        """Received bytes so far, valid or not."""
         return self._port.heard
 
     @property
     def stamp_ns(self) -> int:
-        """When the newest bytes came [ns]."""
+        """Time of the newest bytes [ns]."""
         return self._port.stamp_ns
 
     @property
@@ -206,7 +206,7 @@ class Bus:
         return Answer(answer[9] | answer[10] << 8, answer[11])
 
     def ping_protocol_1(self, servo: int) -> bool:
-        """Say whether a servo answers in the older protocol 1.0."""
+        """Return whether a servo answers in the older protocol 1.0."""
         self._port.drop()
         try:
             _, result, _ = PacketHandler(1.0).ping(self._port, servo)
@@ -215,14 +215,14 @@ class Bus:
         return bool(result == COMM_SUCCESS)
 
     def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
-        """Return all servos that answer a ping to everybody within a time [s]."""
+        """Return all servos that answer a broadcast ping within a time [s]."""
         self._port.drop()
         self._sdk.txPacket(self._port, [0, 0, 0, 0, _BROADCAST, 3, 0, 1, 0, 0])
         self._port.flush()
         self._port.setPacketTimeoutMillis(1e3 * seconds)
         found: dict[int, Answer] = {}
         while not self._port.isPacketTimeout():
-            # One packet after the other: the SDK's own waits for all 252 servos, 1.3 s.
+            # Packet by packet, since the SDK's own function waits for all 252 servos, 1.3 s.
             try:
                 packet, result = self._sdk.rxPacket(self._port, False)
             except IndexError:
@@ -243,7 +243,7 @@ class Bus:
         return int.from_bytes(bytes(data), "little")
 
     def write(self, servo: int, register: Register, value: int) -> None:
-        """Write a register and wait for the servo's word that it did; raises as :meth:`ping`.
+        """Write a register and wait for the servo's confirmation; raises as :meth:`ping`.
 
         Raises:
             ProtocolError: The servo refuses the value.
@@ -260,10 +260,10 @@ class Bus:
             )
 
     def post(self, writes: Sequence[tuple[int, Mapping[int, bytes]]]) -> int:
-        """Write registers in one message and wait for nothing; return when it went [ns].
+        """Write registers in one message without waiting; return the send time [ns].
 
         Args:
-            writes: Sync writes, in order: an address, and the bytes that each servo gets there.
+            writes: Sync writes, in order: an address, and the bytes of each servo.
         """
         for address, values in writes:
             size = len(next(iter(values.values())))
@@ -274,12 +274,12 @@ class Bus:
         return now_ns
 
     def ask(self, servos: Sequence[int], address: int, size: int, *, fast: bool) -> int:
-        """Ask servos for the same registers, in one message; return when it went [ns].
+        """Request the same registers of servos in one message; return the send time [ns].
 
         Args:
             servos: Their ids.
             address: The first register.
-            size: How many bytes of each.
+            size: Number of bytes of each.
             fast: Whether they answer in one packet (Fast Sync Read) or each in its own.
         """
         self._port.drop()
@@ -292,14 +292,14 @@ class Bus:
 
     @staticmethod
     def answer_bytes(servos: int, size: int, fast: bool) -> int:
-        """Return how many bytes a group's answer has."""
+        """Return the number of bytes of a group's answer."""
         return 8 + servos * (size + 4) if fast else servos * (size + _STATUS_BYTES)
 
     def take(self, deadline_ns: int) -> dict[int, bytes] | None:
         """Return the group's registers by id, waiting for them until a deadline at most.
 
         Returns:
-            None: nothing whole came until the deadline, but still may.
+            None if no complete answer arrived until the deadline, but may still arrive.
 
         Raises:
             TransportTimeoutError: The servos are silent.
@@ -324,7 +324,7 @@ class Bus:
         return found
 
     def _whole(self) -> bool:
-        """Say whether the buffer holds as many packets as were asked for; the SDK judges what is in them."""
+        """Return whether the buffer contains all requested packets; the SDK checks their content."""
         at, wanted = 0, 1 if self._fast else len(self._ids)
         while wanted:
             at = self._port.buffer.find(HEADER, at)
@@ -341,7 +341,7 @@ class Bus:
         if result != COMM_SUCCESS or packet[4] != _BROADCAST or packet[7] != _STATUS:
             raise FrameError("no sound packet")
         if len(packet) > self.answer_bytes(len(self._ids), self._size, True):
-            # The SDK takes such answers as unstuffed; a servo that stuffs them is known by the length.
+            # The SDK expects such answers without stuffing; the length shows whether a servo stuffs them.
             packet = self._sdk.removeStuffing(packet)
         found = {}
         for k, servo in enumerate(self._ids):

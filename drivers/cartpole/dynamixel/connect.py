@@ -1,4 +1,4 @@
-"""From a port as it is typed to a cart-pole on two servos."""
+"""Makes a cart-pole on two servos from a --port text."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SETTINGS_FILE = "settings"
 def parse_port(port: str) -> tuple[str, DynamixelSettings]:
     """Return the path and the settings in a port such as ``/dev/ttyUSB0?cart_id=3&settings=servos.json``.
 
-    Values in the port count more than those in the file.
+    Values in the port override those in the file.
 
     Raises:
         ConfigurationError: A setting is unknown or wrong, or the file cannot be read.
@@ -33,7 +33,7 @@ def parse_port(port: str) -> tuple[str, DynamixelSettings]:
         given = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query)))
     except ValueError as error:
         raise ConfigurationError(
-            f"port {port!r}: what follows the ? is name=value, more of them joined by &"
+            f"port {port!r}: write settings after the ? as name=value, joined by &"
         ) from error
     values: dict[str, Any] = {}
     if (file := given.pop(SETTINGS_FILE, None)) is not None:
@@ -63,7 +63,7 @@ def dynamixel_robot(
         can_send: False for a robot that is only listened to; ``connect`` then refuses.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is invalid.
     """
     path, settings = parse_port(port)
     link: Transport

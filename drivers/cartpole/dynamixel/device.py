@@ -49,28 +49,28 @@ _BITS_PER_BYTE = 10
 _VELOCITY_MODE = 1
 _NO_LIMIT_M_S = 1000.0
 _FREE_M = 10.0
-"""A servo knows no rail: its goals may lie beyond the stops."""
+"""A servo does not know the rail, so its goals may lie beyond the stops."""
 
 
 class DynamixelDevice(EmulatedDevice):
     """Two servos and the cart-pole that they drive and measure.
 
     Control tick k, at device time k ms: set-point, force from the state at its start, one physics step.
-    Packets are handled when they come; an answer leaves after the time that question and answer take on a
-    wire of the servo's baud rate, and its return delay.
+    Packets are handled on arrival. An answer leaves after the time of request and answer on a wire of the
+    servo's baud rate, plus its return delay.
 
-    The pole servo's LED asks a hand to set the pole upright, as homing needs it; the hand lets go when the
-    belt servo gets torque.
+    The pole servo's LED asks a hand to set the pole upright for homing; the hand releases it when the belt
+    servo gets torque.
 
     Attributes:
         servos: Belt servo and pole servo.
         fast_read: Whether they know Fast Sync and Bulk Read; older firmware does not.
-        host_baud_rate: What the host's port is set to; a servo of another rate hears noise. None: the same.
+        host_baud_rate: Rate of the host's port; a servo with another rate receives noise. None: the same.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
-        settings: Wiring and gearing, as the driver has them.
-        faults: What goes wrong.
+        settings: Wiring and gearing, as in the driver.
+        faults: The faults.
         keep_truth: Whether to keep the true trajectory for :meth:`true_trajectory`.
     """
 
@@ -92,7 +92,7 @@ class DynamixelDevice(EmulatedDevice):
         self._cart = EmulatedServo(s.cart_id, s.baud_rate, mode=s.operating_mode)
         self._pole = EmulatedServo(s.pole_id, s.baud_rate)
         self.servos = [self._cart, self._pole]
-        # Within a revolution a servo knows where it stands when it starts; the whole ones it does not.
+        # At its start a servo knows its position within a revolution, but not the number of revolutions.
         self._cart_base = int(rng.integers(0, PULSES))
         self._pole_base = s.pole_zero
         self._parser = PacketParser()
@@ -113,7 +113,7 @@ class DynamixelDevice(EmulatedDevice):
 
     @property
     def device_ns(self) -> int:
-        """Device time at which something happens next, a tick or an answer [ns]."""
+        """Device time of the next tick or answer [ns]."""
         tick_ns = self._tick * TICK_NS
         return min(tick_ns, max(self._replies[0][0], self._now_ns)) if self._replies else tick_ns
 
@@ -124,7 +124,7 @@ class DynamixelDevice(EmulatedDevice):
 
     @property
     def mode(self) -> str:
-        """What the motor does: "idle" and "held" are without torque, "stopped" holds where it stopped."""
+        """State of the motor: without torque in "idle" and "held"; "stopped" holds its position."""
         if self._mechanics.held:
             return "held"
         if not self._torque:
@@ -140,7 +140,7 @@ class DynamixelDevice(EmulatedDevice):
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the servos now; "" for nothing."""
+        """Current fault of the servos; "" for none."""
         if not self._pole.present:
             return "pole servo absent"
         if not self._cart.awake(self._now_ns):
@@ -166,13 +166,13 @@ class DynamixelDevice(EmulatedDevice):
             self._handle(packet)
 
     def advance_to(self, device_ns: int) -> bytes:
-        """Let everything happen up to and including ``device_ns``; return the bytes sent meanwhile."""
+        """Run all ticks and answers up to and including ``device_ns``; return the bytes sent meanwhile."""
         out = super().advance_to(device_ns)
         self._now_ns = max(self._now_ns, device_ns)
         return out
 
     def tick(self) -> bytes:
-        """Let the next thing happen; return the bytes sent."""
+        """Run the next tick or answer; return the bytes sent."""
         self._now_ns = max(self._now_ns, self.device_ns)
         if self._replies and self._replies[0][0] <= self._now_ns < self._tick * TICK_NS + TICK_NS:
             return self._replies.popleft()[1]
@@ -220,7 +220,7 @@ class DynamixelDevice(EmulatedDevice):
         self._lit = lit
 
     def _follow_torque(self, motor: Motor) -> None:
-        """Switch the motor as the belt servo's registers say."""
+        """Switch the motor according to the belt servo's registers."""
         block = self._cart.block
         if bool(block.torque_enable) != self._torque:
             self._torque = bool(block.torque_enable)
@@ -235,7 +235,7 @@ class DynamixelDevice(EmulatedDevice):
                     self._first_ns = self._now_ns
         stopped = self._cart.watchdog_tripped
         if stopped and not self._stopped:
-            # "The DYNAMIXEL will stop": it holds the place where it was, with the gains it had.
+            # "The DYNAMIXEL will stop": it holds its position with its gains.
             self._targets.clear()
             here = dataclasses.replace(self._target(block), position_um=round(motor.position * 1e6))
             self._loop.reset(motor.position)
@@ -243,7 +243,7 @@ class DynamixelDevice(EmulatedDevice):
         self._stopped = stopped
 
     def _target(self, block: Block) -> Target:
-        """Return what the belt servo's registers ask of its loop."""
+        """Return the target in the belt servo's registers."""
         s, goal = self._settings, self._settings.read_goal(block)
         # A profile velocity of 0 is no limit.
         speed = goal.profile_velocity * s.metres_s_per_count if goal.profile_velocity else _NO_LIMIT_M_S
@@ -257,7 +257,7 @@ class DynamixelDevice(EmulatedDevice):
         )
 
     def _sense(self, motor: Motor) -> None:
-        """Put what the sensors say into the registers."""
+        """Write the sensors' values into the registers."""
         s, reading = self._settings, self._mechanics.read()
         pulses = round(reading.cart_um * 1e-6 / s.metres_per_pulse)
         self._cart.put(PRESENT_POSITION, self._cart_base + pulses)
@@ -284,7 +284,7 @@ class DynamixelDevice(EmulatedDevice):
         servo.put(PRESENT_POSITION, servo.block.present_position - whole)
 
     def _fail(self) -> None:
-        """Let due faults happen."""
+        """Apply due faults."""
         if self._first_ns is None:
             return
         passed_s = (self._now_ns - self._first_ns) / 1e9
@@ -368,7 +368,7 @@ class DynamixelDevice(EmulatedDevice):
             at += 5 + size
 
     def _schedule(self) -> None:
-        """Let what the belt servo was told act, after its latency; what came at one time acts at one time."""
+        """Apply the belt servo's writes after its latency; writes of one time act at one time."""
         target = self._target(self._cart.block)
         if not self._torque or not self._cart.block.torque_enable or target == self._told:
             return
@@ -393,7 +393,7 @@ class DynamixelDevice(EmulatedDevice):
         for servo, address, size in wanted:
             listeners = self._listeners(servo) if servo != BROADCAST else []
             if not listeners:
-                # Each waits for the answer of the one before it, which never comes.
+                # Each waits for the answer of the servo before it, which never comes.
                 break
             speaker = listeners[0]
             error, data = speaker.read(address, size)
@@ -416,7 +416,7 @@ class DynamixelDevice(EmulatedDevice):
         *,
         read: bool = True,
     ) -> None:
-        """Send what servos with an id answer; two with the same one speak at the same time."""
+        """Send the answers of servos with an id; two with the same id answer at the same time."""
         if servo == BROADCAST:
             return
         pinged = packet.instruction == Instruction.PING

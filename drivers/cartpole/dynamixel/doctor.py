@@ -1,4 +1,4 @@
-"""What ``deal-hw doctor`` finds on a Dynamixel bus: rates, ids, models, and how the servos are set up."""
+"""Checks of ``deal-hw doctor`` on a Dynamixel bus: rates, ids, models, and the servos' settings."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from deal_hw.findings import Finding, Level
 
 AREA: Final = "servos"
 _LISTEN_S: Final = 0.1
-"""For all servos to answer a ping to everybody, beyond the allowance for an answer [s]."""
+"""Time for all servos to answer a broadcast ping, beyond the allowance for an answer [s]."""
 _SYSFS: Final = Path("/sys/class/tty")
 _LONG_DELAY_US = 250
 _FAST_BAUD = 1_000_000
 
 
 def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Finding]:
-    """Yield what is found at every baud rate; nothing is written to a servo.
+    """Yield findings at every baud rate; nothing is written to a servo.
 
     Args:
         port: The port, with settings as for ``--port``.
         clock: For the waiting.
-        sysfs: Where the kernel tells of serial ports.
+        sysfs: Folder of the kernel's information on serial ports.
 
     Raises:
         DealHwError: The port cannot be opened.
@@ -56,7 +56,7 @@ def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Fi
         except DealHwError as error:
             if rate == settings.baud_rate:
                 raise
-            yield Finding(AREA, Level.NOTE, f"{rate} baud: the port does not do this rate ({error})")
+            yield Finding(AREA, Level.NOTE, f"{rate} baud: the port does not support this rate ({error})")
             continue
         with transport:
             bus = Bus(transport, clock, rate, settings.answer_s)
@@ -93,8 +93,8 @@ def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelS
             yield Finding(
                 AREA,
                 Level.FAIL,
-                f"id {servo} at {rate} baud answers pings, its other answers are corrupt",
-                "two servos with the same id? Connect one alone and give it another",
+                f"id {servo} at {rate} baud answers pings, but its other answers are corrupt",
+                "two servos may have the same id: connect one alone and give it another",
             )
             return
     role = {settings.cart_id: "belt", settings.pole_id: "pole"}.get(servo, "not used")
@@ -109,7 +109,7 @@ def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelS
         yield Finding(
             AREA,
             Level.FAIL,
-            f"id {servo} is set to {rate} baud, deal-hw expects {settings.baud_rate}",
+            f"id {servo} is set to {rate} baud, but deal-hw expects {settings.baud_rate}",
             "set its register Baud Rate (8) with Dynamixel Wizard"
             + (f", or give --port 'PORT?baud_rate={rate}' if both have it" if rate >= _FAST_BAUD else ""),
         )
@@ -147,13 +147,13 @@ def _old(servo: int, rate: int) -> Finding:
 
 
 def _latency_timer(path: str, sysfs: Path) -> Iterator[Finding]:
-    """Look at the time for which an FTDI adapter collects bytes before it hands them over."""
+    """Check how long an FTDI adapter collects bytes before it passes them on."""
     try:
         timer_ms = int((sysfs / Path(path).resolve().name / "device" / "latency_timer").read_text())
     except (OSError, ValueError):
         return
     slow = timer_ms > 1
-    # The driver asks for 1 ms when it opens the port; where that is not permitted the answers are late.
+    # The driver sets 1 ms when it opens the port; without permission for that the answers are late.
     yield Finding(
         AREA,
         Level.NOTE if slow else Level.OK,

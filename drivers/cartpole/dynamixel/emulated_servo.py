@@ -1,4 +1,4 @@
-"""One emulated X-series servo: its control table, and what it answers to an instruction."""
+"""One emulated X-series servo: its control table, and its answers to instructions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
 TABLE_BYTES = 256
 XL330_M077, FIRMWARE = 1190, 46
 BOOT_NS = 300_000_000
-"""A servo that starts is silent for this long [ns]."""
+"""How long a starting servo is silent [ns]."""
 _FIRST_RAM = 64
 _FIRST_READ_ONLY, _END_READ_ONLY = 120, 147
 _READ_ONLY = {*range(7), 70, 69, *range(_FIRST_READ_ONLY, _END_READ_ONLY)}
@@ -80,8 +80,8 @@ class EmulatedServo:
     """A servo's registers, with the rules by which they may be read and written.
 
     Attributes:
-        present: False for a servo that is unplugged.
-        protocol: 2, or 1 for an old firmware that knows protocol 1.0 only.
+        present: False for an unplugged servo.
+        protocol: 2, or 1 for an old firmware with protocol 1.0 only.
 
     Args:
         servo: Its id.
@@ -118,7 +118,7 @@ class EmulatedServo:
         return int.from_bytes(self._table[register.address : register.address + register.size], "little")
 
     def put(self, register: Register, value: int) -> None:
-        """Set a register, whatever the rules for hosts are."""
+        """Set a register, without the rules for hosts."""
         data = (value % (1 << 8 * register.size)).to_bytes(register.size, "little")
         self._table[register.address : register.address + register.size] = data
 
@@ -134,7 +134,7 @@ class EmulatedServo:
 
     @property
     def return_delay_s(self) -> float:
-        """What it waits before it answers [s]."""
+        """Delay before its answers [s]."""
         return self.get(RETURN_DELAY_TIME) * RETURN_DELAY_UNIT_S
 
     @property
@@ -144,24 +144,24 @@ class EmulatedServo:
 
     @property
     def alert(self) -> int:
-        """What every status packet carries beside its error."""
+        """Alert bit of every status packet."""
         return ALERT if self.get(HARDWARE_ERROR) else 0
 
     @property
     def block(self) -> Block:
-        """What the driver reads with every sample."""
+        """The registers that the driver reads with every sample."""
         return Block.unpack(bytes(self._table[BLOCK_ADDRESS : BLOCK_ADDRESS + BLOCK_BYTES]))
 
     def awake(self, now_ns: int) -> bool:
-        """Whether it hears anything."""
+        """Whether it receives packets."""
         return self.present and now_ns >= self._silent_until_ns
 
     def answers(self, *, read: bool) -> bool:
-        """Whether its Status Return Level has it answer."""
+        """Whether it answers, by its Status Return Level."""
         return self.get(STATUS_RETURN_LEVEL) >= (1 if read else 2)
 
     def reboot(self, now_ns: int) -> None:
-        """Start anew: what is not in EEPROM is forgotten, hardware errors too."""
+        """Restart: registers outside the EEPROM are reset, hardware errors too."""
         self._table[_FIRST_RAM:] = bytes(TABLE_BYTES - _FIRST_RAM)
         for register, value in _DEFAULTS.items():
             if register.address >= _FIRST_RAM:
@@ -170,12 +170,12 @@ class EmulatedServo:
         self._silent_until_ns = self._start_ns = now_ns + BOOT_NS
 
     def fail(self, bits: int) -> None:
-        """Report a hardware error and switch the torque off, as Shutdown has it."""
+        """Report a hardware error and switch the torque off, according to Shutdown."""
         self.put(HARDWARE_ERROR, self.get(HARDWARE_ERROR) | bits)
         self.put(TORQUE_ENABLE, 0)
 
     def tick(self, now_ns: int, silence_ns: int) -> None:
-        """Let a millisecond pass; silence is how long no packet has come [ns]."""
+        """Advance by a millisecond; ``silence_ns`` is the time without a packet [ns]."""
         self.put(REALTIME_TICK, max(0, now_ns - self._start_ns) // 1_000_000 % TICK_PERIOD_MS)
         limit = self.get(BUS_WATCHDOG)
         if (
@@ -206,7 +206,7 @@ class EmulatedServo:
         return error
 
     def act(self) -> bool:
-        """Do the write that was kept; return whether there was one."""
+        """Do the kept write; return whether there was one."""
         kept, self._registered = self._registered, None
         return kept is not None and self.write(*kept) == Error.NONE
 

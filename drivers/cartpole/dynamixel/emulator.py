@@ -19,12 +19,12 @@ _OUTPUT_SPEED = 5
 
 
 class ServoEmulator(CartpoleEmulator):
-    """Runs servos behind a pty; they hear noise where the host's port has another baud rate than theirs.
+    """Runs servos behind a pty; they receive noise if the host's port has another baud rate.
 
     Args:
         device: The servos.
         link: A symbolic link to make to the port; None for none.
-        hazards: What goes wrong on purpose.
+        hazards: Faults on purpose.
     """
 
     def __init__(

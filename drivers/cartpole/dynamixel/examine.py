@@ -1,4 +1,4 @@
-"""Looks at the two servos before anything is driven: who answers, and how each is set up."""
+"""Checks the two servos before any motion: which ones answer, and their settings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from deal_hw.errors import (
 T = TypeVar("T")
 
 _TRIES = 5
-"""Times that a question is put while answers are corrupt: with 5 % of them corrupt all fail once in 10**6."""
+"""Attempts of a request with corrupt answers; with 5 % corrupt answers all fail once in 10**6."""
 _LISTEN_S = 0.05
 _ALL_STATUS = 2
 _WIZARD = "with Dynamixel Wizard 2.0 (page 'Dynamixel servos' of the documentation)"
@@ -56,7 +56,7 @@ class ServoInfo:
         id: Its id.
         model: Name of the model.
         firmware: Version of its firmware.
-        return_delay_us: What it waits before it answers [us].
+        return_delay_us: Delay before its answers [us].
     """
 
     id: int
@@ -83,7 +83,7 @@ class DynamixelInfo:
 
 
 def model_name(number: int) -> str:
-    """Return a model's name; its number in words where the SDK knows none."""
+    """Return a model's name, or a text with its number if the SDK knows no name."""
     try:
         return str(ControlTable.getModelName(number)).removesuffix(".model").replace("_", "-").upper()
     except DxlRuntimeError:
@@ -103,16 +103,16 @@ class Examination:
     def __init__(self, bus: Bus, settings: DynamixelSettings, clock: Clock, where: str) -> None:
         self._bus, self._settings, self._clock, self._where = bus, settings, clock, where
         self.repeated = 0
-        """Questions that had to be put again."""
+        """Number of repeated requests."""
 
     def run(self, state_rate_hz: float) -> DynamixelInfo:
         """Return what was found.
 
         Raises:
             TransportTimeoutError: A servo is silent.
-            WrongDeviceError: Something else answers, or a servo that cannot be used.
+            WrongDeviceError: Another device answers, or a servo that cannot be used.
             VersionMismatchError: A servo speaks protocol 1.0.
-            ConfigurationError: A servo is set up in another way; the message names the register.
+            ConfigurationError: A servo has other settings; the message names the register.
         """
         s = self._settings
         self._check_speed(state_rate_hz)
@@ -121,7 +121,7 @@ class Examination:
             self._check_model(servo, answers[servo])
         infos = {}
         for servo, answer in answers.items():
-            # Asked before anything is written: where writes are not answered they look lost.
+            # Checked before any write, since writes without an answer look lost.
             level = self._read(servo, STATUS_RETURN_LEVEL)
             if level != _ALL_STATUS:
                 raise self._wrong(servo, STATUS_RETURN_LEVEL, level, str(_ALL_STATUS))
@@ -185,19 +185,19 @@ class Examination:
             silent = " and ".join(map(str, missing))
             listed = ", ".join(f"{i} ({model_name(a.model)})" for i, a in sorted(there.items()))
             raise TransportTimeoutError(
-                f"{self._where}: servo {silent} does not answer; these do: {listed}. "
-                "Every new servo has id 1, and two with the same id spoil each other's answers: connect one "
-                f"alone, give it its id {_WIZARD}, then connect both"
+                f"{self._where}: servo {silent} does not answer; these do: {listed}. Every new servo has "
+                "id 1, and two servos with the same id corrupt each other's answers: connect one alone, "
+                f"set its id {_WIZARD}, then connect both"
             )
         if self._bus.heard:
             raise WrongDeviceError(
-                f"{self._where}: {self._bus.heard} bytes came, none of them a sound answer of a Dynamixel; "
-                f"is another device on this port, do the servos use another rate than {s.baud_rate} baud, or "
-                "do two have the same id?"
+                f"{self._where}: {self._bus.heard} bytes came, but no valid answer of a Dynamixel; check "
+                f"for another device on this port, another rate than {s.baud_rate} baud, and two servos "
+                "with the same id"
             )
         raise TransportTimeoutError(
-            f"{self._where}: no servo answers at {s.baud_rate} baud; is their supply on, is this the port? "
-            "New servos use 57600 baud: `deal-hw doctor cartpole --transport dynamixel` looks at every rate"
+            f"{self._where}: no servo answers at {s.baud_rate} baud; check their supply and the port. New "
+            "servos use 57600 baud: `deal-hw doctor cartpole --transport dynamixel` tries every rate"
         )
 
     def _check_model(self, servo: int, answer: Answer) -> None:
@@ -239,8 +239,9 @@ class Examination:
             return self._retry(question)
         except FrameError as error:
             raise WrongDeviceError(
-                f"{self._where}: the answers of servo {servo} are corrupt time after time: two servos with "
-                "that id, another program on the port, or a bad cable. Connect one servo alone and try again"
+                f"{self._where}: the answers of servo {servo} are corrupt again and again: two servos have "
+                "that id, another program uses the port, or the cable is bad. Connect one servo alone and "
+                "try again"
             ) from error
 
     def _retry(self, question: Callable[[], T]) -> T:

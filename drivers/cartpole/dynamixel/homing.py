@@ -1,4 +1,4 @@
-"""Homing: the middle of the rail is found and gone to by the motor, the pole is set upright by a hand."""
+"""Homing: the motor finds the middle of the rail and moves there; a hand sets the pole upright."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.types import JointCommand
 
 _PERIOD_NS = 10_000_000
-"""Between two looks: often enough for the belt servo's watchdog."""
+"""Time between two requests; short enough for the belt servo's watchdog."""
 _MOVED_M = 0.003
 _ARRIVED_M = 0.003
 _STILL_RAD = 0.05
@@ -44,11 +44,11 @@ class Homing:
         self._deadline_ns = 0
 
     def run(self, timeout_s: float) -> int:
-        """Return the belt servo's position in the middle of the rail, where the cart is then.
+        """Return the belt servo's position in the middle of the rail, with the cart there.
 
         Raises:
-            TransportTimeoutError: It was not done in time; the message says what was missing.
-            SafetyError: The rail is not as long as it should be, or a servo reports an error.
+            TransportTimeoutError: It did not finish in time; the message names the missing part.
+            SafetyError: The rail has another length than in the settings, or a servo reports an error.
         """
         self._deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         zero = self._middle()
@@ -66,8 +66,9 @@ class Homing:
         way_m = abs((ends[1] - ends[0]) * s.metres_per_pulse)
         if abs(way_m - s.rail_m) > s.rail_tolerance_m:
             raise SafetyError(
-                f"cartpole: homing found {way_m:.3f} m between the end stops, the settings say {s.rail_m:g} "
-                "m: something blocks the cart, the belt slips, or metres_per_revolution or rail_m is wrong"
+                f"cartpole: homing found {way_m:.3f} m between the end stops, but the settings have "
+                f"{s.rail_m:g} m: check that nothing blocks the cart and that the belt does not slip, then "
+                "metres_per_revolution and rail_m"
             )
         return round((ends[0] + ends[1]) / 2)
 
@@ -78,21 +79,21 @@ class Homing:
         end = self._move(start + beyond)
         if abs(end - start) >= abs(beyond) - 1:
             raise SafetyError(
-                f"cartpole: the cart went {self._settings.rail_m + 0.2:g} m without meeting an end stop; is "
-                "metres_per_revolution right, does the belt slip?"
+                f"cartpole: the cart went {self._settings.rail_m + 0.2:g} m without reaching an end stop; "
+                "check metres_per_revolution, and that the belt does not slip"
             )
         return end
 
     def _go_to(self, position: int) -> None:
-        """Move the cart to a place; friction stops it short, so the goal goes beyond by what was missing."""
+        """Move the cart to a place. Friction stops it short, so the goal is moved beyond."""
         m = abs(self._settings.metres_per_pulse)
         aim = position
         while abs(missing := position - self._move(aim, near=position)) * m > _ARRIVED_M:
             aim += missing
             if abs(aim - position) * m > 0.5 * self._settings.rail_m:
                 raise SafetyError(
-                    "cartpole: the cart does not reach the middle of the rail; does something block it, are "
-                    "homing_effort_n and the supply enough?"
+                    "cartpole: the cart does not reach the middle of the rail; check that nothing blocks "
+                    "it, and that homing_effort_n and the supply are large enough"
                 )
 
     def _move(self, target: int, near: int | None = None) -> int:
@@ -115,8 +116,8 @@ class Homing:
                 return block.present_position
             if not block.torque_enable or block.bus_watchdog == WATCHDOG_TRIPPED:
                 raise SafetyError(
-                    f"cartpole: servo {self._settings.cart_id} stopped while homing: it restarted, or this "
-                    "computer did not ask it for 0.2 s; try again"
+                    f"cartpole: servo {self._settings.cart_id} stopped while homing: it restarted, or got "
+                    "no request from this computer for 0.2 s; try again"
                 )
             if block.goal_position != target:
                 self._servos.send(goal._replace(position=target))
@@ -158,7 +159,7 @@ class Homing:
         """Return both blocks after a while; refuse to go on where a servo reports an error."""
         self._clock.sleep_until_ns(self._clock.now_ns() + _PERIOD_NS)
         if self._clock.now_ns() >= self._deadline_ns:
-            raise TransportTimeoutError(f"cartpole: homing was not done in time: {missing}")
+            raise TransportTimeoutError(f"cartpole: homing did not finish in time: {missing}")
         blocks = self._servos.read(self._deadline_ns)
         for servo, block in zip((self._settings.cart_id, self._settings.pole_id), blocks, strict=True):
             if block.hardware_error:

@@ -127,7 +127,7 @@ class DynamixelCartpole(Robot):
             return
         if not self._transport.can_send:
             raise ConfigurationError(
-                "servos say nothing unless asked: a dry run, which sends nothing, cannot listen to them"
+                "servos answer only to requests, but a dry run sends nothing; leave --dry-run out"
             )
         self._transport.open()
         try:
@@ -179,7 +179,9 @@ class DynamixelCartpole(Robot):
             SafetyError: It was never homed, or a servo reports an error.
         """
         if not self._homed:
-            raise SafetyError("cartpole: it was not homed since the servos were found; call home() first")
+            raise SafetyError(
+                "cartpole: the servos were not homed since they were connected; call home() first"
+            )
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         self._clear_faults()
         cart, _ = self.servos.read(deadline_ns)
@@ -227,7 +229,7 @@ class DynamixelCartpole(Robot):
             if not self._states and self._clock.now_ns() >= deadline_ns:
                 why = (
                     self._fault
-                    or f"are both servos powered, is the cable good ({self.transport_errors} errors)?"
+                    or f"check that both servos are powered, and the cable ({self.transport_errors} errors)"
                 )
                 raise TransportTimeoutError(f"cartpole: no state within {timeout_s:g} s; {why}")
         return self._states.popleft()
@@ -285,8 +287,8 @@ class DynamixelCartpole(Robot):
         if self._misses[asked[0]] > _MISSES:
             role = "belt" if asked == self._servos[:1] else "pole"
             self._latch(
-                f"servo {asked[0]} ({role}) does not answer any more: it restarted, or lost its supply or "
-                "its cable. Check both, then start again"
+                f"servo {asked[0]} ({role}) stopped answering: it restarted, or lost its supply or its "
+                "cable. Check both, then start again"
             )
 
     def _latch(self, fault: str) -> None:
@@ -340,8 +342,8 @@ class DynamixelCartpole(Robot):
                 )
         if self._armed and not blocks[self._servos[0]].torque_enable:
             self._lose_position(
-                f"servo {self._servos[0]} has no torque any more: it restarted, or another program uses "
-                "the bus"
+                f"servo {self._servos[0]} lost its torque: it restarted, or another program uses the bus. "
+                "End other programs, then start again"
             )
 
     def _lose_position(self, fault: str) -> None:

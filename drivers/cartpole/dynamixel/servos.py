@@ -78,7 +78,7 @@ class Servos:
             except (TransportTimeoutError, FrameError) as error:
                 if self._clock.now_ns() >= deadline_ns:
                     raise TransportTimeoutError(
-                        f"cartpole: {error}; are both servos powered, is the cable good?"
+                        f"cartpole: {error}; check that both servos are powered, and the cable"
                     ) from error
             else:
                 raise TransportTimeoutError("cartpole: the servos' answer did not come in time")
@@ -112,7 +112,7 @@ class Servos:
             if shown == (_WATCHDOG, 0, goal):
                 break
             if self._clock.now_ns() >= deadline_ns:
-                raise TransportTimeoutError(f"cartpole: servo {cart} does not show what it was told: {shown}")
+                raise TransportTimeoutError(f"cartpole: servo {cart} does not confirm its settings: {shown}")
         while True:
             try:
                 self._bus.write(cart, TORQUE_ENABLE, 1)

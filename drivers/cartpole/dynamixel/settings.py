@@ -104,7 +104,8 @@ class DynamixelSettings:
             )
         if self.baud_rate not in BAUD_RATES:
             raise ConfigurationError(
-                f"baud_rate {self.baud_rate}: X-series servos have {', '.join(map(str, BAUD_RATES))}"
+                f"baud_rate {self.baud_rate}: allowed for X-series servos are "
+                f"{', '.join(map(str, BAUD_RATES))}"
             )
         for name in (
             "metres_per_revolution",
@@ -124,7 +125,7 @@ class DynamixelSettings:
             if not 0 < (value := getattr(self, name)) < math.inf:
                 raise ConfigurationError(f"{name} is {value!r}; it must be a number above 0")
         if not 0 <= self.pole_zero < PULSES:
-            raise ConfigurationError(f"pole_zero is {self.pole_zero}; a position is 0 to {PULSES - 1}")
+            raise ConfigurationError(f"pole_zero is {self.pole_zero}; allowed are 0 to {PULSES - 1}")
 
     @property
     def operating_mode(self) -> OperatingMode:

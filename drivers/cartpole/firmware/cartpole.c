@@ -46,7 +46,7 @@ static void take_target(cartpole *device, const uint8_t *body)
 {
     uint32_t sequence = get(body), due_tick = device->tick;
     cartpole_target *target;
-    /* A repeated number is a stuck host or a stuck adapter: it must not keep the watchdog quiet. */
+    /* A repeated number comes from a stuck host or adapter; it must not reset the watchdog. */
     if (device->mode != CARTPOLE_ARMED || sequence == device->command_sequence)
         return;
     device->command_sequence = sequence;
@@ -124,7 +124,7 @@ uint8_t cartpole_handle(cartpole *device, const uint8_t *payload, uint8_t length
     if (type == CARTPOLE_HELLO && length == 3)
         return greet(device, payload[2], answer);
     if (type >= CARTPOLE_ARM && type <= CARTPOLE_HOME && length == 3 && payload[0] == CARTPOLE_VERSION) {
-        /* A host that missed the answer asks again under the same number; the request must not act twice. */
+        /* A host that missed the answer repeats the request with the same number; it must not act twice. */
         key = (uint16_t)((uint16_t)type << 8 | payload[2]);
         if (key != device->last_request) {
             result = act(device, type, motor);

@@ -26,7 +26,7 @@
 #define CARTPOLE_MAX_PAYLOAD (CARTPOLE_MAX_BLOCK - 3)
 
 #ifndef CARTPOLE_QUEUE
-#define CARTPOLE_QUEUE 8 /* Targets that wait for their tick; where it is full the newest replaces the last. */
+#define CARTPOLE_QUEUE 8 /* Targets that wait for their tick; if the queue is full, the newest replaces the last. */
 #endif
 
 enum cartpole_mode { CARTPOLE_IDLE, CARTPOLE_HOMING, CARTPOLE_ARMED };
@@ -63,7 +63,7 @@ typedef struct {
     uint16_t delay_ticks;
 } cartpole_settings;
 
-/* What the motor's own encoder says now. */
+/* Reading of the motor's own encoder. */
 typedef struct {
     int32_t position_nm;
     int32_t velocity_um_s;
@@ -146,7 +146,7 @@ bool cartpole_control(cartpole *device, const cartpole_motor *motor, int64_t *fo
 uint8_t cartpole_report(cartpole *device, const cartpole_reading *reading, uint8_t *frame);
 /* The cart is in the middle and the pole upright; nothing happens unless homing. */
 void cartpole_finish_homing(cartpole *device);
-/* Motor off, as the host's stop does it. */
+/* Motor off, as by the host's stop. */
 void cartpole_stop(cartpole *device);
 
 #endif

@@ -76,7 +76,7 @@ uint8_t cartpole_decode(cartpole_decoder *decoder, uint8_t byte)
     }
     if (length <= CARTPOLE_MAX_BLOCK)
         payload = unwrap(decoder->block, length);
-    /* What comes before the first delimiter is the end of a frame that began before we listened. */
+    /* Bytes before the first delimiter are the end of a frame that began before we listened. */
     if (payload == 0 && length > 0 && decoder->synchronised)
         decoder->errors++;
     decoder->synchronised = true;

@@ -48,7 +48,7 @@ static void aim(rig *rig, int32_t target_um)
     cartpole_servo_accept(&rig->homing, &target, &rig->device.settings);
 }
 
-/* Move the zero of the cart, with all that remembers positions. */
+/* Move the zero of the cart, with all stored positions. */
 static void shift(rig *rig, int32_t counts)
 {
     uint8_t i;
@@ -145,7 +145,7 @@ bool rig_tick(rig *rig, const rig_inputs *inputs, int16_t *pwm)
                                (CARTPOLE_CONTROL_HZ / RIG_VELOCITY_TICKS);
     rig->cart_before[rig->at] = rig->cart_counts;
     rig->at = (uint8_t)((rig->at + 1) % RIG_VELOCITY_TICKS);
-    /* Without a position that can be trusted nothing may move. */
+    /* Without a valid position the motor must not move. */
     if (inputs->lost_counts && (rig->device.homed || rig->device.mode == CARTPOLE_HOMING))
         fail(rig);
     due = cartpole_control(&rig->device, &rig->motor, &force_pn);
@@ -158,7 +158,7 @@ bool rig_tick(rig *rig, const rig_inputs *inputs, int16_t *pwm)
         *pwm = 0;
         return due;
     }
-    /* What a step of the PWM cannot give is given by the next one. */
+    /* The rest of a PWM step is added to the next one. */
     wanted += rig->pwm_rest;
     *pwm = (int16_t)(magnitude(wanted) / rig->pwm_step > RIG_PWM_TOP ? RIG_PWM_TOP
                                                                      : magnitude(wanted) / rig->pwm_step);

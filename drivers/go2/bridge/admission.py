@@ -4,9 +4,9 @@
       ▲                                      │                          │
       └--- handed back to sport mode --------┴--- or another program on the robot's side commands it
 
-The first command of a controller is damping: that is the hand-over, which nobody sends who believes to walk.
-Then the robot is that stream's until it is silent for longer than the limit. Whoever lost the robot in the
-middle of a walk takes it over anew, as everybody does.
+A controller takes the robot over by a damping command, which no walking controller sends. The robot then
+belongs to its stream until it is silent for longer than the limit. A controller that lost the robot during a
+walk must take it over again in the same way.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from deal_hw.errors import FrameError, SafetyError
 from deal_hw.transport import Message
 
 _STREAMS: Final = 64
-"""Streams whose newest sequences are remembered; those of older ones are too old anyway."""
+"""Number of streams whose newest sequences are remembered; messages of older streams are too old anyway."""
 _REQUESTS: Final = {topics.request(name): name for name in topics.SERVICES}
 
 
 class Control(enum.Enum):
-    """Who has the robot."""
+    """Who controls the robot."""
 
     IDLE = "idle"
-    """Not the bridge: it sends nothing."""
+    """Neither a controller nor the bridge, which sends nothing."""
     CONTROLLED = "controlled"
     """A controller, through the bridge."""
     DAMPING = "damping"
@@ -44,7 +44,7 @@ class Control(enum.Enum):
 
 
 class RefusedMessageError(SafetyError):
-    """A message that does not go through.
+    """A message that is refused.
 
     Attributes:
         kind: One word for counting.
@@ -56,18 +56,18 @@ class RefusedMessageError(SafetyError):
 
 
 class Admission:
-    """Judges what comes from the network.
+    """Judges the messages from the network.
 
     Attributes:
-        control: Who has the robot.
-        reason: Why, in words.
-        admitted: Commands that went through.
-        refused: Messages that did not, by kind.
-        last_refusal: Why, of the last one.
+        control: Who controls the robot.
+        reason: The reason, as text.
+        admitted: Number of admitted commands.
+        refused: Number of refused messages, by kind.
+        last_refusal: Reason of the last refusal.
 
     Args:
         config: Settings.
-        limits: What a command may ask for.
+        limits: Limits of a command.
         session: The number in the bridge's own stamps.
     """
 
@@ -86,7 +86,7 @@ class Admission:
         self._newest: OrderedDict[tuple[int, str], int] = OrderedDict()
 
     def command(self, message: Message, now_ns: int, frame: LowStateFrame | None) -> LowCommand | None:
-        """Return the command in a message where it may go to the robot, None where it may not.
+        """Return the command in a message if it may go to the robot, else None.
 
         Args:
             message: Of ``rt/lowcmd``, with its attachment.
@@ -108,14 +108,15 @@ class Admission:
         return command
 
     def request(self, message: Message, now_ns: int) -> bool:
-        """Return whether a request to the robot's services may pass; one that hands it back ends control."""
+        """Return whether a request to the services may pass; one for sport mode ends control."""
         try:
             echo = self._link(message, now_ns)
             self._check_holder(echo)
             if self._gives_back(message):
                 if self._stiff and self.control is Control.CONTROLLED:
                     raise RefusedMessageError(
-                        "handover", "the robot cannot be handed back while it is commanded: damp it first"
+                        "handover",
+                        "the robot cannot return to its own controller while it is commanded: damp it first",
                     )
                 self._become(Control.IDLE, "the robot was handed back to its own controller")
         except RefusedMessageError as refusal:
@@ -125,16 +126,16 @@ class Admission:
         return True
 
     def take_charge(self, reason: str) -> None:
-        """Damp the robot from now on, until a controller takes it over."""
+        """Damp the robot until a controller takes it over."""
         self._become(Control.DAMPING, reason)
 
     def yield_to_robot_side(self) -> None:
-        """Stop damping: somebody on the robot's side commands it, and two who command make it jump."""
+        """Stop damping: another program on the robot's side commands it, and two commanders make it jump."""
         if self.control is Control.DAMPING:
             self._become(Control.IDLE, "another program on the robot's side commands the motors")
 
     def tick(self, now_ns: int) -> bool:
-        """Look for silence; return whether a damping command must go out now."""
+        """Check for silence; return whether a damping command must be sent now."""
         if self.control is not Control.CONTROLLED:
             return self.control is Control.DAMPING
         silent_ns = now_ns - self._last_ns
@@ -143,8 +144,7 @@ class Admission:
         if self._stiff:
             self._become(
                 Control.DAMPING,
-                f"no command that may pass for {silent_ns / 1e6:.0f} ms, the limit is "
-                f"{self._age_ns / 1e6:g} ms"
+                f"no admissible command for {silent_ns / 1e6:.0f} ms, the limit is {self._age_ns / 1e6:g} ms"
                 + (f"; the last refusal: {self._refusal}" if self._refusal else ""),
             )
         elif silent_ns > self._release_ns:
@@ -152,7 +152,7 @@ class Admission:
         return True
 
     def status(self) -> dict[str, Any]:
-        """Return who has the robot and why, as plain values."""
+        """Return who controls the robot and why, as plain values."""
         return {
             "control": self.control.value,
             "reason": self.reason,
@@ -170,11 +170,11 @@ class Admission:
         self.refused[refusal.kind] += 1
         self.last_refusal = str(refusal)
         if refusal.kind != "holder":
-            # What another controller was told is no reason for the silence of this one.
+            # A refusal of another controller does not explain the silence of this one.
             self._refusal = self.last_refusal
 
     def _link(self, message: Message, now_ns: int) -> Echo:
-        """Return the sender's stream and number, where the message is new and young."""
+        """Return the sender's stream and number if the message is new and not too old."""
         try:
             echo = read_echo(message.attachment)
         except FrameError as error:
@@ -196,7 +196,8 @@ class Admission:
         newest = self._newest.get((echo.stream, message.channel), -1)
         if echo.sequence <= newest:
             raise RefusedMessageError(
-                "sequence", f"number {echo.sequence} came after number {newest}: a replay, or overtaken"
+                "sequence",
+                f"number {echo.sequence} came after number {newest}: a replay, or overtaken on the way",
             )
         return echo
 
@@ -215,7 +216,8 @@ class Admission:
     def _check_holder(self, echo: Echo) -> None:
         if self._holder is not None and echo.stream != self._holder:
             raise RefusedMessageError(
-                "holder", "another controller commands the robot; end that run first, this one is refused"
+                "holder",
+                "another controller commands the robot, so this one is refused; end the other run first",
             )
 
     def _hand_over(self, echo: Echo, damping: bool) -> None:
@@ -224,7 +226,7 @@ class Admission:
             if not damping:
                 raise RefusedMessageError(
                     "handover",
-                    f"whoever takes the robot over begins with damping (kp 0, kd above 0): {self.reason}",
+                    f"a new controller must begin with damping (kp 0, kd above 0): {self.reason}",
                 )
             self._become(Control.CONTROLLED, "a controller took the robot over")
             self._holder = echo.stream

@@ -1,4 +1,4 @@
-"""The bridge itself: two transports, a thread that passes states on, and a loop that judges and damps."""
+"""The bridge: two transports, a thread that passes states on, and a loop that judges and damps."""
 
 from __future__ import annotations
 
@@ -40,13 +40,14 @@ TO_NETWORK: Final = (
     topics.CLAIM,
     *RESPONSES,
 )
-"""Topics that pass from the robot's side; motor commands are those of others, such as sport mode."""
+"""Topics that pass from the robot's side; motor commands there come from other programs, such as sport
+mode."""
 READABLE: Final = (*TO_NETWORK, topics.BRIDGE)
 _ASK_S: Final = 2.0
 _RECEIVE_S: Final = 0.1
 _JOIN_S: Final = 2.0
 _MOST_MESSAGES: Final = 64
-"""Messages judged at a time before silence is looked for: a flood must not put the damping off."""
+"""Messages judged before each check for silence; a flood of messages must not delay the damping."""
 
 
 class Go2Bridge:
@@ -56,15 +57,15 @@ class Go2Bridge:
         admission: The judge; only the thread that steps changes it.
         counts: Messages that passed, by topic.
         unsent: Messages that a transport did not take.
-        latest_ns: How late the latest look for silence was [ns].
+        latest_ns: Largest delay of a check for silence [ns].
 
     Args:
         robot: Topics of the robot (DDS); not open.
         network: Topics of its clients (Zenoh); not open.
         clock: The bridge's own time.
         config: Settings.
-        state_check: What a state must pass to count as known here; all states are passed on as they come.
-        tell: Called with a line for the operator whenever something changes.
+        state_check: Check of states that the bridge itself uses; all states are passed on unchanged.
+        tell: Called with a line for the operator at each change.
     """
 
     def __init__(
@@ -117,7 +118,7 @@ class Go2Bridge:
         self._thread.start()
 
     def close(self) -> None:
-        """Damp the robot where the bridge or a controller behind it has it, and leave both networks."""
+        """Damp the robot if the bridge or its controller has it, and leave both networks."""
         self._end.set()
         thread, self._thread = self._thread, None
         if thread is not None:
@@ -133,7 +134,7 @@ class Go2Bridge:
         self._robot.close()
 
     def step(self) -> None:
-        """Serve until the next look for silence is due, and look.
+        """Serve until the next check for silence is due, and check.
 
         Raises:
             DealHwError: The robot's side broke down.
@@ -143,7 +144,7 @@ class Go2Bridge:
                 self._take(self._network.receive(left_ns * 1e-9))
         if self._failure is not None:
             raise self._failure
-        # Late or not, what has come is judged first: it shows that the controller is not silent.
+        # Even when late, received messages are judged first: they show that the controller is not silent.
         with contextlib.suppress(TransportTimeoutError):
             for _ in range(_MOST_MESSAGES):
                 self._take(self._network.receive(0.0))
@@ -163,7 +164,7 @@ class Go2Bridge:
         if message.channel == topics.LOW_COMMAND:
             command = self.admission.command(message, now_ns, self._frame)
             if command is not None:
-                # Made anew: what a LowCmd has beside the joints (battery switch, lights) does not pass.
+                # Encoded again, so that other fields of a LowCmd (battery switch, lights) do not pass.
                 self._to_robot(topics.LOW_COMMAND, self._encoder.encode(command))
         elif message.channel == topics.CLAIM:
             if read_claim(message.payload) is not None:
@@ -220,7 +221,7 @@ class Go2Bridge:
             self._send(self._network, self._heard(self._robot.receive(timeout_s)))
 
     def _heard(self, message: Message) -> Message:
-        """Take note of a message of the robot's side; return it as clients get it."""
+        """Note a message of the robot's side; return it in the clients' form."""
         if message.channel == topics.LOW_STATE:
             with contextlib.suppress(FrameError):
                 self._frame = decode_low_state(message.payload, self._strict)
@@ -235,19 +236,19 @@ class Go2Bridge:
     # At the beginning.
 
     def _ask_who_moves_it(self) -> None:
-        """Damp the robot at once where nobody moves it: a bridge before this one may have died in a walk.
+        """Damp the robot at once if nobody controls it, since an earlier bridge may have died during a walk.
 
-        A robot whose own controller is released holds its last command for ever. Where that controller has
-        it, or somebody else commands it, the bridge keeps quiet.
+        A robot whose own controller is released holds its last command for ever. If its own controller is
+        active, or another program commands it, the bridge sends nothing.
         """
         self._services = ServiceClient(self._to_robot, self._pump, self._clock)
         switcher = MotionSwitcher(self._services, self._clock)
         try:
-            # A request that goes out before discovery has ended is lost, and repeated half a second later.
+            # A request before the end of discovery is lost, and repeated half a second later.
             self._listen(_ASK_S, lambda: self._frame is not None)
             mode = switcher.active(_ASK_S)
         except DealHwError as error:
-            self._tell(f"who moves the robot is not known, so it is not damped yet: {error}")
+            self._tell(f"the robot's active controller is unknown, so it is not damped yet: {error}")
             return
         finally:
             self._services = None

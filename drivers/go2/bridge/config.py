@@ -12,28 +12,29 @@ _LOOKS = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BridgeConfig:
-    """What the bridge admits, and when it damps."""
+    """Which commands the bridge admits, and when it damps the robot."""
 
     command_age_s: float = LEG_LIMITS.command_age_s
-    """A command is refused where the state that its sender acted on is older than this, and the robot is
-    damped after so long without an admitted command [s]. Both ways over the network are part of the age."""
+    """A command is refused if it is based on a state older than this. The robot is damped after this time
+    without an admitted command [s]. The age includes both ways over the network."""
     margin_s: float = 0.008
-    """Silence counts so long before the limit, so that the robot is damped within it: looks are 2 ms apart
-    and may be late, and the way takes time [s]. With 6 ms, 1 of 100 cut links was damped 1.2 ms after it."""
+    """The robot is damped this long before the limit, so that damping acts within it: checks are 2 ms apart
+    and may be late, and the way to the robot takes time [s]. With 6 ms, 1 of 100 cuts was damped 1.2 ms after
+    the limit."""
     effort_margin: float = 2.0
-    """Largest torque that a command may ask for now, kp (q* - q) + kd (dq* - dq) + tau, in multiples of what
-    the driver's own filter allows at 50 Hz (23.5 N·m): joints move on between two of its cycles."""
+    """Largest torque that a command may request, kp (q* - q) + kd (dq* - dq) + tau, in multiples of the limit
+    of the driver's own filter (23.5 N·m). It exceeds 1 since joints move between two cycles of that filter at
+    50 Hz."""
     release_s: float = 1.0
-    """A controller that went passive and is silent for so long has left, and another one may follow [s]."""
+    """After this time of silence, a passive controller counts as gone, and another one may take over [s]."""
     rate_hz: float = WIRE_HZ
-    """Rate of the damping commands, and of looking for silence [Hz]."""
+    """Rate of the damping commands, and of the checks for silence [Hz]."""
     status_s: float = 0.2
-    """How often clients are told who commands the robot; a change is told at once [s]."""
+    """Time between two messages to clients on who commands the robot; a change is sent at once [s]."""
     listen_s: float = 0.1
-    """How long nobody on the robot's side may have commanded the motors before the bridge damps at its start
-    [s]."""
+    """At its start the bridge damps only after this time without motor commands on the robot's side [s]."""
     leave_s: float = 0.1
-    """How long damping goes on when the bridge is told to end [s]."""
+    """How long damping continues at the end of the bridge [s]."""
 
     def __post_init__(self) -> None:
         allowed = {
@@ -51,9 +52,9 @@ class BridgeConfig:
                 raise ConfigurationError(f"BridgeConfig.{name} is {value!r}; allowed: {low:g} to {high:g}")
         if (self.command_age_s - self.margin_s) * self.rate_hz < _LOOKS:
             raise ConfigurationError(
-                f"--command-age-s {self.command_age_s:g} less --margin-s {self.margin_s:g}, with --rate-hz "
-                f"{self.rate_hz:g}: silence is looked for less than {_LOOKS} times within it; choose a "
-                "longer limit or a higher rate"
+                f"--command-age-s {self.command_age_s:g} minus --margin-s {self.margin_s:g}, with "
+                f"--rate-hz {self.rate_hz:g}: silence would be checked less than {_LOOKS} times in it; "
+                "choose a longer limit or a higher rate"
             )
 
 

@@ -1,4 +1,4 @@
-"""What a LowCmd may ask for: the limits of the driver's description, checked again beside the robot."""
+"""Limits of a LowCmd: those of the driver's description, checked again on the robot's computer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 ROUNDING = 1e-5
-"""The wire has float32: a limit that was kept in float64 may be missed by so much of its value."""
+"""Relative tolerance, since the wire has float32: a value at its float64 limit may exceed it by this
+share."""
 
 
 def is_damping(command: LowCommand) -> bool:
-    """Return whether a command brakes every joint and does nothing else; positions do not matter then."""
+    """Return whether a command only brakes every joint; positions have no effect then."""
     return bool(
         (command.mode == MODE_SERVO).all()
         and (command.damping > 0.0).all()
@@ -39,7 +40,10 @@ class CommandLimits:
     def __init__(self, description: RobotDescription, effort_margin: float) -> None:
         limits = description.limits
         if limits.legs is None:
-            raise ConfigurationError(f"robot {description.name!r} has no limits for legs: nothing to bridge")
+            raise ConfigurationError(
+                f"robot {description.name!r} has no limits for legs, so it cannot be "
+                "bridged; the bridge is for go2"
+            )
         slack = 1.0 + ROUNDING
         self._joints = description.actuated
         low, high = np.array(limits.target).T
@@ -50,7 +54,7 @@ class CommandLimits:
         self._predicted = effort_margin * np.array(limits.legs.effort)
 
     def complaint(self, command: LowCommand, frame: LowStateFrame | None) -> str:
-        """Return in words what a command exceeds; "" where it may go out.
+        """Return a text on the limit that a command exceeds; "" if it may be sent.
 
         Args:
             command: As decoded.
@@ -66,7 +70,7 @@ class CommandLimits:
                 f"motor modes {command.mode.tolist()}; allowed are {MODE_OFF} (off) and {MODE_SERVO} (servo)"
             )
         kp, kd = command.stiffness, command.damping
-        # Without a gain a target means nothing: the vendor's "stop" values are far outside any range.
+        # Without a gain a target has no effect; the vendor's "stop" values are far outside any range.
         target = np.where(kp > 0.0, command.position, 0.5 * (self._low + self._high))
         none = np.zeros_like(kp)
         for name, value, low, high, unit in (
@@ -77,11 +81,11 @@ class CommandLimits:
         ):
             if text := self._outside(name, value, low, high, unit):
                 return text
-        # A brake alone only takes energy out, however fast the joint is.
+        # A brake alone only removes energy, at any joint speed.
         if is_damping(command):
             return ""
         if frame is None:
-            return "no sound state of the robot is known, so the torque that it asks for is not either"
+            return "no valid state of the robot is known, so the requested torque is unknown"
         torque = kp * np.where(kp > 0.0, command.position - frame.position, 0.0)
         torque += kd * (np.where(kd > 0.0, command.velocity, 0.0) - frame.velocity) + command.effort
         return self._outside("torque now", torque, -self._predicted, self._predicted, "N·m")

@@ -1,4 +1,4 @@
-"""What the bridge tells its clients on ``rt/deal_hw/bridge``: who has the robot, and why."""
+"""The bridge's status for clients on ``rt/deal_hw/bridge``: who controls the robot, and why."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def encode_status(values: Mapping[str, Any]) -> bytes:
 
 
 def read_status(payload: bytes) -> dict[str, str] | None:
-    """Return ``control`` and ``reason`` as text; None where the message is none of a bridge's."""
+    """Return ``control`` and ``reason`` as text; None if the message is not from a bridge."""
     try:
         values = json.loads(decode_request(payload).parameter)
     except (FrameError, ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""What goes wrong with an emulated Go2 on request: on the wire, in the firmware, in the motors, around it."""
+"""Faults of an emulated Go2 on request: on the wire, in the firmware, in the motors, around it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOMENTS: Final = (
     "stop",
     "push",
 )
-"""Faults that begin at a moment, as in ``<name>_after_s``; ``wire`` is that of the four shares."""
+"""Faults with a start time, as in ``<name>_after_s``; ``wire`` is the start of the four shares."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,43 +32,43 @@ class Go2Faults:
     """Faults of an emulated Go2; times count from the first stiff command."""
 
     reorder: float = 0.0
-    """Share of states that come after their successor."""
+    """Share of states that arrive after their successor."""
 
     wire_after_s: float | None = None
-    """When the shares --drop, --duplicate, --reorder and --corrupt begin [s]; by default at once."""
+    """Start of --drop, --duplicate, --reorder and --corrupt [s]; by default at once."""
 
     stale_after_s: float | None = None
-    """When the same state begins to be sent again and again [s]."""
+    """Time after which the same state is sent again and again [s]."""
 
     lost_after_s: float | None = None
-    """When a motor gives no torque any more and counts lost commands [s]."""
+    """Time after which a motor gives no torque and counts lost commands [s]."""
 
     lost_joint: str = "FL_calf_joint"
-    """That motor."""
+    """The motor of this fault."""
 
     sport_after_s: float | None = None
-    """When sport mode comes back and stands the robot up [s]."""
+    """Time after which sport mode comes back and stands the robot up [s]."""
 
     battery_after_s: float | None = None
-    """When the battery is nearly empty [s]."""
+    """Time after which the battery is nearly empty [s]."""
 
     nan_after_s: float | None = None
-    """When a joint's position and velocity become NaN [s]."""
+    """Time after which a joint's position and velocity are NaN [s]."""
 
     nan_joint: str = "FL_calf_joint"
-    """That joint."""
+    """The joint of this fault."""
 
     hot_after_s: float | None = None
-    """When a motor reports 95 degrees [s]."""
+    """Time after which a motor reports 95 °C [s]."""
 
     hot_joint: str = "FL_calf_joint"
-    """That motor."""
+    """The motor of this fault."""
 
     stop_after_s: float | None = None
-    """When the operator presses L2 and B and holds them [s]."""
+    """Time after which the operator holds L2 and B [s]."""
 
     push_after_s: float | None = None
-    """When somebody pushes the base to its left [s]."""
+    """Time of a push of the base to its left [s]."""
 
     push: float = 25.0
     """The push's impulse, over 0.1 s [N*s]."""
@@ -88,28 +88,28 @@ class Go2Faults:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultPlan(Go2Faults):
-    """All of an emulated Go2's faults: those that every emulated robot has, and its own."""
+    """All faults of an emulated Go2: those of every emulated robot, and its own."""
 
     drop: float = 0.0
     """Share of states that are lost."""
 
     duplicate: float = 0.0
-    """Share of states that come twice."""
+    """Share of states that arrive twice."""
 
     corrupt: float = 0.0
     """Share of states in which one byte is changed."""
 
     freeze_after_s: float | None = None
-    """When the robot says nothing any more; it still hears [s]."""
+    """Time after which the robot sends nothing; it still receives [s]."""
 
     cut_after_s: float | None = None
-    """When the wire is cut: nothing goes out or is heard; the robot does what it was last told [s]."""
+    """Time after which the wire is cut in both directions; the robot keeps its last command [s]."""
 
     cut_s: float = 1.0
     """How long the wire is cut [s]."""
 
     def due(self) -> list[tuple[int, str]]:
-        """Return when faults begin, in ms since the first stiff command, and which; earliest first."""
+        """Return the start of each fault, in ms since the first stiff command, and its name, in order."""
         found = []
         for name in MOMENTS:
             after_s = getattr(self, f"{name}_after_s")
@@ -137,7 +137,7 @@ class StateFaults:
         self._held: bytes | None = None
 
     def apply(self, payload: bytes) -> list[bytes]:
-        """Return what goes out instead of this message, in order."""
+        """Return the messages that replace this one, in order."""
         drop, duplicate, reorder, corrupt = self._rng.random(4) < self._shares
         late = [] if self._held is None else [self._held]
         self._held = None

@@ -45,7 +45,8 @@ def read_remote_script(path: Path) -> tuple[RemoteMoment, ...]:
 def _moment(path: Path, entry: Any) -> RemoteMoment:
     if not isinstance(entry, dict) or "at_s" not in entry or set(entry) - set(_KEYS):
         raise ConfigurationError(
-            f"{path}: {shown(entry)} is no moment; keys: {', '.join(_KEYS)}, at_s always"
+            f"{path}: {shown(entry)} is no valid entry; allowed keys are {', '.join(_KEYS)}, and at_s is "
+            "required"
         )
     at_ms = round(number(entry["at_s"], "at_s", 0.0, 1e6) * 1e3)
     sticks = {name: number(entry.get(name, 0.0), name, -1.0, 1.0) for name in _KEYS[2:6]}

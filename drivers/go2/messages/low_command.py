@@ -89,7 +89,9 @@ class LowCommandEncoder:
         values[0], values[1], values[2] = command.position, command.velocity, command.effort
         values[3], values[4] = command.stiffness, command.damping
         if not self._flat.dot(self._flat) < _LARGEST:
-            raise FrameError("a LowCmd's numbers must be finite and of this world; refusing to send others")
+            raise FrameError(
+                "a LowCmd's numbers must be finite and of a plausible size; this command is not sent"
+            )
         self._rows[...] = values.take(_WIRE_ROWS)
         if (mode := command.mode.tobytes()) != self._mode or command.level != self._level:
             self._set_modes(command)

@@ -14,11 +14,12 @@ from deal_hw.errors import FrameError, ProtocolError, VersionMismatchError, Wron
 StateCheck = Literal["strict", "length"]
 """What a LowState must pass: all, or all but head and checksum."""
 OTHER_RULE: Final = (
-    "the robot's firmware, or a simulator in its place, makes head or checksum by another rule; update "
-    "deal-hw, or go on with `--state-check length`: neither counts then, and a state that was corrupted on "
-    "the way is taken for a true one"
+    "the robot's firmware, or a simulator in its place, has another head or checksum; update deal-hw, or "
+    "continue with `--state-check length`, which checks neither, so corrupted states are not detected"
 )
-ANOTHER_ROBOT: Final = "another robot type (G1 and H1 use this topic, too)? Choose the right robot or network"
+ANOTHER_ROBOT: Final = (
+    "it may be another robot type (G1 and H1 use this topic, too): choose the right robot or network"
+)
 
 
 class Refusals:
@@ -58,13 +59,15 @@ class Refusals:
         """Return what is wrong where every state was refused."""
         if self.by_rule:
             return VersionMismatchError(
-                f"go2: {self._ruled} states have the right length, and none the right head and checksum (the "
-                f"first: {self.first}): {self.remedy}"
+                f"go2: {self._ruled} states have the right length, but none has the right head and "
+                f"checksum (the first: {self.first}): {self.remedy}"
             )
         length = self._lengths.most_common(1)[0][0]
         if length != LOW_STATE_BYTES:
             return WrongDeviceError(
-                f"go2: the messages on {topics.LOW_STATE} have {length} bytes, those of a Go2 "
+                f"go2: the messages on {topics.LOW_STATE} have {length} bytes, but those of a Go2 "
                 f"{LOW_STATE_BYTES}: {ANOTHER_ROBOT}"
             )
-        return WrongDeviceError(f"go2: what comes on {topics.LOW_STATE} is no state of a Go2: {self.first}")
+        return WrongDeviceError(
+            f"go2: the messages on {topics.LOW_STATE} are no states of a Go2: {self.first}"
+        )

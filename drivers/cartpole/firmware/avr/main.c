@@ -20,7 +20,7 @@
 #define LEFT_SWITCH _BV(PD6)
 #define RIGHT_SWITCH _BV(PD7)
 
-/* The settings in EEPROM, from address 0, CRC-16/IBM-3740 last; without them the nominal ones hold. */
+/* The settings in EEPROM, from address 0, CRC-16/IBM-3740 last; without them the nominal ones apply. */
 typedef struct {
     rig_settings settings;
     uint16_t crc;
@@ -81,7 +81,7 @@ ISR(USART_UDRE_vect)
         UCSR0B &= (uint8_t)~_BV(UDRIE0);
 }
 
-/* Queue a frame, or leave it out where it has no room: half a frame would cost the next one, too. */
+/* Queue a frame, or leave it out where it has no room: half a frame would also corrupt the next one. */
 static void send(const uint8_t *frame, uint8_t length)
 {
     uint8_t room = (uint8_t)((tx_out - tx_in - 1) & (TX_SIZE - 1));
@@ -200,7 +200,7 @@ int main(void)
             cli();
             if (!ticks_due && rx_in == rx_out) {
                 sleep_enable();
-                sei(); /* The instruction after it runs before any interrupt, so that none is slept through. */
+                sei(); /* The next instruction runs before any interrupt, so no interrupt is missed by sleeping. */
                 sleep_cpu();
                 sleep_disable();
             }

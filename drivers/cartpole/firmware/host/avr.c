@@ -50,7 +50,7 @@ typedef struct {
     double pwm;             /* Mean over the millisecond, -799 to 799. */
     int32_t armed, set_pole;
     uint32_t longest_step;  /* Most cycles from the start of a control step to its end, in this call. */
-    uint32_t asleep;        /* Cycles in which nothing was to do. */
+    uint32_t asleep;        /* Idle cycles. */
     uint32_t complaints;    /* Errors that the simulator saw in this call, such as a byte that came too soon. */
     int32_t crashed;
 } board_outputs;
@@ -196,7 +196,7 @@ board *board_open(const char *elf, uint8_t *eeprom, uint32_t length)
     b->right = pin(b->avr, 'D', 7);
     b->uart = avr_io_getirq(b->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
     avr_irq_register_notify(avr_io_getirq(b->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), sent, b);
-    b->cart.at = b->pole.at = 2; /* Both pins high, as the pull-ups have them before the first edge. */
+    b->cart.at = b->pole.at = 2; /* Both pins high, by the pull-ups, before the first edge. */
     show(&b->cart);
     show(&b->pole);
     return b;
