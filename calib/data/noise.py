@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
 
 MAD_TO_STD = 1.4826022185056018
 """Of a normal distribution: standard deviation over median absolute deviation."""
@@ -93,7 +98,9 @@ class NoiseModel:
         return np.sqrt(self.position_std**2 + (self.timing_std_s * velocity) ** 2)
 
 
-def white_noise_std(values: FloatArray, settings: DataSettings = SETTINGS) -> FloatArray:
+def white_noise_std(
+    values: FloatArray, settings: DataSettings = SETTINGS, reported: Mask | None = None
+) -> FloatArray:
     """Estimate the standard deviation of white noise on top of smooth motion.
 
     The sixth difference of a smooth motion nearly vanishes while white noise of variance s^2 comes out with
@@ -103,14 +110,23 @@ def white_noise_std(values: FloatArray, settings: DataSettings = SETTINGS) -> Fl
     Args:
         values: Uniformly sampled channels, (T, J).
         settings: Which differences; the least that is returned.
+        reported: Which samples are no fillings of gaps, which are smooth, (T,). None: all.
 
     Returns:
         Standard deviations, (J,).
     """
     order = settings.noise_order
-    if len(values) <= 2 * order:
+    whole = _whole(len(values), order, reported)
+    if whole.sum() <= order:
         return np.full(values.shape[1], settings.floor)
-    return np.maximum(_spread(np.diff(values, n=order, axis=0), order), settings.floor)
+    return np.maximum(_spread(np.diff(values, n=order, axis=0)[whole], order), settings.floor)
+
+
+def _whole(count: int, order: int, reported: Mask | None) -> Mask:
+    """Return which differences of an order hold no sample that was filled in, (T - order,)."""
+    if reported is None or count <= order:
+        return np.ones(max(count - order, 0), dtype=bool)
+    return np.asarray(sliding_window_view(reported, order + 1).all(axis=1))
 
 
 def _spread(difference: FloatArray, order: int) -> FloatArray:
@@ -122,6 +138,7 @@ def noise_model(
     positions: list[FloatArray],
     velocities: list[FloatArray],
     settings: DataSettings = SETTINGS,
+    reported: Sequence[Mask | None] | None = None,
 ) -> NoiseModel:
     """Estimate noise and timing jitter of recordings.
 
@@ -133,16 +150,21 @@ def noise_model(
         positions: Reported positions of each recording, (T, J) each, uniformly sampled.
         velocities: Smoothed velocities, likewise.
         settings: How.
+        reported: Which samples of each are no fillings of gaps, (T,); None: all.
     """
     order, bins, floor = settings.noise_order, settings.speed_bins, settings.floor
-    whole = np.max([white_noise_std(x, settings) for x in positions], axis=0)
-    usable = [i for i, x in enumerate(positions) if len(x) > bins * settings.fewest_in_bin]
+    masks = reported or [None] * len(positions)
+    whole = np.max(
+        [white_noise_std(x, settings, mask) for x, mask in zip(positions, masks, strict=True)], axis=0
+    )
+    kept = [_whole(len(x), order, mask) for x, mask in zip(positions, masks, strict=True)]
+    usable = [i for i, one in enumerate(kept) if one.sum() > bins * settings.fewest_in_bin - order]
     if not usable or np.all(whole <= 10 * floor):
         return NoiseModel(whole, 0.0)
-    difference = np.concatenate([np.diff(positions[i], n=order, axis=0) for i in usable])
+    difference = np.concatenate([np.diff(positions[i], n=order, axis=0)[kept[i]] for i in usable])
     middle = order // 2
     speed2 = np.concatenate(
-        [velocities[i][middle : middle + len(velocities[i]) - order] ** 2 for i in usable]
+        [velocities[i][middle : middle + len(velocities[i]) - order][kept[i]] ** 2 for i in usable]
     )
     slopes, weights = [], []
     lines: list[tuple[FloatArray, FloatArray, FloatArray]] = []
