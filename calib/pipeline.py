@@ -20,12 +20,14 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.channel_weights import Weighed, weigh_channels
 from deal_hw.calib.fit.refinement import Refined, at_parameters, local_fit, refine, refine_robust
 from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
     Uncertainty,
+    mismatch,
     uncertainty_at,
     with_rows,
 )
@@ -197,6 +199,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         # What another minimum leaves can be as small as noise, but it has a pattern.
         if local is not None and conclusive(problem, local, MISMATCH.white_samples):
             found = to_the_noise(run, without_search(problem, budget, local), local)
+        elif local is not None and (weighed := weigh_channels(problem, local)) is not None:
+            found = by_the_model(run, weighed)
         else:
             if local is not None and progress is not None:
                 local = with_rows(local)
@@ -356,6 +360,29 @@ def to_the_noise(
         known=known,
         facts=facts,
     )
+
+
+def by_the_model(run: CalibrationRun, weighed: Weighed) -> FitOutcome:
+    """Judge a fit whose sensors are finer than the model. Its chi2 stays that of the sensors' noise.
+
+    Args:
+        run: The calibration.
+        weighed: The fit.
+    """
+    names = weighed.problem.channel_names
+    words = ", ".join(f"{n} {s:.2g}" for n, s in zip(names, weighed.scale, strict=True) if s > 1)
+    run.say(
+        BEFORE_SEARCH, f"sensors finer than the model are weighed by what it leaves, times noise: {words}"
+    )
+    found = to_the_noise(
+        dataclasses.replace(run, problem=weighed.problem),
+        without_search(weighed.problem, run.budget, weighed.fit),
+        weighed.fit,
+    )
+    known = dataclasses.replace(found.known, alarms=(mismatch(weighed.chi2), *found.known.alarms))
+    scale = dict(zip(names, map(float, weighed.scale), strict=True))
+    facts = {**found.facts, "channel_weights": scale}
+    return dataclasses.replace(found, chi2=weighed.chi2, known=known, facts=facts)
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
