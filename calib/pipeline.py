@@ -20,12 +20,14 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.refinement import Refined, at_parameters, local_fit, refine, refine_robust
 from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
     Uncertainty,
+    mismatch,
     uncertainty_at,
     with_rows,
 )
@@ -196,6 +198,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         # Another minimum can leave a residual as small as noise, but with a pattern.
         if local is not None and conclusive(problem, local, MISMATCH.white_samples):
             found = conclude_fit(run, without_search(problem, budget, local), local)
+        elif local is not None and (weighted := weight_channels(problem, local)) is not None:
+            found = conclude_weighted(run, weighted)
         else:
             if local is not None and progress is not None:
                 local = with_rows(local)
@@ -347,6 +351,26 @@ def conclude_fit(
         known=known,
         facts=facts,
     )
+
+
+def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
+    """Conclude a fit whose sensors are finer than the model. Its chi2 stays relative to the sensors' noise."""
+    names = weighted.problem.channel_names
+    scale = dict(zip(names, map(float, weighted.scale), strict=True))
+    words = ", ".join(f"{name} {value:.2g}" for name, value in scale.items() if value > 1)
+    run.say(
+        BEFORE_SEARCH,
+        "these sensors are finer than the model; the fit weights them by the model's residual "
+        f"(multiples of their noise): {words}",
+    )
+    found = conclude_fit(
+        dataclasses.replace(run, problem=weighted.problem),
+        without_search(weighted.problem, run.budget, weighted.fit),
+        weighted.fit,
+    )
+    known = dataclasses.replace(found.known, alarms=(mismatch(weighted.chi2), *found.known.alarms))
+    facts = {**found.facts, "channel_weights": scale}
+    return dataclasses.replace(found, chi2=weighted.chi2, known=known, facts=facts)
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

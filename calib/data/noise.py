@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
 
 MAD_TO_STD = 1.4826022185056018
 """Of a normal distribution: standard deviation over median absolute deviation."""
@@ -90,17 +95,27 @@ class NoiseModel:
         return np.sqrt(self.position_std**2 + (self.timing_std_s * velocity) ** 2)
 
 
-def white_noise_std(values: FloatArray, settings: DataSettings = SETTINGS) -> FloatArray:
+def white_noise_std(
+    values: FloatArray, settings: DataSettings = SETTINGS, reported: Mask | None = None
+) -> FloatArray:
     """Estimate the standard deviation of white noise on top of smooth motion, (J,), from samples (T, J).
 
     The sixth difference of a smooth motion nearly vanishes. That of white noise with variance s^2 has
     variance 924 s^2 (the sum of the squared binomial coefficients). The median ignores impacts and
-    stick-slip.
+    stick-slip. Samples that filled a gap, False in ``reported``, (T,), are smooth and do not count.
     """
     order = settings.noise_order
-    if len(values) <= 2 * order:
+    whole = _whole(len(values), order, reported)
+    if whole.sum() <= order:
         return np.full(values.shape[1], settings.floor)
-    return np.maximum(_spread(np.diff(values, n=order, axis=0), order), settings.floor)
+    return np.maximum(_spread(np.diff(values, n=order, axis=0)[whole], order), settings.floor)
+
+
+def _whole(count: int, order: int, reported: Mask | None) -> Mask:
+    """Return which differences contain no filled sample, (T - order,)."""
+    if reported is None or count <= order:
+        return np.ones(max(count - order, 0), dtype=bool)
+    return np.asarray(sliding_window_view(reported, order + 1).all(axis=1))
 
 
 def _spread(difference: FloatArray, order: int) -> FloatArray:
@@ -112,22 +127,27 @@ def noise_model(
     positions: list[FloatArray],
     velocities: list[FloatArray],
     settings: DataSettings = SETTINGS,
+    reported: Sequence[Mask | None] | None = None,
 ) -> NoiseModel:
     """Estimate noise and timing jitter from positions and smoothed velocities of recordings, (T, J) each.
 
     The noise is estimated in bins of equal speed, joint by joint. A straight line is fitted to its square
     over the squared speed. The intercept is the noise at rest; the slope, shared by all joints, is the
-    jitter's variance.
+    jitter's variance. ``reported`` holds a mask for each recording, as in :func:`white_noise_std`.
     """
     order, bins, floor = settings.noise_order, settings.speed_bins, settings.floor
-    whole = np.max([white_noise_std(x, settings) for x in positions], axis=0)
-    usable = [i for i, x in enumerate(positions) if len(x) > bins * settings.fewest_in_bin]
+    masks = reported or [None] * len(positions)
+    whole = np.max(
+        [white_noise_std(x, settings, mask) for x, mask in zip(positions, masks, strict=True)], axis=0
+    )
+    kept = [_whole(len(x), order, mask) for x, mask in zip(positions, masks, strict=True)]
+    usable = [i for i, one in enumerate(kept) if one.sum() > bins * settings.fewest_in_bin - order]
     if not usable or np.all(whole <= 10 * floor):
         return NoiseModel(whole, 0.0)
-    difference = np.concatenate([np.diff(positions[i], n=order, axis=0) for i in usable])
+    difference = np.concatenate([np.diff(positions[i], n=order, axis=0)[kept[i]] for i in usable])
     middle = order // 2
     speed2 = np.concatenate(
-        [velocities[i][middle : middle + len(velocities[i]) - order] ** 2 for i in usable]
+        [velocities[i][middle : middle + len(velocities[i]) - order][kept[i]] ** 2 for i in usable]
     )
     slopes, weights = [], []
     lines: list[tuple[FloatArray, FloatArray, FloatArray]] = []

@@ -177,7 +177,8 @@ class Problem:
         found = np.full(2 * self.coordinates, floor)
         for e in self.episodes:
             values = np.concatenate([e.position, e.velocity], axis=1)[:, self.channels]
-            found[self.channels] = np.maximum(found[self.channels], white_noise_std(values, self.settings))
+            std = white_noise_std(values, self.settings, e.reported)
+            found[self.channels] = np.maximum(found[self.channels], std)
         return self._with_given_noise(found, np.arange(2 * self.coordinates))
 
     def _noise_model(self) -> NoiseModel:
@@ -189,7 +190,9 @@ class Problem:
         timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
         columns = self.channels[timed]
         positions = [e.position[:, columns] for e in self.episodes]
-        moved = noise_model(positions, [s.velocity[:, columns] for s in self.starts], self.settings)
+        speeds = [s.velocity[:, columns] for s in self.starts]
+        reported = [e.reported for e in self.episodes]
+        moved = noise_model(positions, speeds, self.settings, reported)
         std = self.noise_std[self.channels]
         std[timed] = moved.position_std
         return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
@@ -227,6 +230,12 @@ class Problem:
         """Return the problem of other recordings; noise is estimated again, simulators are shared."""
         other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
         other._batches = self._batches
+        return other
+
+    def with_noise(self, scale: FloatArray) -> Problem:
+        """Return the problem with the noise of each channel multiplied by ``scale``, (M,)."""
+        other = copy.copy(self)
+        other.noise = NoiseModel(self.noise.position_std * scale, self.noise.timing_std_s)
         return other
 
     def with_more(self, parameters: Sequence[Parameter]) -> Problem:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from deal_hw.bench.tasks import Case
@@ -161,6 +162,18 @@ def test_white_noise_is_measured_under_motion() -> None:
     t = np.arange(800) * 5e-3
     values = 0.05 * np.sin(2 * np.pi * t)[:, None] + np.random.default_rng(0).normal(0, 3e-4, (800, 1))
     assert white_noise_std(values)[0] == pytest.approx(3e-4, rel=0.15)
+
+
+def test_what_was_filled_in_is_not_taken_for_quiet_samples() -> None:
+    """Lost samples get a spline, which has no noise: with one in twelve lost it looked a quarter less."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0, 60, 0.005)
+    values = (0.1 * np.sin(6.0 * t) + 3e-4 * rng.standard_normal(t.size))[:, None]
+    reported = np.ones(t.size, dtype=bool)
+    reported[5:-5:12] = False
+    values[~reported] = CubicSpline(t[reported], values[reported])(t[~reported])
+    assert white_noise_std(values)[0] < 0.9 * 3e-4
+    assert white_noise_std(values, reported=reported)[0] == pytest.approx(3e-4, rel=0.1)
 
 
 def test_timing_jitter_is_told_from_noise() -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
@@ -46,11 +46,24 @@ class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
         return [*whole[:5], *(len(body) + 2).to_bytes(2, "little"), *body, *whole[-2:]]
 
 
+Writes: TypeAlias = Sequence[tuple[int, Mapping[int, bytes]]]
+"""Sync writes: an address, and the bytes that each servo gets there."""
+
+
 class Answer(NamedTuple):
     """A servo's answer to a ping."""
 
     model: int
     firmware: int
+
+
+class _Wanted(NamedTuple):
+    """A requested answer: servos, bytes of each, whether in one packet, deadline [ns]."""
+
+    ids: tuple[int, ...]
+    size: int
+    fast: bool
+    until_ns: int
 
 
 class _Port:
@@ -170,10 +183,7 @@ class Bus:
         self._clock = clock
         self._port = _Port(transport, clock, baud_rate, answer_s)
         self._sdk: Any = _Packets()
-        self._ids: tuple[int, ...] = ()
-        self._size = 0
-        self._fast = False
-        self._until_ns = 0
+        self._wanted: deque[_Wanted] = deque()
 
     @property
     def heard(self) -> int:
@@ -259,21 +269,33 @@ class Bus:
                 f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {said}"
             )
 
-    def post(self, writes: Sequence[tuple[int, Mapping[int, bytes]]]) -> int:
+    def post(self, writes: Writes) -> int:
         """Write registers in one message without waiting; return the send time [ns].
 
         Args:
             writes: Sync writes, in order: an address, and the bytes of each servo.
         """
-        for address, values in writes:
-            size = len(next(iter(values.values())))
-            params = [byte for servo, data in values.items() for byte in (servo, *data)]
-            self._sdk.syncWriteTxOnly(self._port, address, size, params, len(params))
+        self._write(writes)
         now_ns = self._clock.now_ns()
         self._port.flush()
         return now_ns
 
-    def ask(self, servos: Sequence[int], address: int, size: int, *, fast: bool) -> int:
+    def _write(self, writes: Writes) -> None:
+        for address, values in writes:
+            size = len(next(iter(values.values())))
+            params = [byte for servo, data in values.items() for byte in (servo, *data)]
+            self._sdk.syncWriteTxOnly(self._port, address, size, params, len(params))
+
+    def ask(
+        self,
+        servos: Sequence[int],
+        address: int,
+        size: int,
+        *,
+        fast: bool,
+        writes: Writes = (),
+        behind: bool = False,
+    ) -> int:
         """Request the same registers of servos in one message; return the send time [ns].
 
         Args:
@@ -281,13 +303,18 @@ class Bus:
             address: The first register.
             size: Number of bytes of each.
             fast: Whether they answer in one packet (Fast Sync Read) or each in its own.
+            writes: Sync writes before it in the same message, as in :meth:`post`.
+            behind: Wait for this answer after the one before it; otherwise that one is forgotten.
         """
-        self._port.drop()
-        self._ids, self._size, self._fast = tuple(servos), size, fast
+        if not behind:
+            self._port.drop()
+            self._wanted.clear()
+        self._write(writes)
         self._sdk.syncReadTx(self._port, address, size, list(servos), len(servos), fast)
         now_ns = self._clock.now_ns()
         self._port.flush()
-        self._until_ns = now_ns + self._port.answer_ns(self.answer_bytes(len(servos), size, fast) + 16)
+        until_ns = now_ns + self._port.answer_ns(self.answer_bytes(len(servos), size, fast) + 16)
+        self._wanted.append(_Wanted(tuple(servos), size, fast, until_ns))
         return now_ns
 
     @staticmethod
@@ -296,7 +323,7 @@ class Bus:
         return 8 + servos * (size + 4) if fast else servos * (size + _STATUS_BYTES)
 
     def take(self, deadline_ns: int) -> dict[int, bytes] | None:
-        """Return the group's registers by id, waiting for them until a deadline at most.
+        """Return the registers of the oldest question by id, waiting for them until a deadline at most.
 
         Returns:
             None if no complete answer arrived until the deadline, but may still arrive.
@@ -305,27 +332,29 @@ class Bus:
             TransportTimeoutError: The servos are silent.
             FrameError: The answer is corrupt.
         """
-        while not self._whole():
-            if self._clock.now_ns() >= self._until_ns:
+        wanted = self._wanted[0]
+        while not self._whole(wanted):
+            if self._clock.now_ns() >= wanted.until_ns:
                 self.errors += 1
+                self._wanted.popleft()
                 if self._port.buffer:
-                    raise FrameError(f"the answer of servos {self._ids} is corrupt or incomplete")
-                raise TransportTimeoutError(f"servos {self._ids} do not answer")
-            if not self._port.receive(min(deadline_ns, self._until_ns)) and (
+                    raise FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
+                raise TransportTimeoutError(f"servos {wanted.ids} do not answer")
+            if not self._port.receive(min(deadline_ns, wanted.until_ns)) and (
                 self._clock.now_ns() >= deadline_ns
             ):
                 return None
         self._port.expire()
+        self._wanted.popleft()
         try:
-            found = self._fast_answer() if self._fast else self._answers()
+            return self._fast_answer(wanted) if wanted.fast else self._answers(wanted)
         except (IndexError, FrameError) as error:
             self.errors += 1
-            raise FrameError(f"the answer of servos {self._ids} is corrupt") from error
-        return found
+            raise FrameError(f"the answer of servos {wanted.ids} is corrupt") from error
 
-    def _whole(self) -> bool:
+    def _whole(self, answer: _Wanted) -> bool:
         """Return whether the buffer contains all requested packets; the SDK checks their content."""
-        at, wanted = 0, 1 if self._fast else len(self._ids)
+        at, wanted = 0, 1 if answer.fast else len(answer.ids)
         while wanted:
             at = self._port.buffer.find(HEADER, at)
             if at < 0 or len(self._port.buffer) < at + 7:
@@ -336,34 +365,29 @@ class Bus:
             wanted -= 1
         return True
 
-    def _fast_answer(self) -> dict[int, bytes]:
+    def _fast_answer(self, wanted: _Wanted) -> dict[int, bytes]:
         packet, result = self._sdk.rxPacket(self._port, True)
         if result != COMM_SUCCESS or packet[4] != _BROADCAST or packet[7] != _STATUS:
             raise FrameError("no sound packet")
-        if len(packet) > self.answer_bytes(len(self._ids), self._size, True):
+        if len(packet) > self.answer_bytes(len(wanted.ids), wanted.size, True):
             # The SDK expects such answers without stuffing; the length shows whether a servo stuffs them.
             packet = self._sdk.removeStuffing(packet)
         found = {}
-        for k, servo in enumerate(self._ids):
-            at = 8 + k * (self._size + 4)
+        for k, servo in enumerate(wanted.ids):
+            at = 8 + k * (wanted.size + 4)
             if packet[at + 1] != servo:
                 raise FrameError("another servo's answer")
-            found[servo] = bytes(packet[at + 2 : at + 2 + self._size])
-        return self._sized(found)
+            found[servo] = bytes(packet[at + 2 : at + 2 + wanted.size])
+        return _sized(found, wanted.size)
 
-    def _answers(self) -> dict[int, bytes]:
+    def _answers(self, wanted: _Wanted) -> dict[int, bytes]:
         found = {}
-        for servo in self._ids:
+        for servo in wanted.ids:
             packet, result = self._sdk.rxPacket(self._port, False)
             if result != COMM_SUCCESS or packet[4] != servo:
                 raise FrameError("no sound packet")
-            found[servo] = bytes(packet[9 : 9 + self._size])
-        return self._sized(found)
-
-    def _sized(self, found: dict[int, bytes]) -> dict[int, bytes]:
-        if any(len(data) != self._size for data in found.values()):
-            raise FrameError("too short")
-        return found
+            found[servo] = bytes(packet[9 : 9 + wanted.size])
+        return _sized(found, wanted.size)
 
     def _check(self, servo: int, result: int, whole: bool = True) -> None:
         if result == COMM_SUCCESS and whole:
@@ -373,3 +397,9 @@ class Bus:
         if "no status packet" in said:
             raise TransportTimeoutError(f"servo {servo} does not answer")
         raise FrameError(f"servo {servo}: {said or 'a short answer'}")
+
+
+def _sized(found: dict[int, bytes], size: int) -> dict[int, bytes]:
+    if any(len(data) != size for data in found.values()):
+        raise FrameError("too short")
+    return found

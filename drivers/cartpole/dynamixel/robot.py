@@ -53,11 +53,12 @@ def _hardware_error(servo: int, block: Block) -> str:
 
 
 class _Sent(NamedTuple):
-    """A command that went out."""
+    """A command that went out; when the belt servo got it by its own clock, -1 where it did not say [ns]."""
 
     sequence: int
     sent_ns: int
     goal: Goal
+    received_ns: int = -1
 
 
 class DynamixelCartpole(Robot):
@@ -66,7 +67,9 @@ class DynamixelCartpole(Robot):
     Servos say nothing unless asked, so :meth:`read_state` asks them, ``state_rate_hz`` times a second, the
     last time so that the answer is there when the caller's time is over: question, answer and command do not
     meet on the half-duplex wire, and the policy gets a fresh state. A state needs both servos. What the belt
-    servo was told comes back with every sample: a command counts as in force once the servo shows it.
+    servo was told comes back with every sample: a command counts as in force once the servo shows it. When it
+    got it is asked for with the command itself: this computer's own times are off by what its scheduler and
+    the adapter do, which a calibration takes for another motion.
 
     There are two watchdogs: the belt servo's own (Bus Watchdog) stops it when this computer falls silent, and
     the driver switches the torque off when states are read but commands stay away.
@@ -113,6 +116,7 @@ class DynamixelCartpole(Robot):
         self._next_ns = self._asked_ns = self._alive_ns = 0
         self._round_trip_ns = self._needed_ns = _FIRST_ROUND_TRIP_NS
         self._asked: tuple[int, ...] = ()
+        self._stamping = False
         self._pair_misses = 0
         self._misses = dict.fromkeys(servos, 0)
         self._zero = 0
@@ -149,7 +153,7 @@ class DynamixelCartpole(Robot):
     def reopen(self) -> None:
         """Open the port again where it vanished."""
         self._transport.reopen()
-        self._asked = ()
+        self._asked, self._stamping = (), False
 
     def home(self, timeout_s: float) -> None:
         """Find the middle of the rail, move the cart there, then wait until a hand has set the pole upright.
@@ -188,7 +192,7 @@ class DynamixelCartpole(Robot):
         self.servos.torque_on(Goal(0, 0, 0, 1, cart.present_position), deadline_ns)
         self._written = None
         self._states.clear()
-        self._asked, self._stopped = (), False
+        self._asked, self._stamping, self._stopped = (), False, False
         while Status.ARMED not in (state := self.read_state(self._left_s(deadline_ns))).status:
             continue
         self._states.append(state)
@@ -221,6 +225,8 @@ class DynamixelCartpole(Robot):
         while not self._states:
             if self._asked:
                 self._take(deadline_ns)
+            elif self._stamping:
+                self._take_stamp(deadline_ns)
             elif max(self._clock.now_ns(), self._next_ns) + self._needed_ns <= deadline_ns:
                 self._clock.sleep_until_ns(self._next_ns)
                 self._ask()
@@ -255,6 +261,20 @@ class DynamixelCartpole(Robot):
         self._asked_ns = self.servos.ask(self._asked)
         late = max(0, now_ns - self._next_ns) // self._period_ns
         self._next_ns += (1 + late) * self._period_ns
+
+    def _take_stamp(self, deadline_ns: int) -> None:
+        """Take the belt servo's clock at its newest command."""
+        try:
+            tick_ms = self.servos.take_tick(deadline_ns)
+        except (TransportTimeoutError, FrameError):
+            self._stamping = False
+            return
+        if tick_ms is None:
+            return
+        self._stamping, sent = False, self._sent[-1]
+        time_ms = self._ticks[self._servos[0]].read(tick_ms, sent.sent_ns)
+        # Ticks are whole milliseconds: it came within this one.
+        self._sent[-1] = sent._replace(received_ns=time_ms * 1_000_000 + 500_000)
 
     def _take(self, deadline_ns: int) -> None:
         try:
@@ -363,7 +383,12 @@ class DynamixelCartpole(Robot):
             self._written = None
         if found is None or (self._in_force is not None and self._in_force[0] == found.sequence):
             return
-        received_ns = min(sampled_ns - (self._asked_ns - found.sent_ns), device_ns)
+        received_ns = found.received_ns
+        if received_ns < 0:
+            received_ns = min(sampled_ns - (self._asked_ns - found.sent_ns), device_ns)
+        if received_ns > device_ns:
+            # The sample was moved back to its point on the grid, where the command was not there yet.
+            return
         self._in_force = (found.sequence, received_ns)
         while self._sent[0] is not found:
             self._sent.popleft()
@@ -392,7 +417,8 @@ class DynamixelCartpole(Robot):
             SafetyError: A value is not finite.
         """
         goal = self.settings.to_goal(command, self._zero, self.servos.most_effort)
-        sent_ns = self.servos.send(goal, self._written)
+        sent_ns = self.servos.send(goal, self._written, stamped=True, behind=bool(self._asked))
+        self._stamping = True
         self._written, self._alive_ns = goal, sent_ns
         self._sequence += 1
         self._sent.append(_Sent(self._sequence, sent_ns, goal))
@@ -405,8 +431,9 @@ class DynamixelCartpole(Robot):
         """
         self._states.clear()
         self._armed, self._stopped = False, True
-        if self._asked:
+        if self._asked or self._stamping:
             self._asked, self._next_ns = (), self._clock.now_ns() + self._round_trip_ns
+        self._stamping = False
         self.servos.torque_off()
 
     @property

@@ -19,6 +19,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     POSITION_D_GAIN,
     PROFILE_ACCELERATION,
     PULSES,
+    REALTIME_TICK,
     TORQUE_ENABLE,
     WATCHDOG_UNIT_S,
     Block,
@@ -83,8 +84,22 @@ class Servos:
             else:
                 raise TransportTimeoutError("cartpole: the servos' answer did not come in time")
 
-    def send(self, goal: Goal, before: Goal | None = None) -> int:
-        """Write a goal, of gains and effort limit what differs from the goal before; return when [ns]."""
+    def take_tick(self, deadline_ns: int) -> int | None:
+        """Return the belt servo's clock when it got a goal [ms]; as :meth:`Bus.take`."""
+        found = self._bus.take(deadline_ns)
+        return None if found is None else int.from_bytes(found[self._settings.cart_id], "little")
+
+    def send(
+        self, goal: Goal, before: Goal | None = None, *, stamped: bool = False, behind: bool = False
+    ) -> int:
+        """Write a goal, of gains and effort limit what differs from the goal before; return when [ns].
+
+        Args:
+            goal: What the belt servo gets.
+            before: What it has.
+            stamped: Ask in the same message for the servo's clock; :meth:`take_tick` has the answer.
+            behind: That answer comes after one that is still under way.
+        """
         cart = self._settings.cart_id
         writes = []
         if before is None or (goal.d_gain, goal.p_gain) != (before.d_gain, before.p_gain):
@@ -92,7 +107,11 @@ class Servos:
         if before is None or goal.effort != before.effort:
             writes.append((self._effort.address, {cart: struct.pack("<H", goal.effort)}))
         motion = struct.pack("<IIi", 0, goal.profile_velocity, goal.position)
-        return self._bus.post([*writes, (PROFILE_ACCELERATION.address, {cart: motion})])
+        writes.append((PROFILE_ACCELERATION.address, {cart: motion}))
+        if not stamped:
+            return self._bus.post(writes)
+        tick = REALTIME_TICK
+        return self._bus.ask((cart,), tick.address, tick.size, fast=False, writes=writes, behind=behind)
 
     def torque_on(self, goal: Goal, deadline_ns: int) -> None:
         """Give the belt servo a goal, then torque, with its watchdog running.
