@@ -103,6 +103,11 @@ def render(inputs: ReportInputs) -> str:
             if word in result.verdicts
         ],
         weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
+        untold=[
+            n
+            for n, v in zip(result.space.names, result.verdicts, strict=False)
+            if v == "not identifiable" and not any(n in words for words in result.null_directions)
+        ],
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
         windows=list(dict.fromkeys(short(shown.window_s) for shown in inputs.overlays)),
         panels_each=charts.SETTINGS.panels,

@@ -311,6 +311,12 @@ def test_what_the_data_cannot_tell_gets_no_value() -> None:
     assert "estimate 11.3" in text and "13.7" not in text and "no value" in text
 
 
+def test_an_open_parameter_is_named_without_a_direction() -> None:
+    """The page does not say "Nothing" beside a parameter without a value."""
+    text = Tags(render(inputs(result(space(), verdicts=("identifiable", "not identifiable"))))).text()
+    assert "p1: not identifiable. Nearly the whole range" in text and "Nothing: every" not in text
+
+
 def test_a_bare_result_makes_a_page_too() -> None:
     """Without covariance, population, verdicts, scan and recordings there are words in their place."""
     found = result(

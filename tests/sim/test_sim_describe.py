@@ -124,7 +124,7 @@ def test_motors_are_known_and_mixtures_refused(tmp_path: Path) -> None:
     [
         (('kp="300" kv="4"', 'kp="300" dyntype="integrator"'), None),
         (('<position name="first"', '<velocity name="first" kv="2"/><position name="first"'), None),
-        (('kp="10" kv="0.5"', 'kp="10" gear="2"'), "gear 2"),
+        (('kp="10" kv="0.5"', 'kp="10" gear="2"'), "gear 2, .*forcerange times the gear"),
         (('<joint name="rail"', '<joint name="extra" axis="1 0 0"/><joint name="rail"'), "extra"),
     ],
 )

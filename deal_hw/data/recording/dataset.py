@@ -145,7 +145,8 @@ class Dataset:
         folder = Path(folder)
         if not (folder / INDEX_NAME).is_file():
             raise DatasetError(
-                f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one"
+                f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, "
+                "`deal-hw data import` one of files"
             )
         try:
             lock = _lock(folder)

@@ -173,7 +173,10 @@ def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[st
             "the column map, or remove them from a copy of the MJCF"
         )
     if not actuated:
-        raise ConfigurationError("no recorded joint has commands; name the `target` in the column map")
+        raise ConfigurationError(
+            "no recorded joint has commands: name the `target` in the column map, or give the model an "
+            "actuator, such as <position joint=... kp=...>, where it has none"
+        )
 
 
 def _actuation(model: Any, actuator: int, joint: str) -> str:
@@ -190,7 +193,8 @@ def _actuation(model: Any, actuator: int, joint: str) -> str:
         if not np.isclose(model.actuator_gear[actuator, 0], 1.0):
             raise ConfigurationError(
                 f"position actuator {name!r} has gear {model.actuator_gear[actuator, 0]:g}, recordings hold "
-                "joint positions; write gear 1 and kp, kv times the gear squared"
+                "joint positions; write gear 1, kp and kv times the gear squared, forcerange times the gear, "
+                "ctrlrange divided by it"
             )
         return "position"
     if plain and not affine and not np.any(bias):
