@@ -354,7 +354,7 @@ def conclude_fit(
 
 
 def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
-    """Conclude a fit whose sensors are finer than the model. Its chi2 stays relative to the sensors' noise."""
+    """Conclude a fit whose sensors are finer than the model; its chi2 is relative to the sensors' noise."""
     names = weighted.problem.channel_names
     scale = dict(zip(names, map(float, weighted.scale), strict=True))
     words = ", ".join(f"{name} {value:.2g}" for name, value in scale.items() if value > 1)
