@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from deal_hw.data.files import dataset_of
+from deal_hw.data.files import INDEX_NAME, dataset_of
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
@@ -81,6 +81,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         DatasetError: A recording cannot be read, understood or trusted.
         ConfigurationError: The column map, model or description cannot be used.
     """
+    from deal_hw.data.importing.channels import digest_of_file
     from deal_hw.data.importing.columns import read_column_map
     from deal_hw.data.importing.grid import common_period, to_trajectories
     from deal_hw.data.importing.load import load_tables
@@ -113,7 +114,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         for table in checked
     }
     if robot is None and described is None and config.model is not None:
-        robot = derived_robot(config.model, config.name, tables, say)
+        robot = derived_robot(config.model, config.name, tables)
     period = common_period(checked)
     if robot is None:
         recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
@@ -128,6 +129,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
             f"{how['file']}{stretch}: {part.trajectory.duration_s:.4g} s at {1 / period:.6g} Hz, samples "
             f"{how['method']}, largest shift {how['largest_shift_s'] * 1e3:.3g} ms"
         )
+    # The source of each new episode, as it is noted in the dataset.
+    sources = [_source(e.path.name, digest_of_file(e.path)) for e in episodes]
+    sources += [_source(**part.trajectory.metadata["import"]) for part in recordings]
+    _refuse_copies(config.out, sources, say)
     if config.dry_run:
         return None
     values = described or minimal_description(
@@ -144,9 +149,37 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
 
         with Dataset.create_or_open(config.out, values, say):
             carry(robot, config.out)
-    return write_dataset(
-        config.out, recordings, values, {"plausibility": problems}, say, [e.path for e in episodes]
-    )
+    noted = [{"plausibility": problems, "source": source} for source in sources]
+    return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
+
+
+def _source(file: str, sha256: str, part: str = "", stretch: int = 0, **_: Any) -> dict[str, Any]:
+    return {"file": file, "sha256": sha256, "part": part, "stretch": stretch}
+
+
+def _refuse_copies(folder: Path, sources: Sequence[Mapping[str, Any]], say: Say) -> None:
+    """Refuse to import the same recording twice: a copy could be fitted and held out at the same time.
+
+    Raises:
+        DatasetError: A recording is in the dataset already, or is given twice.
+    """
+    from deal_hw.data.recording.dataset import Dataset
+
+    taken: dict[tuple[Any, ...], str] = {}
+    kept = Dataset.open(folder, say).episodes if (folder / INDEX_NAME).is_file() else ()
+    for index, episode in enumerate(kept):
+        taken[_content(episode.facts.get("source", {}))] = f"episode {index} of {folder}"
+    for source in sources:
+        if _content(source) in taken:
+            raise DatasetError(
+                f"{source['file']} is a copy of {taken[_content(source)]}; a copy counts twice, and can be "
+                "fitted and held out at the same time. Leave it out, or name another folder"
+            )
+        taken[_content(source)] = source["file"]
+
+
+def _content(source: Mapping[str, Any]) -> tuple[Any, ...]:
+    return source.get("sha256"), source.get("part"), source.get("stretch")
 
 
 def _as_recorded(config: ImportSettings, say: Say) -> tuple[list[Episode], list[Path]]:

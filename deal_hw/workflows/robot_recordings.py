@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.recordings import common_rates
 from deal_hw.workflows.robot import is_ours
-from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
@@ -19,14 +18,16 @@ if TYPE_CHECKING:
     from deal_hw.sim.robots.user_robot import UserRobot
 
 
-def derived_robot(model: Path, name: str, tables: Sequence[Table], say: Say) -> UserRobot | None:
-    """Return the robot that a model describes; None, with a reason, if no later verb could use it.
+def derived_robot(model: Path, name: str, tables: Sequence[Table]) -> UserRobot | None:
+    """Return the robot that a model describes; None for a robot of ours, which later verbs know by name.
 
     Args:
         model: The MJCF.
         name: The robot's name; "": the file's name.
         tables: Its recordings.
-        say: Called with the reason.
+
+    Raises:
+        ConfigurationError: `inspect` and `calibrate` could not use it.
     """
     from deal_hw.data.importing.grid import common_period
     from deal_hw.sim.robots.user_robot import derive_robot
@@ -39,8 +40,11 @@ def derived_robot(model: Path, name: str, tables: Sequence[Table], say: Say) -> 
         for table in tables:
             _check_joints(robot, table)
     except ConfigurationError as err:
-        say(f"the dataset keeps no robot, so `inspect` and `calibrate` cannot use it: {err}")
-        return None
+        err.args = (
+            f"{err}. `calibrate` and `inspect` could not use the dataset: correct the model or the column "
+            "map, or import without --model",
+        )
+        raise
     return robot
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +16,7 @@ import pytest
 from deal_hw.cli.data import Export, Import, data
 from deal_hw.cli.main import parse
 from deal_hw.data.checks.plausibility import examine
+from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.columns import parse_column_map, read_column_map
 from deal_hw.data.importing.load import load_recordings, load_tables
 from deal_hw.data.importing.table import Table
@@ -44,6 +46,9 @@ MODEL = """
       </body>
     </body>
   </worldbody>
+  <actuator>
+    <position joint="knee" kp="10"/><position joint="hip" kp="10"/><position joint="foot" kp="10"/>
+  </actuator>
 </mujoco>
 """
 
@@ -89,12 +94,42 @@ def test_import_and_export(
     trajectory = dataset.read(0).trajectory
     np.testing.assert_allclose(trajectory.position, make_table().position[:, [1, 0, 2]], atol=1e-12)
     assert trajectory.metadata["import"]["file"] == "rec.csv"
-    assert dataset.episodes[0].facts == {"plausibility": {"rec.csv": []}}
+    source = {"file": "rec.csv", "sha256": digest_of_file(recording), "part": "", "stretch": 0}
+    assert dataset.episodes[0].facts == {"plausibility": {"rec.csv": []}, "source": source}
     assert data(Export(path=out, out=tmp_path / "lerobot", task="wave")) == 0
     assert "1 LeRobot episodes of robot" in capsys.readouterr().out
     (back,) = load_recordings([tmp_path / "lerobot"])
     np.testing.assert_allclose(back.trajectory.position, trajectory.position, atol=1e-6)
     assert data(Export(path=dataset.path(0), out=tmp_path / "again")) == 0
+
+
+def test_a_recording_is_imported_once(recording: Path, tmp_path: Path) -> None:
+    """A copy under another name is refused, in the same call and in a later one; nothing is written."""
+    copy, out = tmp_path / "copy.csv", tmp_path / "dataset"
+    copy.write_bytes(recording.read_bytes())
+    with pytest.raises(DatasetError, match=r"copy.csv is a copy of rec.csv.*Leave it out"):
+        data(Import(paths=(recording, copy), out=out))
+    assert not out.exists()
+    assert data(Import(paths=(recording,), out=out)) == 0
+    with pytest.raises(DatasetError, match=r"copy.csv is a copy of episode 0 of .*dataset"):
+        data(Import(paths=(copy,), out=out))
+    assert len(Dataset.open(out).episodes) == 1
+    # An episode of ours is known by its own bytes.
+    other = tmp_path / "other"
+    assert data(Import(paths=(out,), out=other)) == 0
+    with pytest.raises(DatasetError, match="is a copy of episode 0"):
+        data(Import(paths=(out / "episodes" / "000000.mcap",), out=other))
+
+
+def test_a_model_that_no_later_verb_can_use_is_refused(recording: Path, tmp_path: Path) -> None:
+    """Without an actuator: nothing is written, and the same folder takes the mended model."""
+    model, out = tmp_path / "robot.xml", tmp_path / "dataset"
+    model.write_text(re.sub("<actuator>.*</actuator>", "", MODEL, flags=re.S))
+    with pytest.raises(ConfigurationError, match=r"an actuator.*could not use the dataset.*without --model"):
+        data(Import(paths=(recording,), out=out, model=model))
+    assert not out.exists()
+    model.write_text(MODEL)
+    assert data(Import(paths=(recording,), out=out, model=model)) == 0
 
 
 def test_import_refuses_what_is_not_plausible(
@@ -125,9 +160,9 @@ def test_import_with_a_description_and_dry_run(recording: Path, tmp_path: Path) 
     description = Dataset.open(first).description
     path = tmp_path / "description.json"
     path.write_text(json.dumps({**description, "name": "other"}))
-    data(Import(paths=(recording, recording), out=tmp_path / "second", description=path))
+    data(Import(paths=(recording,), out=tmp_path / "second", description=path))
     second = Dataset.open(tmp_path / "second")
-    assert second.description["name"] == "other" and len(second.episodes) == 2
+    assert second.description["name"] == "other" and len(second.episodes) == 1
     path.write_text("{}")
     with pytest.raises(ConfigurationError, match="name, joint_names, actuated"):
         data(Import(paths=(recording,), out=first, description=path))

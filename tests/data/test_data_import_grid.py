@@ -234,7 +234,7 @@ def test_dataset_of_an_import_reads_back(make_table: MakeTable, tmp_path: Path) 
     table = jittered(make_table(effort=np.ones((1200, 3))), 0.01)
     recordings = to_trajectories(table, GAINS)
     description = robot(table, grid_rate(table), 5)
-    dataset = write_dataset(tmp_path / "dataset", recordings, description, {"plausibility": []})
+    dataset = write_dataset(tmp_path / "dataset", recordings, description, [{"plausibility": []}])
     assert dataset.episodes[0].states == 1200 and dataset.episodes[0].purpose == "import"
     assert not [v for v in dataset.episodes[0].verdicts if v["severity"] == "fail"]
     (back,) = load_recordings([tmp_path / "dataset"])

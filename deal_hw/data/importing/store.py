@@ -28,7 +28,7 @@ def write_dataset(
     folder: Path,
     recordings: Sequence[Recording],
     description: RobotDescription | Mapping[str, Any],
-    facts: Mapping[str, Any] | None = None,
+    facts: Sequence[Mapping[str, Any]] | None = None,
     notify: Notify = print,
     episodes: Sequence[Path] = (),
 ) -> Dataset:
@@ -38,7 +38,7 @@ def write_dataset(
         folder: The dataset; made if missing.
         recordings: On one grid, with the description's joints.
         description: Of the robot, or its plain JSON values.
-        facts: Plain JSON values to keep with each episode.
+        facts: Plain JSON values to keep with each episode, those of ``episodes`` first.
         notify: Called with a sentence for each repair.
         episodes: Our own episodes of the same robot, to copy unchanged.
 
@@ -55,15 +55,16 @@ def write_dataset(
                 f"{', '.join(recording.trajectory.actuated)}), but the description {', '.join(wants)} "
                 f"(commands: {', '.join(values['actuated'])}); correct the column map"
             )
+    noted = iter(facts or [{}] * (len(episodes) + len(recordings)))
     with Dataset.create_or_open(folder, values, notify) as dataset:
         for episode in episodes:
             path = dataset.next_episode_path()
             shutil.copyfile(episode, path)
-            dataset.note_episode(path, facts)
+            dataset.note_episode(path, next(noted))
         for recording in recordings:
             path = dataset.next_episode_path()
             write_episode(path, recording.trajectory, values)
-            dataset.note_episode(path, facts)
+            dataset.note_episode(path, next(noted))
     return dataset
 
 
