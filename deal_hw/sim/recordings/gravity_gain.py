@@ -27,12 +27,14 @@ class GravityGain:
     Attributes:
         gain: Torque carried over deviation from the command, (A,) [N·m/rad or N/m]; negative if the joint
             hangs against gravity.
+        error: Standard error of 1 / gain, (A,) [rad/(N·m) or m/N].
         explained: Share of the mean square deviation that this gain explains, (A,).
         load: Root mean square torque carried, (A,) [N·m or N].
         deviation: Root mean square deviation from the command, (A,) [rad or m].
     """
 
     gain: FloatArray
+    error: FloatArray
     explained: FloatArray
     load: FloatArray
     deviation: FloatArray
@@ -73,4 +75,5 @@ def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGa
         gain = np.where(compliance != 0, 1.0 / compliance, np.inf)
     explained = np.where(square > 0, 1 - left / np.where(square > 0, square, 1.0), 0.0)
     count = max(len(load), 1)
-    return GravityGain(gain, explained, np.sqrt(power / count), np.sqrt(square / count))
+    error = np.sqrt(left / np.where(power > 0, power, np.inf) / max(count - 1, 1))
+    return GravityGain(gain, error, explained, np.sqrt(power / count), np.sqrt(square / count))

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from deal_hw.sim.mjcf.joint_facts import JointFacts
     from deal_hw.sim.recordings.episode import SampledEpisode
 
-GRAVITY_EXPLAINED, GRAVITY_LEAST = 0.5, 0.01
-"""Gravity must explain this share of a deviation of at least this size, or no gain is reported [rad, m]."""
+GRAVITY_EXPLAINED, GRAVITY_LEAST, GRAVITY_ERRORS = 0.5, 0.01, 4.0
+"""Gravity must explain this share of a deviation of at least this size [rad, m], or no gain is reported. A
+contradiction counts from this many standard errors on."""
 MOTOR_CHECKS = (
     "size",
     "finite",
@@ -129,15 +130,18 @@ def warn_of_gravity(
         if found.explained[a] < GRAVITY_EXPLAINED or found.deviation[a] < GRAVITY_LEAST:
             continue
         gain, own = float(found.gain[a]), robot.description.stiffness[a]
+        # In a few seconds of motion, deviation and weight correlate by chance.
+        reach = GRAVITY_ERRORS * float(found.error[a])
+        softest, stiffest = 1 / gain + reach, 1 / gain - reach
         parameter = next((p for elements, p in searched.items() if names[a] in elements), None)
         low, high = (own / 2, own * 2) if parameter is None else (parameter.low, parameter.high)
-        if gain < 0:
+        if softest < 0:
             say(
                 f"warning: {joint} deviates from its command against gravity: by {found.deviation[a]:.2g} "
                 f"rad or m, at a gravity torque of the model of {found.load[a]:.2g} N·m. Its sign or its "
                 "zero is wrong; check the sign in the column map"
             )
-        elif not low <= gain <= high:
+        elif stiffest > 0 and (1 / softest > high or 1 / stiffest < low):
             say(
                 f"warning: {joint} sags under gravity as with a gain of about {gain:.3g}; the model has "
                 f"{own:.4g}. The search range ({low:.3g} to {high:.3g}) does not contain that gain: give "
