@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import tyro
 
 from deal_hw.calibration import Progress
 from deal_hw.cli.calibrate_output import print_result, show_progress
+from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.best_so_far import (
     CHECKPOINT,
     SO_FAR,
@@ -64,6 +67,26 @@ class Calibrate(CalibrateSettings):
 
     quiet: bool = False
     """Print nothing but errors."""
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Refuse a model and its recordings without their options.
+
+    Args:
+        words: Arguments that do not parse.
+
+    Raises:
+        ConfigurationError: Several files come before the first option; the message has the right line.
+    """
+    names = list(itertools.takewhile(lambda word: not word.startswith("-"), words))
+    if len(names) < 2:
+        return
+    models = [name for name in names if name.endswith(".xml")] or ["robot.xml"]
+    recordings = [name for name in names if not name.endswith(".xml")]
+    raise ConfigurationError(
+        f"{' '.join(names)}: calibrate takes one dataset; name a model and its recordings by their options: "
+        f"deal-hw calibrate --model {models[0]} --data {' '.join(recordings) or 'rec.csv'}"
+    )
 
 
 def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:

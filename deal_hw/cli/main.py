@@ -250,6 +250,9 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
             cause = cause.__context__
         if cause is not None:
             raise cause from None
+        if stop.code and hasattr(module, "check_words"):
+            # A verb may know a better answer than that an option is unknown.
+            module.check_words(arguments)
         settings = read(speak=True)
     return settings, getattr(module, verb.function)
 

@@ -239,8 +239,8 @@ def calibrate(
     Raises:
         DealHwError: A setting or a recording is unusable; raised before any long work.
     """
-    check_source(dataset=dataset is not None, model=model is not None)
     fit, judges = _listed(data), _listed(holdout)
+    check_source(dataset=dataset, model=model is not None, data=bool(fit))
     with contextlib.ExitStack() as kept:
         path = None
         if model is not None:

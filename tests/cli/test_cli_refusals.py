@@ -237,6 +237,8 @@ REVIEWED: Lines = [
         "calibrate",
         "or a model and its recordings (deal-hw calibrate --model robot.xml --data rec.csv), one of",
     ),
+    ("calibrate arm.xml rec.csv --out o", "deal-hw calibrate --model arm.xml --data rec.csv"),
+    ("calibrate rec.csv rec.csv", "deal-hw calibrate --model robot.xml --data rec.csv rec.csv"),
     ("deploy cartpole --port /dev/null", "/dev/null cannot be opened as a serial port: it is a file or"),
     ("collect cartpole --port /dev/null --out o", "another device; ports at hand"),
     ("doctor cartpole", "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"),

@@ -121,7 +121,14 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
 MODEL = {"model": "m.xml", "data": ["r.csv"]}
 ON_MODEL = "--model m.xml --data r.csv"
 CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
-    ({}, "", "in Python dataset=..., or model=... and data=[...]"),
+    ({}, "", "(deal-hw calibrate --model robot.xml --data rec.csv), one of the two"),
+    ({"data": ["r.csv"]}, "--data r.csv", "--data needs the robot's model: add --model robot.xml"),
+    (
+        {"dataset": "m.xml"},
+        "m.xml",
+        "m.xml is a model, not a dataset; name it by --model m.xml --data rec.csv",
+    ),
+    ({"dataset": "m.xml", "data": ["r.csv"]}, "m.xml --data r.csv", "name it by --model m.xml"),
     ({**MODEL, "dataset": "d"}, f"d {ON_MODEL}", "not both"),
     (
         {"dataset": "d", "data": ["r.csv"]},

@@ -139,7 +139,11 @@ class CalibrateSettings(Checked):
             ConfigurationError: A setting would have no effect, or is missing.
             UnknownNameError: There is no such method.
         """
-        check_source(dataset=self.dataset is not None, model=self.recordings.model is not None)
+        check_source(
+            dataset=self.dataset,
+            model=self.recordings.model is not None,
+            data=bool(data or self.recordings.data),
+        )
         if self.dataset is not None:
             object.__setattr__(self, "dataset", dataset_of(self.dataset))
         if self.recordings.model is None:
@@ -200,18 +204,29 @@ class CalibrateSettings(Checked):
         )
 
 
-def check_source(*, dataset: bool, model: bool) -> None:
+def check_source(*, dataset: Path | str | None, model: bool, data: bool) -> None:
     """Check that there is one source of recordings.
 
+    Args:
+        dataset: The named dataset.
+        model: Whether a model is given.
+        data: Whether recordings for a model are given.
+
     Raises:
-        ConfigurationError: There is none, or there are two.
+        ConfigurationError: There is none, or there are two; or a model is named as a dataset.
     """
-    if dataset == model:
-        how = "not both" if dataset else "one of the two"
+    if not model and dataset is not None and Path(dataset).suffix == ".xml":
+        recordings = "" if data else " --data rec.csv"
+        raise ConfigurationError(
+            f"{dataset} is a model, not a dataset; name it by --model {dataset}{recordings}"
+        )
+    if not model and dataset is None and data:
+        raise ConfigurationError("--data needs the robot's model: add --model robot.xml")
+    if (dataset is not None) == model:
+        how = "not both" if model else "one of the two"
         raise ConfigurationError(
             "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
-            f"(deal-hw calibrate --model robot.xml --data rec.csv), {how}; "
-            "in Python dataset=..., or model=... and data=[...]"
+            f"(deal-hw calibrate --model robot.xml --data rec.csv), {how}"
         )
 
 
