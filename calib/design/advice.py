@@ -368,7 +368,7 @@ def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]
     if robot and groups[best][0].get("command"):
         found += [
             f"    deal-hw design-excitation {robot} {groups[best][0]['command']} --out next.json",
-            f"    deal-hw collect {robot} --excite next.json",
+            f"    deal-hw collect {robot} --excite next.json --port PORT --out runs/next",
         ]
     if hopeless:
         names = ", ".join(row["parameter"] for row in hopeless)

@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from deal_hw.calibration import Progress
-from deal_hw.cli.calibrate_output import print_result, show_progress
+from deal_hw.cli.calibrate_output import print_files, print_result, show_progress
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.best_so_far import (
     CHECKPOINT,
@@ -153,7 +153,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     )
     if not config.quiet:
         print_result(report.result, work.advice, work.name)
-        print("written: " + ", ".join(str(f) for f in report.files.values()))
+        print_files(report.files)
     return report
 
 

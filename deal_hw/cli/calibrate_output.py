@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
@@ -43,6 +44,17 @@ def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
             )
 
         yield report
+
+
+def print_files(files: Mapping[str, Path]) -> None:
+    """Print the written files, each folder once, and which to open."""
+    folders: dict[Path, list[str]] = {}
+    for path in files.values():
+        folders.setdefault(path.parent, []).append(path.name)
+    for folder, names in folders.items():
+        print(f"written to {folder}: {', '.join(names)}")
+    if "report.html" in files:
+        print(f"see all results: open {files['report.html']} in a browser")
 
 
 def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:

@@ -43,7 +43,10 @@ def print_design(robot: str, report: ExcitationReport) -> None:
     if report.optimum is not None:
         _print_optimum(report)
     print(report.plan.words)
-    print(f"written: {report.path}; play it with `deal-hw collect {robot} --excite {report.path} ...`")
+    print(
+        f"written: {report.path}; play it with "
+        f"`deal-hw collect {robot} --excite {report.path} --port PORT --out FOLDER`"
+    )
 
 
 def _print_optimum(report: ExcitationReport) -> None:

@@ -93,7 +93,7 @@ def test_one_step_is_next_with_its_commands() -> None:
     assert next_step(rows, "cartpole") == [
         "record a chirp: b goes from 60 % to 20 %",
         "    deal-hw design-excitation cartpole --family steps --out next.json",
-        "    deal-hw collect cartpole --excite next.json",
+        "    deal-hw collect cartpole --excite next.json --port PORT --out runs/next",
         "no recording helps with m: measure it by other means, then --known NAME VALUE",
     ]
     assert next_step([*rows, row("d", 0.3, "steps")])[0] == (
@@ -119,5 +119,5 @@ def test_what_is_printed_names_the_robot(capsys: pytest.CaptureFixture[str]) -> 
     found = dataclasses.replace(result(k9_space(), "weak"), advice=(row("a", 0.3, "steps"),))
     print_result(found, "record another motion", "cartpole")
     said = capsys.readouterr().out
-    assert "deal-hw collect cartpole --excite next.json" in said
+    assert "deal-hw collect cartpole --excite next.json --port PORT --out runs/next" in said
     assert "collect verdict" not in said

@@ -11,6 +11,7 @@ import pytest
 
 from deal_hw.calibration import read_result
 from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.calibrate_output import print_files
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
@@ -70,6 +71,20 @@ def test_writes_everything_a_user_needs(dataset: Path, tmp_path: Path) -> None:
     assert provenance["episodes"] == [0] and provenance["holdout"] == [1]
     assert provenance["seed"] == 0 and "mujoco" in provenance["versions"]
     assert json.loads(report.files["distribution.json"].read_text())["latency_s"][0] <= 9e-3
+
+
+def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    """And what to open, where there is a report; eight absolute paths on a line before."""
+    folder = Path("runs/arm/calibration")
+    files = {name: folder / name for name in ("result.json", "report.html")}
+    print_files(files)
+    told = capsys.readouterr().out.splitlines()
+    assert told == [
+        f"written to {folder}: result.json, report.html",
+        f"see all results: open {folder / 'report.html'} in a browser",
+    ]
+    print_files({"result.json": folder / "result.json"})
+    assert capsys.readouterr().out == f"written to {folder}: result.json\n"
 
 
 def test_same_seed_same_result(dataset: Path, tmp_path: Path) -> None:
