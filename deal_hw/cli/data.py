@@ -104,7 +104,7 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
     if isinstance(config, Export):
         count, robot = export_recordings(config, aloud)
         layout = {"lerobot": "LeRobot", "foxglove": "Foxglove"}[config.format]
-        print(f"{config.out}: {count} {layout} episodes of {robot}")
+        print(f"{config.out}: {count} {layout} episode{'s' * (count != 1)} of {robot}")
         return EXIT_OK
     config = replace(config, path=dataset_of(config.path))
     reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))

@@ -97,7 +97,7 @@ def test_import_and_export(
     source = {"file": "rec.csv", "sha256": digest_of_file(recording), "part": "", "stretch": 0}
     assert dataset.episodes[0].facts == {"plausibility": {"rec.csv": []}, "source": source}
     assert data(Export(path=out, out=tmp_path / "lerobot", task="wave")) == 0
-    assert "1 LeRobot episodes of robot" in capsys.readouterr().out
+    assert "1 LeRobot episode of robot" in capsys.readouterr().out
     (back,) = load_recordings([tmp_path / "lerobot"])
     np.testing.assert_allclose(back.trajectory.position, trajectory.position, atol=1e-6)
     assert data(Export(path=dataset.path(0), out=tmp_path / "again")) == 0
@@ -145,6 +145,8 @@ def test_import_refuses_what_is_not_plausible(
     with pytest.raises(DatasetError, match=r"hip follows the command of knee.*--force"):
         data(Import(paths=(recording,), out=out, columns=columns))
     assert not out.exists()
+    # The error has it; a line before it said the same in full.
+    assert "fail assignment" not in capsys.readouterr().err
     assert data(Import(paths=(recording,), out=out, columns=columns, force=True, name="odd")) == 0
     facts = Dataset.open(out).episodes[0].facts["plausibility"]["rec.csv"]
     assert [fact["name"] for fact in facts if fact["severity"] == "fail"] == ["assignment"]

@@ -53,12 +53,14 @@ def test_values_that_are_not_numbers(make_table: MakeTable) -> None:
 
 
 def test_clock_going_backwards(make_table: MakeTable) -> None:
-    """The row and the two stamps are named."""
+    """The last sample before, counted from 1, and the two stamps are named."""
     time_s = make_table().time_s.copy()
     time_s[600:] -= 3.0
     found = verdict(make_table(time_s=time_s), "clock")
     assert found.severity is Severity.FAIL
-    assert "1 times" in found.message and "row 599" in found.message and "5.99 s, then 3 s" in found.message
+    assert (
+        "1 times" in found.message and "sample 600 (" in found.message and "5.99 s, then 3 s" in found.message
+    )
 
 
 @pytest.mark.parametrize(("step", "severity"), [(100, Severity.WARN), (2, Severity.FAIL)])
@@ -85,6 +87,7 @@ def test_gaps_are_counted(make_table: MakeTable) -> None:
         (1.0, Severity.OK, "100"),
         (2.5, Severity.WARN, "40"),
         (6.0, Severity.FAIL, "16.67"),
+        (1e3, Severity.FAIL, "record faster, or correct the unit of time"),
         (1e-3, Severity.FAIL, "unit of time"),
         (1e6, Severity.FAIL, "unit of time"),
     ],
@@ -238,6 +241,7 @@ def test_wrong_order_names_the_permutation(make_table: MakeTable, order: tuple[i
         mine, its = sound.joint_names[joint], sound.joint_names[source]
         named = f"the measurement of {mine} follows the command of {its}"
         assert (named in found.message) == (joint != source)
+    assert found.message.startswith("joints seem to be in another order: ")
     assert "sign" not in found.message
 
 

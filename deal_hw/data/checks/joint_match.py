@@ -147,13 +147,10 @@ def _assignment(found: _Match, at: int) -> CheckResult:
         if best is None:
             best = (
                 gain,
-                f"joints seem to be in another order: {_pairs(found, C, order, moved)}; correct the "
-                "column map",
+                f"joints seem to be in another order: {_pairs(found, C, order, moved)}",
             )
     if best is not None:
-        return CheckResult(
-            "assignment", Severity.FAIL, f"commands and measurements do not fit together: {best[1]}"
-        )
+        return CheckResult("assignment", Severity.FAIL, best[1])
     against = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < -GOOD]
     if against:
         text = f"a joint moves against its command: {', '.join(against)}; check order and sign of the joints"

@@ -153,7 +153,7 @@ def _clock(table: Table) -> CheckResult:
         back = np.flatnonzero(steps < 0)
         if back.size:
             text = (
-                f"the clock of the {what} goes backwards {back.size} times, first after row {back[0]} "
+                f"the clock of the {what} goes backwards {back.size} times, first after sample {back[0] + 1} "
                 f"({stamps[back[0]]:.6g} s, then {stamps[back[0] + 1]:.6g} s); sort the rows if they are "
                 "mixed up, or cut the file where the clock was set"
             )
@@ -185,8 +185,11 @@ def _rate(clock: FloatArray) -> CheckResult:
             "rate", Severity.FAIL, f"{text}; record at least {MIN_DURATION_S:g} s, and check the unit of time"
         )
     if rate_hz < MIN_RATE_HZ:
-        text = f"{text}; below {MIN_RATE_HZ:g} Hz friction cannot be separated from damping; record faster"
-        return _verdict("rate", Severity.FAIL, f"{text}, record faster")
+        text = (
+            f"{text}; below {MIN_RATE_HZ:g} Hz friction cannot be separated from damping: record faster, or "
+            "correct the unit of time, if it is wrong"
+        )
+        return _verdict("rate", Severity.FAIL, text)
     if rate_hz < GOOD_RATE_HZ * 0.95:
         return _verdict(
             "rate", Severity.WARN, f"{text}; {GOOD_RATE_HZ:g} Hz or more would give better estimates"
