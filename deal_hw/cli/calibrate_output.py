@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
@@ -12,16 +12,28 @@ from deal_hw.cli.piped import PipedProgress
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
+CHI2 = "chi2 is the squared prediction error over that of the sensor noise; chi2 1: sensor noise only"
 
 
 @contextlib.contextmanager
 def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
-    """Show a progress bar on a terminal; elsewhere a line every ten seconds."""
+    """Show a progress bar on a terminal; elsewhere a line every ten seconds. Explain chi2 once."""
+    explained = False
+
+    def explain(p: Progress, say: Callable[[str], None]) -> None:
+        nonlocal explained
+        if not explained and "chi2" in p.message:
+            explained = True
+            say(CHI2)
+
     if quiet or not sys.stderr.isatty():
         with PipedProgress(title, quiet) as piped:
-            yield lambda p: piped.at(
-                f"{p.stage} {p.done}/{p.total}" + (f", {p.message}" if p.message else "")
-            )
+
+            def note(p: Progress) -> None:
+                explain(p, piped.say)
+                piped.at(f"{p.stage} {p.done}/{p.total}" + (f", {p.message}" if p.message else ""))
+
+            yield note
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -39,6 +51,7 @@ def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
         task = bar.add_task(title, total=None, note="")
 
         def report(p: Progress) -> None:
+            explain(p, bar.console.print)
             bar.update(
                 task, description=f"{title}: {p.stage}", completed=p.done, total=p.total, note=p.message
             )

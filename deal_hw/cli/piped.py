@@ -20,7 +20,7 @@ def _to_stderr(line: str) -> None:
 
 
 class PipedProgress:
-    """Prints every ten seconds how long a verb has run and its current step.
+    """Prints how long a verb has run and its current step: every ten seconds, if the step has changed.
 
     A thread prints, since one step may take longer than ten seconds. A pipe that nobody reads must not block
     a process that watches a robot.
@@ -43,7 +43,8 @@ class PipedProgress:
         wait: Callable[[float], bool] | None = None,
         say: Callable[[str], None] = _to_stderr,
     ) -> None:
-        self._title, self._clock, self._say = title, clock or MonotonicClock(), say
+        self._title, self._clock = title, clock or MonotonicClock()
+        self._say = (lambda line: None) if quiet else say
         self._text = ""
         self._ended = threading.Event()
         self._wait = wait or self._ended.wait
@@ -54,11 +55,20 @@ class PipedProgress:
         """Note the current step for the next line."""
         self._text = text
 
+    def say(self, text: str) -> None:
+        """Print a line now."""
+        self._say(f"{self._title}: {text}")
+
     def tell(self) -> None:
-        """Print a line every ten seconds until the verb has ended."""
+        """Print the current step every ten seconds, once each, until the verb has ended."""
+        told = None
         while not self._wait(EVERY_S):
+            text = self._text
+            if text == told:
+                continue
+            told = text
             passed_s = (self._clock.now_ns() - self._began_ns) * 1e-9
-            self._say(f"{self._title}: {passed_s:.0f} s" + (f", {self._text}" if self._text else ""))
+            self.say(f"{passed_s:.0f} s" + (f", {text}" if text else ""))
 
     def __enter__(self) -> PipedProgress:
         if self._thread is not None:

@@ -60,10 +60,10 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Lines:
 
 
 def test_a_line_comes_every_ten_seconds_until_the_end() -> None:
-    """With the time since the beginning and the newest of what was noted."""
+    """With the time since the beginning and the newest of what was noted, unless the last line had it."""
     clock = VirtualClock()
     said: list[str] = []
-    notes = iter(("search 3/40", "", None))
+    notes = iter(("search 3/40", "search 3/40", "", "search 3/40", None))
 
     def wait(seconds: float) -> bool:
         clock.advance_ns(round(seconds * 1e9))
@@ -74,7 +74,7 @@ def test_a_line_comes_every_ten_seconds_until_the_end() -> None:
 
     progress = PipedProgress("calibrate", clock=clock, wait=wait, say=said.append)
     progress.tell()
-    assert said == ["calibrate: 10 s, search 3/40", "calibrate: 20 s"]
+    assert said == ["calibrate: 10 s, search 3/40", "calibrate: 30 s", "calibrate: 40 s, search 3/40"]
 
 
 def test_the_thread_ends_with_the_block(capsys: pytest.CaptureFixture[str]) -> None:
@@ -104,6 +104,9 @@ def test_calibrate(lines: Lines) -> None:
         assert lines.after_ten_seconds() == "calibrate (deal): 10 s, search 3/40, loss 0.2"
         tell(Progress("intervals", 1, 2))
         assert lines.after_ten_seconds() == "calibrate (deal): 20 s, intervals 1/2"
+        for chi2 in ("chi2 2.1", "chi2 0.66"):
+            tell(Progress("local fit", 1, 1, chi2))
+        assert lines.said[2:] == [f"calibrate (deal): {calibrate_output.CHI2}"]
 
 
 @pytest.mark.parametrize("phase", [HOMING, RUNNING])
