@@ -99,7 +99,8 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
     if isinstance(config, Import):
         dataset = import_recordings(config, aloud)
         if dataset is not None:
-            print(f"{dataset.folder}: {len(dataset.episodes)} episodes of {dataset.description['name']}")
+            count = len(dataset.episodes)
+            print(f"{dataset.folder}: {count} episode{'s' * (count != 1)} of {dataset.description['name']}")
         return EXIT_OK
     if isinstance(config, Export):
         count, robot = export_recordings(config, aloud)

@@ -84,7 +84,7 @@ def test_import_and_export(
     out = tmp_path / "dataset"
     assert data(Import(paths=(recording,), out=out, model=tmp_path / "robot.xml", device_periods=4)) == 0
     printed = capsys.readouterr()
-    assert "1 episodes of robot" in printed.out
+    assert "1 episode of robot" in printed.out
     for words in ("guessed", "hip_cmd", "base", "11.99 s at 100 Hz", "largest shift"):
         assert words in printed.err
     dataset = Dataset.open(out)

@@ -117,12 +117,12 @@ def test_a_damaged_archive_is_read_or_refused(tmp_path: Path, mutation: int) -> 
     "cell",
     ["[[1], 2]", '["1", 2]', "[1, null]", '{"a": 1}', "[" * 5000, "[1]", "[1, 1e999, 2]", "x" * 10_000],
 )
-def test_a_list_of_something_else_names_row_and_column(tmp_path: Path, cell: str) -> None:
+def test_a_list_of_something_else_names_line_and_column(tmp_path: Path, cell: str) -> None:
     """A cell in a column of lists that is no list of as many numbers."""
     path = tmp_path / "a.csv"
     path.write_text(f"time;pos\n0;[1, 2]\n1;{cell}\n2;[1, 2]\n", encoding="utf-8")
     text = refusal(lambda: read_csv(path), path)
-    assert "row 2, column 'pos' contains" in text and "not a list of 2 numbers" in text
+    assert "line 3, column 'pos' contains" in text and "not a list of 2 numbers" in text
 
 
 @settings(max_examples=80, deadline=None)

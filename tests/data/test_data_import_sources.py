@@ -74,7 +74,7 @@ def test_csv_dialects(tmp_path: Path) -> None:
     assert channels.arrays["t"].tolist() == [0.5, 1.5, 2.5]
     np.testing.assert_array_equal(channels.arrays["a"], [1.25, np.nan, 4])
     np.testing.assert_array_equal(channels.arrays["b"], [np.nan, 3, 5])
-    assert "row 4 is incomplete" in channels.notes[0]
+    assert "line 6 is incomplete" in channels.notes[0]
 
 
 def test_csv_lists_in_cells(tmp_path: Path) -> None:
@@ -89,10 +89,10 @@ def test_csv_lists_in_cells(tmp_path: Path) -> None:
         ("", "empty"),
         ("1,2\n3,4\n", "must name the columns"),
         ("t,t\n1,2\n", "each once"),
-        ("t,a\n0,1\n1,x\n", "row 2, column 'a' contains 'x'"),
-        ("t,a\n0,1,2\n", "row 1 has 3 cells"),
-        ("t,a\n0\n1,2\n", "row 1 has fewer"),
-        ('t,a\n0,"[1,2]"\n1,"[1]"\n', "row 2, column 'a'"),
+        ("t,a\n0,1\n1,x\n", "line 3, column 'a' contains 'x'"),
+        ("t,a\n0,1,2\n", "line 2 has 3 cells"),
+        ("t,a\n0\n1,2\n", "line 2 has fewer"),
+        ('t,a\n0,"[1,2]"\n1,"[1]"\n', "line 3, column 'a'"),
     ],
 )
 def test_csv_that_makes_no_sense(tmp_path: Path, text: str, words: str) -> None:

@@ -35,19 +35,27 @@ def read_csv(path: Path) -> Channels:
         check_size(path, RECORDING_BYTES)
         digest = digest_of_file(path)
         with open(path, newline="", encoding="utf-8-sig") as file:
-            arrays, notes = _parse(path, _lines(file))
+            arrays, notes = _parse(path, _Lines(file))
     return Channels(path=path, kind="csv", digest=digest, arrays=arrays, notes=notes)
 
 
-def _lines(file: TextIO) -> Iterator[str]:
-    while line := file.readline(LINE):
-        if len(line) == LINE and line[-1] != "\n":
-            raise ValueError(f"a line of {LINE} characters or more")
-        if line.strip() and line[0] != "#":
-            yield line
+class _Lines(Iterator[str]):
+    """The lines of a file without comments and empty ones; ``number`` is the last one's place in the file."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file, self.number = file, 0
+
+    def __next__(self) -> str:
+        while line := self._file.readline(LINE):
+            self.number += 1
+            if len(line) == LINE and line[-1] != "\n":
+                raise ValueError(f"a line of {LINE} characters or more")
+            if line.strip() and line[0] != "#":
+                return line
+        raise StopIteration
 
 
-def _parse(path: Path, lines: Iterator[str]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+def _parse(path: Path, lines: _Lines) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     header = next(lines, None)
     if header is None:
         raise DatasetError(f"{path} is empty; a CSV file starts with a line that names its columns")
@@ -62,21 +70,21 @@ def _parse(path: Path, lines: Iterator[str]) -> tuple[dict[str, FloatArray], tup
     rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
     columns = [_Column(path, name, delimiter == ";", NUMBERS // len(names)) for name in names]
     cut = 0
-    for number, row in enumerate(rows, start=1):
+    for row in rows:
         if cut:
-            raise DatasetError(f"{path}: row {cut} has fewer than {len(names)} cells; repair the file")
+            raise DatasetError(f"{path}: line {cut} has fewer than {len(names)} cells; repair the file")
         if len(row) < len(names):
-            cut = number  # Only the last row may be incomplete, from a killed writer.
+            cut = lines.number  # Only the last row may be incomplete, from a killed writer.
             continue
         if len(row) > len(names):
             raise DatasetError(
-                f"{path}: row {number} has {len(row)} cells, but the header has {len(names)} (separated by "
-                f"{delimiter!r}); repair the file"
+                f"{path}: line {lines.number} has {len(row)} cells, but the header has {len(names)} "
+                f"(separated by {delimiter!r}); repair the file"
             )
         for column, cell in zip(columns, row, strict=True):
-            column.take(number, cell)
+            column.take(lines.number, cell)
     arrays = {column.name: column.values() for column in columns if not column.is_text}
-    notes = [f"row {cut} is incomplete and left out"] if cut else []
+    notes = [f"line {cut} is incomplete and left out"] if cut else []
     text = [column.name for column in columns if column.is_text]
     if text:
         notes.append(f"columns of text are left out: {short(', '.join(text))}")
@@ -104,7 +112,7 @@ class _Column:
         self._width = 0
         self._seen = False
 
-    def take(self, row: int, cell: str) -> None:
+    def take(self, line: int, cell: str) -> None:
         """Add a cell."""
         if self.is_text:
             return
@@ -128,7 +136,7 @@ class _Column:
                 return
             wanted = f"a list of {self._width} numbers" if self._width else "a number"
             raise DatasetError(
-                f"{self._path}: row {row}, column {short(self.name, 60)!r} contains {short(cell, 60)!r}, "
+                f"{self._path}: line {line}, column {short(self.name, 60)!r} contains {short(cell, 60)!r}, "
                 f"not {wanted}; repair the file"
             ) from error
         self._seen = True
