@@ -82,7 +82,7 @@ def test_parameters_are_told_apart_by_what_they_change(robot: RobotModel) -> Non
     found = compute_sensitivity(Problem(robot, space, [steps_of(robot)], threads=1, known_std=STD))
     assert found.unseen == ("limit",) and found.faint == ("friction",)
     assert found.effect[0] > 10
-    with pytest.raises(ConfigurationError, match="sees limit"):
+    with pytest.raises(ConfigurationError, match="depends on limit"):
         require_sensitive(found)
 
 

@@ -306,7 +306,7 @@ def test_bad_recordings_are_refused(
         (["--window", "9"], "no window"),
         (["--heldout-window", "4"], "held-out recordings are too short"),
         (["--leave-out", "nothing.csv", "0", "1"], "no such recording; known are rec.csv"),
-        (["--leave-out", "rec.csv", "0", "99"], "leaves nothing of rec.csv"),
+        (["--leave-out", "rec.csv", "0", "99"], "--leave-out removes all of rec.csv"),
         (["--space", "k9"], "--parameters"),
         (["--latency", "12"], "--latency 12.0 s: allowed are 0 to 1 s"),
         (["--latency-range", "0.1", "0.05"], "--latency-range 0.1 0.05: give the lower one first"),
@@ -331,7 +331,7 @@ def test_parameter_that_no_rollout_sees_is_refused(
     entry = "  - {kind: servo_effort_limit, elements: servo_a, range: [15, 60]}\n"
     path.write_text(PARAMETERS + entry, encoding="utf-8")
     assert main(command(folder, "--parameters", str(path), "--out", str(tmp_path / "out"))) == EXIT_ERROR
-    assert "sees servo_a.servo_effort_limit" in capsys.readouterr().err
+    assert "depends on servo_a.servo_effort_limit" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

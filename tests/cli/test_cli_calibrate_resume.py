@@ -207,7 +207,7 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     assert main(command(dataset, tmp_path)) == EXIT_INTERRUPTED
     assert pressed
     told = capsys.readouterr().err
-    assert f"the results in {tmp_path / 'calibration'} are whole" in told and "--resume" not in told
+    assert f"the results in {tmp_path / 'calibration'} are complete" in told and "--resume" not in told
     assert {file.name for file in (tmp_path / "calibration").iterdir()} == FILES
     assert [file.name for file in tmp_path.iterdir()] == ["calibration"]
     assert calibration.read_result(tmp_path / "calibration").method == "eki"

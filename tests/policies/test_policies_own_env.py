@@ -193,7 +193,7 @@ def test_an_environment_that_cannot_be_used(robot: Path, env: str, words: str, t
     ("given", "words"),
     [
         ({"robot": "cartpole", "nominal": True}, "--env needs a robot.yaml"),
-        ({"udr": True}, "--udr does not go with --env, not --udr"),
+        ({"udr": True}, "--udr does not go with --env, whose parameters have no known ranges"),
         ({}, "no distribution is named"),
     ],
 )

@@ -166,9 +166,15 @@ REFUSED: list[tuple[str, str]] = [
         "--truth-seed would have no effect: only with --simulated",
     ),
     ("collect cartpole --out r", "no port is given: name the robot's port"),
-    ("replay {made}/run/dataset/episodes/000000.mcap --port p", "a robot of your own has no driver here"),
+    (
+        "replay {made}/run/dataset/episodes/000000.mcap --port p",
+        "deal-hw has no driver for this robot; record its simulation with --simulated",
+    ),
     ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a simulated"),
-    ("deploy {made}/robot.yaml --port p", "a robot of your own has no driver here; docs/how-to/add.md"),
+    (
+        "deploy {made}/robot.yaml --port p",
+        "deal-hw has no driver for this robot; page 'Add a robot or a method'",
+    ),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]
 
