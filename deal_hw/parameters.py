@@ -372,6 +372,7 @@ def _covariance(values: Any, size: int) -> FloatArray:
     found = numbers(values, "covariance", (size, size))
     if np.abs(found).max(initial=0.0) > _LARGEST_VARIANCE:
         raise ConfigurationError(f"covariance contains a value above {_LARGEST_VARIANCE:g}")
-    if not np.allclose(found, found.T, rtol=1e-6, atol=1e-12) or (np.diag(found) < 0).any():
+    rounding = 1e-9 * np.abs(np.diag(found)).max(initial=0.0)
+    if not np.allclose(found, found.T, rtol=1e-6, atol=rounding) or (np.diag(found) < 0).any():
         raise ConfigurationError("covariance is not symmetric, or a variance in it is below 0")
     return found

@@ -228,7 +228,8 @@ def _covariance(precision: FloatArray, free: npt.NDArray[np.bool_]) -> FloatArra
     """Return the covariance of the free entries; rows and columns of fixed ones are zero."""
     covariance = np.zeros_like(precision)
     covariance[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
-    return covariance
+    # The inverse is symmetric up to rounding only.
+    return np.asarray((covariance + covariance.T) / 2)
 
 
 def _bound_std(

@@ -82,7 +82,10 @@ def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
 def test_a_dataset_that_carries_its_robot(hinge: Recordings, tmp_path: Path) -> None:
     """The rows are of its robot, and of the episodes that are fitted and held out."""
     dataset = tmp_path / "dataset"
-    line = ["data", "import", str(hinge.data[0]), str(hinge.data[0]), "--model", str(hinge.model)]
+    # A comment makes another file of it.
+    other = tmp_path / "other.csv"
+    other.write_text("# again\n" + Path(hinge.data[0]).read_text())
+    line = ["data", "import", str(hinge.data[0]), str(other), "--model", str(hinge.model)]
     assert main([*line, "--out", str(dataset)]) == 0
     out = tmp_path / "real.json"
     words = ["--dataset", str(dataset), "--holdout", "1", "--methods", "nominal", "--seeds", "0", "--quiet"]

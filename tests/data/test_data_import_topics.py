@@ -286,7 +286,7 @@ def test_our_own_episodes_are_taken_in_as_they_are(
     dataset = Dataset.open(out)
     assert dataset.path(0).read_bytes() == path.read_bytes()
     assert dataset.description["name"] == "cartpole"
-    assert data(Import(paths=(out, path), out=tmp_path / "both", force=True)) == 0
-    assert len(Dataset.open(tmp_path / "both").episodes) == 2
+    assert data(Import(paths=(out,), out=tmp_path / "both", force=True)) == 0
+    assert (tmp_path / "both" / "episodes" / "000000.mcap").read_bytes() == path.read_bytes()
     with pytest.raises(ConfigurationError, match=r"name.*the episodes contain their own description"):
         data(Import(paths=(path,), out=out, name="other", force=True))
