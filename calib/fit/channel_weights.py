@@ -9,7 +9,6 @@ residual.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +16,9 @@ from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.solver import channel_scale
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
-
-if TYPE_CHECKING:
-    from deal_hw.calib.fit.residual import Shooting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +62,7 @@ class WeightedFit:
     @property
     def chi2(self) -> float:
         """Mean squared residual over the sensors' noise."""
-        return float(np.mean((self.scale * _rms(self.fit.shooting, self.fit)) ** 2))
+        return float(np.mean((self.scale * _rms(self.fit)) ** 2))
 
 
 def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
@@ -78,8 +75,8 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
     noisy = np.any(problem.noise.position_std > SETTINGS.least_noise * problem.settings.floor)
     if problem.known_std is not None or problem.robot.base is not None or not noisy:
         return None
-    left = _rms(fit.shooting, fit)
-    fine = _followed(fit.shooting, left)
+    left = _rms(fit)
+    fine = _followed(fit, left)
     if fine.all() or not np.any(left[fine] ** 2 > REFINEMENT.explained):
         return None
     scale, weighted = np.where(fine, np.maximum(left, 1.0), 1.0), None
@@ -91,7 +88,7 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
         except InsufficientDataError:
             break
         # The other channels keep the weight of their noise. The fit has to explain them to that level.
-        if np.any(_rms(longer.fit.shooting, longer.fit)[~fine] ** 2 > REFINEMENT.explained):
+        if np.any(_rms(longer.fit)[~fine] ** 2 > REFINEMENT.explained):
             break
         if weighted is not None and np.any(longer.scale > SETTINGS.adds_up * weighted.scale):
             break
@@ -112,19 +109,19 @@ def _fitted(problem: Problem, fit: Refined, scale: FloatArray, fine: Mask, secon
             states=fit.shooting.states(fit.point),
         )
         found = WeightedFit(weighted, fit, scale)
-        scale = np.where(fine, np.maximum(scale * _rms(fit.shooting, fit), 1.0), 1.0)
+        scale = np.where(fine, np.maximum(scale * _rms(fit), 1.0), 1.0)
     return found
 
 
-def _rms(shooting: Shooting, fit: Refined) -> FloatArray:
+def _rms(fit: Refined) -> FloatArray:
     """Return the root mean square of each channel's whitened residual, (M,)."""
-    squared = np.concatenate([r.reshape(-1, r.shape[-1]) for r in shooting.residuals(fit.point)]) ** 2
-    reported = np.concatenate([np.isfinite(d.std).reshape(-1, d.std.shape[-1]) for d in shooting.data])
-    return np.asarray(np.sqrt(squared.sum(axis=0) / np.maximum(reported.sum(axis=0), 1)))
+    reported = [np.isfinite(d.std) for d in fit.shooting.data]
+    return channel_scale(fit.shooting.residuals(fit.point), reported, robust=False)
 
 
-def _followed(shooting: Shooting, left: FloatArray) -> Mask:
+def _followed(fit: Refined, left: FloatArray) -> Mask:
     """Return which channels have a residual at the model's limit, (M,)."""
-    moved = np.concatenate([(d.measured - d.measured[:, :1]).reshape(-1, len(left)) for d in shooting.data])
-    noise = shooting.problem.noise.position_std
+    data = fit.shooting.data
+    moved = np.concatenate([(d.measured - d.measured[:, :1]).reshape(-1, len(left)) for d in data])
+    noise = fit.shooting.problem.noise.position_std
     return np.asarray(left * noise < SETTINGS.finest_model * np.sqrt(np.mean(moved**2, axis=0)))
