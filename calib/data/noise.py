@@ -104,11 +104,20 @@ def white_noise_std(
     variance 924 s^2 (the sum of the squared binomial coefficients). The median ignores impacts and
     stick-slip. Samples that filled a gap, False in ``reported``, (T,), are smooth and do not count.
     """
-    order = settings.noise_order
+    order, floor = settings.noise_order, np.maximum(_rounding_std(values, reported), settings.floor)
     whole = _whole(len(values), order, reported)
     if whole.sum() <= order:
-        return np.full(values.shape[1], settings.floor)
-    return np.maximum(_spread(np.diff(values, n=order, axis=0)[whole], order), settings.floor)
+        return np.asarray(floor)
+    return np.maximum(_spread(np.diff(values, n=order, axis=0)[whole], order), floor)
+
+
+def _rounding_std(values: FloatArray, reported: Mask | None) -> FloatArray:
+    """Return the noise of rounding to an encoder's counts, (J,): the least step between values over sqrt(12).
+
+    The median of the differences misses it where the joint moves less than a count per sample.
+    """
+    columns = (values if reported is None else values[reported]).T
+    return np.array([min(np.diff(np.unique(c)), default=0.0) for c in columns]) / math.sqrt(12.0)
 
 
 def _whole(count: int, order: int, reported: Mask | None) -> Mask:
@@ -151,10 +160,12 @@ def noise_model(
     )
     slopes, weights = [], []
     lines: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    rounding = np.max([_rounding_std(x, mask) for x, mask in zip(positions, masks, strict=True)], axis=0)
     for j in range(positions[0].shape[1]):
         parts = np.array_split(np.argsort(speed2[:, j]), bins)
         x = np.array([speed2[part, j].mean() for part in parts])
         y = np.array([float(_spread(difference[part, j : j + 1], order)[0]) ** 2 for part in parts])
+        y = np.maximum(y, rounding[j] ** 2)
         # The median of n samples gives a variance to about 2.3 / sqrt(n), relative; neighbouring differences
         # share samples.
         sigma = y * 2.3 * math.sqrt(3.0 / len(parts[0])) + floor**2

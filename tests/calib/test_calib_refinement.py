@@ -78,7 +78,7 @@ def test_only_the_first_search_is_brief(noisy: Case, monkeypatch: pytest.MonkeyP
     """What a brief search leaves unexplained is searched for to the end, and that search is compared."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     refined = dataclasses.replace(refine(problem, noisy.theta, noisy.latency_s), chi2=9.0)
-    monkeypatch.setattr(pipeline, "from_search", lambda run, searched: refined)
+    monkeypatch.setattr(pipeline, "refined_from", lambda run, theta, latency_s: refined)
     search = FixedSearch(noisy.theta, noisy.latency_s, 0.05)
     run = CalibrationRun(
         problem=problem,
@@ -195,6 +195,17 @@ def test_timing_jitter_is_told_from_noise() -> None:
     assert found.std(np.array([2.0]))[0] == pytest.approx(
         np.hypot(found.position_std[0], 2 * found.timing_std_s)
     )
+
+
+def test_rounding_of_an_encoder_is_no_jitter() -> None:
+    """4096 counts a turn round to 1.53 mrad: 0.44 mrad of noise. Slow parts stay on one count."""
+    t = np.arange(1600, dtype=np.float64) * 5e-3
+    count = 2 * np.pi / 4096
+    phase = 2 * np.pi * 0.4 * t
+    motion, speed = 1.5 * np.sin(phase) ** 3, 1.5 * 3 * np.sin(phase) ** 2 * np.cos(phase) * 2 * np.pi * 0.4
+    found = noise_model([(np.round(motion / count) * count)[:, None]], [speed[:, None]])
+    assert found.timing_std_s < 1e-5
+    assert found.position_std[0] == pytest.approx(count / np.sqrt(12), rel=0.2)
 
 
 def test_correlation_time_by_hand() -> None:
