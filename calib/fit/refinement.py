@@ -125,14 +125,12 @@ def refine(
     """
     space, settings = problem.space, SETTINGS
     theta = np.clip(theta, space.low, space.high)
+    stages_s = stages_s or window_stages(problem)
     if problem.noise_free:
-        stages_s = stages_s or settings.given_stages_s
         if shake and not fixed_latency:
             theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
         # The latency of a simulated target is a whole number of steps.
         fixed_latency = True
-    elif stages_s is None:
-        stages_s = settings.contact_stages_s if problem.robot.base is not None else settings.stages_s
     result: Refined | None = None
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
@@ -165,6 +163,13 @@ def refine(
     if result is None:
         raise InsufficientDataError("no window length was given")
     return result
+
+
+def window_stages(problem: Problem) -> tuple[float, ...]:
+    """Return the lengths of the refinement's windows, short first [s]."""
+    if problem.noise_free:
+        return SETTINGS.given_stages_s
+    return SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
 
 
 def refine_windows(
@@ -331,8 +336,7 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     if part is problem or problem.noise_free:
         found = fit(problem, nominal, latency_s, None)
         return found if np.isfinite(found.chi2) else None
-    stages_s = SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
-    short, *longer = stages_s
+    short, *longer = window_stages(problem)
     found = fit(part, nominal, latency_s, (short,))
     if not found.chi2 < SETTINGS.local_hopeless:
         return found if np.isfinite(found.chi2) else None
