@@ -1,4 +1,4 @@
-"""States of the vendor's simulator unitree_mujoco: how they are known, and what is said of them."""
+"""States of the vendor's simulator unitree_mujoco: recognition and messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deal_hw.drivers.go2.messages.wire import CDR_HEADER, HEAD
 from deal_hw.errors import FrameError, VersionMismatchError
 
 Simulator = Literal["none", "unitree_mujoco"]
-"""What stands in the place of a robot."""
+"""A simulator in the place of a robot."""
 UNITREE_MUJOCO: Final = (
     "no head, no battery: this is how the simulator unitree_mujoco fills them; if it is what runs there, add "
     "`--simulator unitree_mujoco`, which says what replaces the checks that its states do not allow. "
@@ -43,7 +43,7 @@ def decode_simulated(payload: bytes) -> LowStateFrame:
     """Return the state in a LowState of unitree_mujoco.
 
     Raises:
-        FrameError: Wrong length or header, or it fills in what the simulator leaves 0.
+        FrameError: Wrong length or header, or a field is set that the simulator leaves 0.
         VersionMismatchError: It has a head, as a real Go2's.
     """
     frame = decode_low_state(payload, strict=False)
