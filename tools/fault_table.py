@@ -36,7 +36,7 @@ CYCLE_NS = 20_000_000
 _BESIDE_NS = 10_000_000
 _LONG_PAUSE_NS = 20_000_000
 PAUSE_NS = 3_000_000
-"""Shorter pauses of the machine are not noted [ns]."""
+"""Shortest noted pause of the machine [ns]."""
 _ATTEMPTS = 4
 """Attempts at a repetition if its run ends before the fault."""
 _RIG_PRIORITY = 45
@@ -207,7 +207,7 @@ def learn(typical_s: dict[str, float], rig: Rig) -> None:
 def run_cases(
     rig_type: type[Rig], cases: Sequence[Case], wire: str, given: argparse.Namespace, have: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """Run all repetitions of every case, some at a time, and yield its row.
+    """Run all repetitions of every case, several at a time, and yield its row.
 
     Args:
         rig_type: The robot.

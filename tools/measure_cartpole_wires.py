@@ -41,7 +41,7 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
     Args:
         transport: The wire.
         rate_hz: Commands a second.
-        seconds: How long [s].
+        seconds: Duration [s].
     """
     clock = MonotonicClock()
     trips: list[float] = []
