@@ -126,13 +126,14 @@ def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path | str | None
 
 
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float | None] | None:
-    """Parse a number that may be left out: the parser's own rule reports an error for None and one for it."""
-    if info.type not in (int | None, float | None):
+    """Parse a number; the parser's own rule reports a wrong optional one twice, as None and as a number."""
+    if info.type not in (int, float, int | None, float | None):
         return None
-    kind: type[int] | type[float] = int if info.type == int | None else float
+    kind: type[int] | type[float] = int if info.type in (int, int | None) else float
+    optional = info.type is not kind
 
     def read(words: list[str]) -> float | None:
-        if words[0] == "None":
+        if optional and words[0] == "None":
             return None
         try:
             return kind(words[0])
@@ -143,6 +144,6 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float | None] |
         nargs=1,
         metavar=kind.__name__.upper(),
         instance_from_str=read,
-        is_instance=lambda value: value is None or isinstance(value, int | float),
+        is_instance=lambda value: (optional and value is None) or isinstance(value, int | float),
         str_from_instance=lambda value: [str(value)],
     )

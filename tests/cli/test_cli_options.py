@@ -316,13 +316,12 @@ def test_every_help_page_has_an_example(name: str, capsys: pytest.CaptureFixture
     [
         ("train --steps abc", "Error parsing --steps: 'abc' is no whole number"),
         ("train --steps 1.5", "Error parsing --steps: '1.5' is no whole number"),
+        ("train --seed x", "Error parsing --seed: 'x' is no whole number"),
         ("inspect e.mcap --at soon", "Error parsing --at: 'soon' is no number"),
     ],
 )
-def test_a_wrong_number_of_an_optional_setting_is_one_error(
-    line: str, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The parser's own rule adds a second one, for the value None."""
+def test_a_wrong_number_is_one_error(line: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser's own rule adds a second one to an optional number, for the value None."""
     with pytest.raises(SystemExit):
         main(line.split())
     said = capsys.readouterr().err
