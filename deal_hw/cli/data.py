@@ -238,8 +238,9 @@ def _position_ranges(episode: EpisodeInfo, description: Mapping[str, Any]) -> st
     ranges = (episode.excitation or {}).get("position_range") or ()
     units, names = description.get("position_units") or (), description.get("joint_names") or ()
     parts = [f"{value:.2f} {unit}" for value, unit in zip(ranges, units, strict=False)]
-    if len(parts) == 2 and units[0] == units[1]:
-        return f"{ranges[0]:.2f}, {parts[1]}"
+    if len(parts) == 2 and len(set(units)) == 1:
+        # The unit once, so that the row fits its line.
+        return ", ".join(parts).replace(f" {next(iter(units))},", ",")
     if len(parts) <= 2:
         return ", ".join(parts)
     widest = max(range(len(parts)), key=lambda index: ranges[index])
