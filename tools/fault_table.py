@@ -1,8 +1,8 @@
 """Fault tables: repetitions at random moments beside a stall monitor, and pages of them.
 
 A repetition waits for a random moment of a phase of the run and causes one fault. It is judged by the
-emulator's log of commands (on the machine's monotonic clock, which all processes share), by the operator's
-terminal and exit code, and by the recording. deal-hw's own report on the robot is not used.
+emulator's log of commands, the operator's terminal, the exit code and the recording. The log has the
+machine's monotonic clock, which all processes share. deal-hw's own report on the robot is not used.
 """
 
 from __future__ import annotations

@@ -10,8 +10,7 @@ refused.
 | tick | a state is new where it differs from the one before, and is as old as its reception |
 | checksum | length and header; the checksums of UDP or TCP stand for the rest |
 | battery | nothing: the limits of charge and voltage are 0 |
-| motion switcher | nothing is released; before arming no other program may command the motors, as on the
-robot |
+| motion switcher | nothing is released; before arming no other program may command the motors |
 
 It computes torques once for each command, and holds them. So the driver sends the passive command again with
 each state. The robot counts as passive only once its joints are slow.

@@ -46,12 +46,12 @@ class ZenohTransport(TopicTransport):
     Zenoh's own threads, from the first session of a process on. A process with deadlines therefore calls
     ``open`` after it has become a real-time process.
 
-    The side that listens has no fixed peer, so it notices a lost link only by silence. The side that
-    connected to an end point notices it at once. Then ``send`` and ``receive`` raise
+    The side that listens has no fixed peer, so it notices a lost link only by silence. Zenoh
+    reports it to the side that connected to an end point. Then ``send`` and ``receive`` raise
     :class:`~deal_hw.errors.TransportLostError`; ``receive`` first returns the messages already received.
     Zenoh keeps trying to connect, and afterwards both work again. That side also numbers its messages, and
-    returns the newest stamp of the other side with each (:mod:`zenoh_stamps`), unless a message has an
-    attachment of its own.
+    returns the newest stamp of the other side with each (:mod:`zenoh_stamps`). A message with an attachment
+    of its own keeps that.
 
     Args:
         port: End points, comma separated: "tcp/127.0.0.1:7447". A peer connects to all of them, a client to

@@ -39,9 +39,9 @@ class DynamixelSettings:
     """Wiring and gearing of the two servos.
 
     The three factors of gains and effort are nominal: the e-Manual gives the gains' divisors (128 and 16),
-    not the unit behind them. Here they follow from 1 mA for an output unit and a 1 ms control period,
-    for an XL330-M077 at 5 V (0.215 N·m at 1.47 A) on a pulley of 0.16 m for a revolution. ``calibrate`` finds
-    the true ones.
+    not the unit behind them. Here they follow from 1 mA for an output unit and a 1 ms control period.
+    The servo is an XL330-M077 at 5 V (0.215 N·m at 1.47 A), the pulley has 0.16 m for a revolution.
+    ``calibrate`` finds the true factors.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
