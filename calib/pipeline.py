@@ -446,9 +446,9 @@ def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCa
     blind = [n for n, v in zip(problem.space.names, known.verdicts, strict=True) if v == "not identifiable"]
     words = list(known.null_directions)
     if blind and not words:
-        words = [f"nothing is seen of {', '.join(blind)}"]
+        words = [", ".join(blind)]
     if words:
-        progress(Progress(BEFORE_SEARCH, 1, 1, f"the data cannot tell: {'; '.join(words)}"))
+        progress(Progress(BEFORE_SEARCH, 1, 1, f"the data do not determine: {'; '.join(words)}"))
 
 
 def conclusive(problem: Problem, fit: Refined, longest: float = MISMATCH.correlation_samples) -> bool:

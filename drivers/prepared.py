@@ -1,6 +1,6 @@
-"""Simulated robots whose model another package carries: found there, prepared, kept in the user's cache.
+"""Simulated robots whose model is a file of another package: prepares it and keeps it in the user's cache.
 
-Nothing of these models is copied here.
+This repository has no copy of these models.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 
 
 def package_file(package: str, inside: str, extra: str) -> Path:
-    """Return a file that an installed package carries; the package is not imported.
+    """Return a file of an installed package; the package is not imported.
 
     Args:
         package: Its name.
         inside: The file's path inside of it.
-        extra: Our extra that brings the package.
+        extra: Our extra that installs the package.
 
     Raises:
         MissingExtraError: The package is not installed.
-        ConfigurationError: It is, but carries no such file.
+        ConfigurationError: It is installed, but has no such file.
     """
     spec = importlib.util.find_spec(package)
     if spec is None or not spec.submodule_search_locations:
@@ -49,8 +49,8 @@ def prepare(
 
     Args:
         text: The package's MJCF.
-        change: Changes its tree, and raises KeyError or AttributeError where something is not there.
-        values: Parameter name -> value, handed on to the change.
+        change: Changes its tree, and raises KeyError or AttributeError if a part is missing.
+        values: Parameter name -> value, passed to the change.
         source: The file and the package's version that the change was written for.
 
     Raises:
@@ -83,7 +83,7 @@ def cached(robot: str, text: str) -> Path:
     """Return a file in the user's cache folder with this content, written if it is not there yet.
 
     Args:
-        robot: The beginning of its name.
+        robot: First part of its name.
         text: The MJCF.
 
     Raises:
@@ -95,7 +95,7 @@ def cached(robot: str, text: str) -> Path:
         try:
             if not path.is_file() or path.read_text(encoding="utf-8") != text:
                 folder.mkdir(parents=True, exist_ok=True)
-                # Written under another name and moved: a second process never reads half a file.
+                # Written under another name and moved, so that a second process never reads half a file.
                 handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
                 with os.fdopen(handle, "w", encoding="utf-8") as file:
                     file.write(text)

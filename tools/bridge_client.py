@@ -39,7 +39,7 @@ class BridgeClient:
     Args:
         port: End point of the bridge.
         options: Certificates.
-        stiffness: Of the pose that it holds [N·m/rad].
+        stiffness: Stiffness of the held pose [N·m/rad].
     """
 
     def __init__(self, port: str, options: WireOptions, stiffness: float = 20.0) -> None:
@@ -72,18 +72,18 @@ class BridgeClient:
 
     @property
     def echoes(self) -> Echoes:
-        """What numbers its messages; only while it is open."""
+        """The stamper of its messages; only while it is open."""
         found = self._link._echoes
         assert found is not None
         return found
 
     @property
     def in_charge(self) -> bool:
-        """Whether the bridge says that this client has the robot."""
+        """Whether this client has the robot, by the bridge's status."""
         return bool(self.status["stream"] == f"{self.echoes.stream:016x}")
 
     def listen(self, timeout_s: float = 0.0) -> None:
-        """Take what has come, waiting so long for the first of it [s]."""
+        """Take received messages, waiting this long for the first one [s]."""
         with contextlib.suppress(TransportError):
             while True:
                 message = self._link.receive(timeout_s)
@@ -115,7 +115,7 @@ class BridgeClient:
         return self._encoder.encode(LowCommand(target, ZERO, *self._gains, ZERO))
 
     def hear(self, until: Callable[[], bool], patience_s: float = PATIENCE_S) -> None:
-        """Only listen until a condition holds.
+        """Listen without sending until a condition holds.
 
         Raises:
             TransportTimeoutError: It is not so in time.
@@ -131,7 +131,7 @@ class BridgeClient:
         self.hear(lambda: self.frame is not None and bool(self.status))
         self._begin()
         while not self.in_charge:
-            # On a busy machine this process may pause for longer than the bridge waits: then it starts again.
+            # On a busy machine this process may pause for longer than the bridge waits, so it starts again.
             self._begin()
 
     def _begin(self) -> None:
@@ -140,7 +140,7 @@ class BridgeClient:
         self.repeat(self.pose(), lambda: not self.in_charge or self.status["admitted"] > admitted + 50)
 
     def repeat(self, payload: bytes, until: Callable[[], bool]) -> None:
-        """Send a command every 2 ms from now on, b"" for none; return once something is so.
+        """Send a command every 2 ms from now on, b"" for none; return once a condition holds.
 
         Raises:
             TransportTimeoutError: It is not so in time.

@@ -47,7 +47,7 @@ class BridgeRig:
     Args:
         folder: For certificates and logs.
         domain: DDS domain.
-        address: Where the bridge listens.
+        address: Address at which the bridge listens.
         prefix: A command to run both under, such as ``ip netns exec NAME``.
         emulator: More options of the emulator.
         bridge: More options of the bridge.
@@ -104,7 +104,7 @@ class BridgeRig:
         self.port = self.bridge.start()
 
     def kill_bridge(self) -> None:
-        """Kill it with SIGKILL, as a kernel without memory does."""
+        """Kill it with SIGKILL, as the kernel does when memory runs out."""
         os.kill(self.bridge.pid, signal.SIGKILL)
         self.bridge.stop()
 
@@ -122,7 +122,7 @@ class BridgeRig:
         return [what for _, what in self.told() if what in ("stiff", "damping", "off")]
 
     def await_commands(self, kinds: Sequence[str]) -> None:
-        """Return once the motor commands so far are of these kinds: the robot hears of them last.
+        """Return once the robot has received motor commands of these kinds.
 
         Raises:
             TransportTimeoutError: They are not in time.

@@ -1,11 +1,11 @@
-"""Read files of deal-hw with other people's programs, and print a table.
+"""Read files of deal-hw with other programs, and print a table.
 
     python tools/check_readers.py --environments build/readers
     python tools/check_readers.py --environments build/readers --only rerun lerobot --out readers.json
 
-Each program gets an environment of its own, which the first call makes (some gigabytes: lerobot and mjlab
-bring torch). LeRobot 0.4.4 needs an older torch and rerun than deal-hw, so no CI runs this. `--pip-args` is
-passed on to pip. The exit code is 1 if a reader fails.
+Each program gets an environment of its own, which the first call makes (some gigabytes, because lerobot and
+mjlab install torch). LeRobot 0.4.4 needs an older torch and rerun than deal-hw, so no CI runs this.
+`--pip-args` is passed on to pip. The exit code is 1 if a reader fails.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class Reader:
 
     Attributes:
         name: Its name in the table.
-        packages: What pip installs; none: the environment of deal-hw itself.
+        packages: Packages for pip; none: the environment of deal-hw itself.
         script: A file of tools/readers.
-        inputs: Which samples it reads, one run each.
+        inputs: The samples that it reads, one run for each.
     """
 
     name: str
@@ -104,7 +104,7 @@ def make_samples(folder: Path) -> None:
     export_recordings(
         ExportSettings(path=folder / "episode_cartpole.mcap", out=folder / "scene", format="foxglove")
     )
-    # A cycle that never reached the recorder takes its samples along.
+    # A cycle that never reached the recorder loses its samples, too.
     made = cycles("cartpole", 100, np.random.default_rng(1))
     _record(folder / "holes.mcap", "cartpole", [*made[:40], *made[41:]])
     both = [read_trajectory(folder / name) for name in ("episode_cartpole.mcap", "holes.mcap")]
@@ -154,7 +154,7 @@ def _cart_alone(trajectory: Trajectory) -> Trajectory:
 
 
 def python_of(reader: Reader, folder: Path, pip_args: list[str]) -> Path:
-    """Return the reader's Python, its environment made if need be."""
+    """Return the reader's Python, after making its environment if necessary."""
     if not reader.packages:
         return Path(sys.executable)
     home, ready = folder / reader.name, folder / reader.name / ".ready"
@@ -218,7 +218,7 @@ def main() -> int:
                 reader, samples, options.environments.resolve(), shlex.split(options.pip_args)
             )
         ]
-    print("| reader | versions | input | result | what it says |\n|---|---|---|---|---|")
+    print("| reader | versions | input | result | output |\n|---|---|---|---|---|")
     for found in findings:
         verdict = "pass" if found.passed else "FAIL"
         print(f"| {found.reader} | {found.versions} | `{found.input}` | {verdict} | {found.words} |")

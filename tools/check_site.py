@@ -1,4 +1,4 @@
-"""Check the built site: nothing is loaded from other hosts, links lead somewhere or are well formed.
+"""Check the built site: it loads nothing from other hosts, and its links are valid.
 
     python tools/check_site.py build/site
 
@@ -83,7 +83,7 @@ def read(text: str) -> Page:
 
 
 def is_foreign(address: str) -> bool:
-    """Whether a browser would ask another host for this."""
+    """Whether a browser would fetch this from another host."""
     parts = urlsplit(address)
     return bool(parts.netloc) or parts.scheme in {"http", "https"}
 
@@ -112,7 +112,7 @@ def complaints(root: Path) -> list[str]:
     for path, page in pages.items():
         place = path.relative_to(root.resolve())
         found += [f"{place}: loads {load} from another host" for load in page.loads if is_foreign(load)]
-        # The page for missing addresses names everything from the root of a server.
+        # The page for missing addresses has links from the root of a server.
         links = [] if place.name == "404.html" else [*page.links, *page.loads]
         for link in dict.fromkeys(links):
             parts = urlsplit(link)

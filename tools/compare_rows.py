@@ -59,7 +59,7 @@ METHODS = {
 """Old name of a method -> new name; others keep theirs."""
 
 WHOLE = frozenset({"default", "local", "output-error"})
-"""Methods, by their new names, that decide themselves what follows their search."""
+"""Methods, by their new names, that choose the refinement themselves."""
 
 NULL = frozenset({"midpoint", "nominal", "deal-paper-flat"})
 """Methods, by their new names, that ignore the data and are never refined."""
@@ -107,9 +107,9 @@ class Comparison:
 
     Attributes:
         key: Its name, by new names.
-        seeds: How many seeds were compared.
-        figures: Name of a figure -> (old, new), each None where there is none.
-        losses: Why it is worse; empty if it is not.
+        seeds: Number of compared seeds.
+        figures: Name of a figure -> (old, new), each None if there is none.
+        losses: Reasons why it is worse; empty if it is not.
         notes: Other remarks.
     """
 
@@ -225,7 +225,7 @@ def read_cells(path: Path, methods: Mapping[str, str]) -> Cells:
 
 
 def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
-    """Return what names a row's cell, as texts in the order of `KEY`; "" where it does not apply."""
+    """Return the name of a row's cell, as texts in the order of `KEY`; "" if one does not apply."""
     bench, method = str(row["bench"]), str(row["method"])
     method = methods.get(method, method)
     known = {
@@ -241,7 +241,7 @@ def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
 
 
 def cell_name(key: Key) -> str:
-    """Return a cell's name for people: what is not the rule, in one line."""
+    """Return a cell's short name for a reader: only unusual settings, in one line."""
     known = dict(zip(KEY, key, strict=True))
     known["demonstration"] = "" if known["demonstration"] == "excite" else known["demonstration"]
     known["demonstration_s"] = (
@@ -259,7 +259,7 @@ def compare(old: Cells, new: Cells, limits: Limits) -> list[Comparison]:
 def compare_cell(
     key: Key, old: Mapping[int, Row], new: Mapping[int, Row] | None, limits: Limits
 ) -> Comparison:
-    """Compare one cell; `new` is None where there is none."""
+    """Compare one cell; `new` is None if there is none."""
     done = [seed for seed in sorted(old) if not old[seed].get("error")]
     notes = [f"seed {seed} had an error in OLD: not compared" for seed in sorted(old) if seed not in done]
     if new is None:
@@ -322,7 +322,7 @@ def _values(rows: Sequence[Row], name: str) -> list[float]:
 
 def _median(rows: Sequence[Row], name: str) -> float | None:
     values = _values(rows, name)
-    # What is no number is as bad as can be, and a median knows no order for it.
+    # A value that is no number counts as the worst, because a median cannot order it.
     return statistics.median(math.inf if math.isnan(value) else value for value in values) if values else None
 
 

@@ -49,12 +49,12 @@ def convert(source: Path, out: Path, parts: int = 1) -> list[Path]:
     Args:
         source: The torch file.
         out: Folder to write to.
-        parts: Write the recording in so many parts of equal length, so that any of them can be held out.
+        parts: Number of parts of equal length to write, so that any of them can be held out.
 
     Raises:
         SystemExit: The file has other contents than its source describes.
     """
-    # weights_only: a torch file is a pickle and could otherwise run anything.
+    # weights_only, because a torch file is a pickle and could otherwise run any code.
     data = torch.load(source, map_location="cpu", weights_only=True)
     if not isinstance(data, dict) or any(key not in data for key in KEYS):
         raise SystemExit(f"{source} has no {', '.join(KEYS)}; it is not a recording of that project")

@@ -64,7 +64,7 @@ def convert(folder: Path, out: Path) -> Path:
         out: Folder to write to.
 
     Raises:
-        DealHwError: A file is missing or holds something else.
+        DealHwError: A file is missing or has other content.
     """
     control, state = read_csv(folder / "control.csv"), read_csv(folder / "state_motor.csv")
     out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Exchange LowCmd and LowState with a true Cyclone DDS 0.10.2 for a while, in both roles; the result as JSON.
+"""Exchange LowCmd and LowState with a real Cyclone DDS 0.10.2, in both roles; the result as JSON.
 
     make dds-peer
     python tools/dds_peer_soak.py --seconds 60 --out docs/measured/dds_peer_soak.json
@@ -43,7 +43,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PEER = ROOT / "build/dds_peer/go2_peer"
 PERIOD_NS = 2_000_000
 MARGIN_S = 3.0
-"""The peer runs this much longer, so that it never leaves first."""
+"""The peer runs this much longer, so that it never ends first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +54,14 @@ class DdsPeerSoak:
     """Length of each of the two runs [s]."""
 
     out: Path | None = None
-    """Where the result goes; standard output by default."""
+    """File of the result; standard output by default."""
 
     domain: int = 40
     """DDS domain, and the next one."""
 
 
 class Side:
-    """Our side of a run: what goes out each period, what came in."""
+    """Our side of a run: the messages sent and received."""
 
     def __init__(self, publish: str, subscribe: str, message: Callable[[int], bytes]) -> None:
         self.publish, self.subscribe, self.message = publish, subscribe, message
@@ -80,7 +80,7 @@ class Side:
         self.stamps.append(message.stamp_ns)
 
     def run(self, wire: DdsTransport, seconds: float) -> None:
-        """Write every 2 ms, and between the writes read what comes."""
+        """Write every 2 ms, and read between the writes."""
         begin_ns = time.monotonic_ns()
         for cycle in range(round(seconds * 1e9 / PERIOD_NS)):
             start_ns = time.monotonic_ns()
@@ -94,7 +94,7 @@ class Side:
                     break
 
     def report(self) -> dict[str, Any]:
-        """Return counts, and how far apart the messages arrived [ms]."""
+        """Return counts, and the time between arriving messages [ms]."""
         numbers, gaps_ms = np.array(self.numbers), np.diff(self.stamps) * 1e-6
         span = int(numbers[-1] - numbers[0]) + 1
         return {
@@ -114,7 +114,7 @@ class Side:
 
 
 def soak(role: str, side: Side, domain: int, seconds: float) -> dict[str, Any]:
-    """Run the peer in a role and ourselves in the other; return what both saw."""
+    """Run the peer in one role and our side in the other; return the findings of both."""
     wire = DdsTransport("lo", MonotonicClock(), WireOptions(domain=domain))
     wire.declare(publish=[side.publish], subscribe=[side.subscribe])
     peer = subprocess.Popen(
@@ -152,7 +152,7 @@ def soak(role: str, side: Side, domain: int, seconds: float) -> dict[str, Any]:
 
 
 def command_bytes() -> Callable[[int], bytes]:
-    """Return what gives the command of a cycle: targets that swing."""
+    """Return a function for the command of a cycle: swinging targets."""
     encoder, ones = LowCommandEncoder(), np.ones(12)
 
     def message(cycle: int) -> bytes:
@@ -162,7 +162,7 @@ def command_bytes() -> Callable[[int], bytes]:
 
 
 def state_bytes() -> Callable[[int], bytes]:
-    """Return what gives the state of a cycle: a robot at rest."""
+    """Return a function for the state of a cycle: a robot at rest."""
     robot = FakeGo2()
 
     def message(cycle: int) -> bytes:

@@ -36,7 +36,7 @@ class DdsPeerStand:
     """Stand the emulated Go2 up from a 0.10.2 program, and lay it down."""
 
     out: Path | None = None
-    """Where the result goes; standard output by default."""
+    """File of the result; standard output by default."""
 
     domain: int = 42
     """DDS domain, and the next one."""
@@ -49,7 +49,7 @@ class DdsPeerStand:
 
 
 def run(phases: int, domain: int, config: DdsPeerStand) -> dict[str, Any]:
-    """Run an emulator and the program's first phases; return what both tell."""
+    """Run an emulator and the program's first phases; return the reports of both."""
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder, "truth.json")
         options = (

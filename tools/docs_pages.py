@@ -5,7 +5,7 @@
 - ``reference/alarms.md``: every alarm of a calibration, from the calls that make one;
 - ``reference/errors.md``: every refusal, from tests/house/refusals.txt;
 - ``how-to/examples.md``: the files of examples/;
-- ``contributing.md`` and ``changelog.md``: CONTRIBUTING.md and CHANGELOG.md with links that hold in the site.
+- ``contributing.md`` and ``changelog.md``: CONTRIBUTING.md and CHANGELOG.md with links for the site.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
 
 
 def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
-    """Yield the lines of a verb: what it does, its options, then its sub-verbs."""
+    """Yield the lines of a verb: purpose, options, then its sub-verbs."""
     for paragraph in re.split(r"\n\s*\n", (parser.description or "").strip()):
         yield from (cell(paragraph), "")
     for title, rows in options(parser).items():
@@ -156,7 +156,7 @@ def cli_page() -> str:
         "shows where an error came from.",
         "",
         f"Exit status: {main.EXIT_OK} done; {main.EXIT_ERROR} refused, and one line says why; "
-        f"{main.EXIT_INTERRUPTED} stopped by Ctrl-C; {main.EXIT_PIPE} nobody reads the output any more.",
+        f"{main.EXIT_INTERRUPTED} stopped by Ctrl-C; {main.EXIT_PIPE} the reader of the output closed it.",
         "",
     ]
     for name, verb in main.VERBS.items():
@@ -245,7 +245,7 @@ def errors_page(table: str) -> str:
 
 
 def shortened(text: str) -> str:
-    """Return text with an ellipsis for each value that comes in at run time, whatever its expression."""
+    """Return text with an ellipsis for each value that is known at run time only."""
     out, depth = [], 0
     for sign in text:
         depth += sign == "{"
@@ -265,7 +265,7 @@ def alarms() -> list[tuple[str, ...]]:
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Alarm" and node.args:
                     parts = [shortened(words(part)) for part in node.args]
-                    # Without words of its own, an alarm is copied from a file or from the table of causes.
+                    # An alarm without a text of its own is copied from a file or from the table of causes.
                     if parts[0].strip("…"):
                         parts = [part if part.strip("…") else "(the message says it)" for part in parts]
                         found.append((path.relative_to(ROOT).as_posix(), *parts))
@@ -303,7 +303,7 @@ def alarms_page() -> str:
 
 
 def moved(name: str) -> str:
-    """Return a page of the repository's root with links that hold in the site."""
+    """Return a page of the repository's root with links for the site."""
     text = (ROOT / name).read_text(encoding="utf-8")
     return text.replace("](docs/", "](").replace("](CHANGELOG.md)", "](changelog.md)")
 
@@ -319,7 +319,7 @@ def examples_page() -> str:
             text = "".join(cell["source"]).rstrip()
             if cell["cell_type"] == "code":
                 text = f"```python\n{text}\n```"
-            # A heading of the notebook stands below the file's own.
+            # Headings of the notebook are one level below the file's own.
             lines += [re.sub(r"^(#+) ", r"##\1 ", text) if text.startswith("#") else text, ""]
     return "\n".join(lines)
 
@@ -338,7 +338,7 @@ def pages() -> dict[str, str]:
 
 
 def on_env(env: Any, config: Any, files: Any) -> Any:
-    """Let the search of pages on disk run by our own script: the plugin names one of another host."""
+    """Use our own script for the search in pages on disk, because the plugin's is on another host."""
     config.extra["polyfills"] = ["assets/search_worker.js"]
     return env
 

@@ -1,9 +1,9 @@
-"""Draw the figures of a bench again, from its rows; nothing is measured.
+"""Draw the figures of a bench again from its rows, without measuring.
 
     python tools/draw_bench.py docs/measured/loop_sensor.json docs/measured/loop_realistic.json
     python tools/draw_bench.py docs/measured/searches_sensor.json --name deal-paper=deal-paper-replay
 
-Each figure lies beside its rows, as a PNG of their name. Methods of older rows get today's
+Each figure is written beside its rows, as a PNG of the same name. Methods of older rows get their present
 names, as in compare_rows.py.
 """
 
@@ -20,11 +20,11 @@ from deal_hw.bench.rows import load_rows
 
 
 def draw_again(path: Path, names: Mapping[str, str]) -> Path | None:
-    """Draw a file's figure and return it; None where every row is of a cell that failed.
+    """Draw a file's figure and return it; None if every cell failed.
 
     Args:
         path: The rows.
-        names: Today's names of methods, by those in the rows.
+        names: Present names of methods, by those in the rows.
     """
     rows = [row | {"method": names.get(row["method"], row["method"])} for row in load_rows(path)]
     good = [row for row in rows if not row["error"]]

@@ -28,7 +28,7 @@ from deal_hw.sim.recordings.overlay import compute_overlay
 from deal_hw.types import FloatArray
 
 BLUE, ORANGE, GREEN = "#2a6fbb", "#e69f00", "#009e73"
-"""Can be told apart with any kind of colour vision."""
+"""Colours that differ with any kind of colour vision."""
 POLE_M = 0.3
 RAIL_M = 0.46
 NOTHING = np.full(2, np.nan)
@@ -39,11 +39,11 @@ class Motion:
     """A cart-pole's motion to draw.
 
     Attributes:
-        name: What the legend says.
-        colour: Of cart, pole and trace.
-        width: Of pole and trace: wide below, narrow above, so that equal motions show both colours.
+        name: Text in the legend.
+        colour: Colour of cart, pole and trace.
+        width: Width of pole and trace: wide below, narrow above, so that equal motions show both colours.
         time_s: (T,) [s].
-        position: Cart [m] and pole [rad], (T, 2); NaN where nothing is known.
+        position: Cart [m] and pole [rad], (T, 2); NaN where unknown.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Motion:
     position: FloatArray
 
     def at(self, time_s: float) -> FloatArray:
-        """Return cart and pole at a time, (2,); NaN where nothing is known."""
+        """Return cart and pole at a time, (2,); NaN where unknown."""
         n = int(np.searchsorted(self.time_s, time_s, side="right")) - 1
         return self.position[n] if n >= 0 else NOTHING
 
@@ -105,14 +105,14 @@ class Traces:
 
 
 def recorded(episode: Path, name: str, colour: str, width: float = 1.0) -> Motion:
-    """Return what the robot did in an episode."""
+    """Return the robot's motion in an episode."""
     trajectory = read_episode(episode).trajectory
     time_s = trajectory.device_s - trajectory.device_s[0]
     return Motion(name=name, colour=colour, width=width, time_s=time_s, position=trajectory.position)
 
 
 def predicted(run: Path, window_s: float) -> list[Motion]:
-    """Return what the nominal and the calibrated model predict of the first recording."""
+    """Return the predictions of the first recording by the nominal and the calibrated model."""
     episode = read_episode(run / "dataset" / "episodes" / "000000.mcap")
     result = read_result(run / "calibration")
     overlay = compute_overlay(

@@ -39,14 +39,14 @@ def signal_control(number: signal.Signals) -> Callable[[Rig], None]:
 
 
 def kill_control_sometime(rig: Rig) -> None:
-    """The control process dies at a random time: a dry run has no phases in the emulator's log."""
+    """The control process is killed at a random time: a dry run has no phases in the emulator's log."""
     pid = rig.control_pid()
     time.sleep(float(rig.rng.uniform(0.0, 3.0)))
     rig.signal(pid, signal.SIGKILL)
 
 
 def kill_both(rig: Rig) -> None:
-    """Both processes die, as when the machine is out of memory."""
+    """Both processes are killed, as when the machine is out of memory."""
     pid = rig.control_pid()
     rig.signal(rig.run.pid, signal.SIGKILL)
     rig.signal(pid, signal.SIGKILL)
@@ -110,10 +110,10 @@ def _away(proxy: FaultyProxy, state: State, seconds: float) -> None:
 
 
 def second_run(elsewhere: bool = False) -> Callable[[Rig], None]:
-    """Return an act: a second run of the same robot; later Ctrl-C ends the first, and nobody takes over.
+    """Return an act: a second run of the same robot; Ctrl-C then ends the first; no run takes over.
 
     Args:
-        elsewhere: Whether the second comes by another address, as from another computer.
+        elsewhere: Whether the second uses another address, as from another computer.
     """
 
     def act(rig: Rig) -> None:
@@ -157,7 +157,7 @@ def process_cases() -> tuple[Case, ...]:
     connected = ANY[1:]
     return (
         Case(name="Ctrl-C", act=signal_run(signal.SIGINT), phases=ANY, codes=(130,)),
-        # Before there is a control process, the shell's own stop is all; then the run goes on.
+        # Without a control process only the shell's own stop acts; then the run goes on.
         Case(name="Ctrl-Z, then fg", act=suspend, phases=ANY, codes=(130, 0)),
         Case(
             name="the supervisor stands still (SIGSTOP)",
@@ -207,12 +207,12 @@ def process_cases() -> tuple[Case, ...]:
 def link_cases(
     kinds: Mapping[str, Callable[[float], Callable[[Rig], None]]], cut: bool, wires: tuple[str, ...] = ()
 ) -> Iterator[Case]:
-    """Yield the rows with a link that is lost for a time, while the run ends and at any other moment.
+    """Yield the rows with a link that is lost for a time: at any moment, and while the run ends.
 
     Args:
-        kinds: What happens to the link, in words with "{}" for the time, and what makes an act of a time [s].
-        cut: Whether the emulator must be told how long a cut is.
-        wires: Where they are possible.
+        kinds: Fault of the link, in words with "{}" for the time, and a function from a time [s] to an act.
+        cut: Whether the emulator needs the length of a cut.
+        wires: Wires on which they are possible.
     """
     for words, make in kinds.items():
         for when, phases in ((" as the run ends", (ENDING,)), ("", (RISING, RUNNING, LYING_DOWN))):

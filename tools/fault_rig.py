@@ -26,9 +26,9 @@ from deal_hw.testing.faulty_proxy import FaultyProxy
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
 UNDER_TEST = os.environ.get("DEAL_HW_PYTHON", sys.executable)
-"""Python of the deal-hw that is run, perhaps of an older checkout; emulator and judgement are of this one."""
+"""Python of the deal-hw under test, perhaps of an older checkout; emulator and judgement are of this one."""
 PATIENCE_S = 75.0
-"""A run that has not ended by then hangs [s]."""
+"""A run that takes longer than this hangs [s]."""
 CONNECTING, TAKING_OVER, ARMING, RISING, RUNNING, LYING_DOWN, ENDING = (
     "connecting",
     "taking over",
@@ -42,14 +42,14 @@ COMMANDING = (RISING, RUNNING, LYING_DOWN, ENDING)
 ANY = (CONNECTING, TAKING_OVER, ARMING, *COMMANDING)
 _POLL_S = 0.004
 LATE_S, HANG_S = 0.12, 1000.0
-"""How long a policy that comes late takes, and one that hangs [s of a processor]."""
+"""Processor time of a late policy, and of one that hangs [s]."""
 GOES_WRONG_AT_S = 0.4
-"""When a faulty policy goes wrong [s]."""
+"""Beginning of a policy's fault [s]."""
 
 Expect = Literal["goes on", "passive", "contested", "untouched", "unhomed", "stiff"]
-"""What must be true at the end: the run finished; the robot is passive and stays so; the same while somebody
-else goes on commanding; nothing at all was sent; no motor was commanded; the robot holds its last command,
-because only its own side could help."""
+"""Expected ends: the run finished; the robot is passive and stays so; the same while another program goes on
+commanding; nothing was sent; no motor was commanded; the robot holds its last command, because only its own
+side could help."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,9 +58,9 @@ class Case:
 
     Attributes:
         name: The fault, in words.
-        expect: What must be true at the end.
-        codes: Exit codes that are right.
-        act: Lets it go wrong; called at a random moment of a random phase. None: the emulator does it itself.
+        expect: The expected end.
+        codes: Correct exit codes.
+        act: Causes the fault; called at a random moment of a random phase. None: the emulator causes it.
         phases: Those phases.
         emulator: Options of the emulator; "{t}" becomes a random moment after the first command [s].
         policy: "nan", "late" or "hang" for a faulty policy; "" to hold the pose.
@@ -68,7 +68,7 @@ class Case:
         seconds: Length of the run without standing up and lying down [s]; 0: the rig's.
         within_ms: The robot must be passive within this time of the fault, or of the link's return [ms].
         wires: The wires on which it is possible; empty: all.
-        from_ms: Time counts from so long after the fault [ms]: how long the link is away.
+        from_ms: Times count from this long after the fault [ms]: the duration of the link's loss.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Case:
 
 
 class SpoiledError(Exception):
-    """A repetition is of no use: on a busy machine the run ended by itself before the fault."""
+    """A repetition without result: on a busy machine the run ended by itself before the fault."""
 
 
 class Rig(ABC):
@@ -98,13 +98,13 @@ class Rig(ABC):
         folder: For files.
         rng: Draws the moment.
         slot: Number of the job, for ports and domains of its own.
-        typical_s: How long connecting and taking over have taken on this machine lately [s].
+        typical_s: Recent duration of connecting and taking over on this machine [s].
     """
 
     robot: ClassVar[str]
     description: ClassVar[RobotDescription]
     phases: ClassVar[tuple[str, ...]]
-    """Those that a run of this robot has."""
+    """The phases of a run of this robot."""
     wires: ClassVar[tuple[str, ...]]
     longest_s: ClassVar[float]
     """The latest moment after the first command at which an emulator's own faults begin [s]."""
@@ -152,7 +152,7 @@ class Rig(ABC):
 
     @abstractmethod
     def untouched(self, report: Mapping[str, Any]) -> str:
-        """Return what the robot was told, in words; "" where it was told nothing at all."""
+        """Return the commands to the robot, in words; "" for none."""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
         """Return the time of the emulator's own fault [host ns]; -1: there was none."""
@@ -225,7 +225,7 @@ class Rig(ABC):
         """What the run has printed."""
         return (self.folder / "out" / "run").read_text()
 
-    # What can be waited for.
+    # Conditions to wait for.
 
     def pump(self) -> None:
         """Read the emulator's new events."""
@@ -239,7 +239,7 @@ class Rig(ABC):
                 self._events_at = file.tell()
 
     def until(self, ready: Callable[[], Any], seconds: float = 40.0, *, ends: bool = False) -> Any:
-        """Return what ``ready`` returns as soon as that is true; None when the run has ended before.
+        """Return the result of ``ready`` as soon as it is true; None if the run ended before.
 
         Raises:
             TimeoutError: It takes too long.
@@ -296,10 +296,10 @@ class Rig(ABC):
         told = [what for _, what in self.events if what in self.active | self.inactive]
         return bool(told) and told[-1] in self.active
 
-    # What can be done.
+    # Actions.
 
     def fault(self) -> None:
-        """The fault is now."""
+        """Note the present time as that of the fault."""
         if self.fault_ns < 0:
             self.fault_ns = time.monotonic_ns()
 
@@ -338,7 +338,7 @@ class Rig(ABC):
 
 
 def headline(said: str) -> str:
-    """Return the line that tells the operator how it ended."""
+    """Return the operator's line on the end of the run."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     wanted = [line for line in lines if re.match(r"(tripped|finished|stopped|failed|deal-hw: error)", line)]
     return (wanted or lines or [""])[0]
@@ -350,7 +350,7 @@ def write_faulty(path: Path, description: RobotDescription, fault: str) -> None:
     Args:
         path: The file.
         description: The robot.
-        fault: "nan"; "late", for which it computes so long as :data:`LATE_S`; "hang", for ever.
+        fault: "nan"; "late", which computes for :data:`LATE_S`; "hang", for ever.
     """
     rounds = 1000
     if fault in ("late", "hang"):

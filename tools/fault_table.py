@@ -1,8 +1,8 @@
 """Fault tables: repetitions at random moments beside a stall monitor, and pages of them.
 
 A repetition waits for a random moment of a phase of the run and causes one fault. It is judged by the
-emulator's log of commands (on the machine's monotonic clock, which all processes share), by the operator's
-terminal and exit code, and by the recording. deal-hw's own report on the robot is not used.
+emulator's log of commands, the operator's terminal, the exit code and the recording. The log has the
+machine's monotonic clock, which all processes share. deal-hw's own report on the robot is not used.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CYCLE_NS = 20_000_000
 _BESIDE_NS = 10_000_000
 _LONG_PAUSE_NS = 20_000_000
 PAUSE_NS = 3_000_000
-"""Shorter pauses of the machine are not noted [ns]."""
+"""Shortest noted pause of the machine [ns]."""
 _ATTEMPTS = 4
 """Attempts at a repetition if its run ends before the fault."""
 _RIG_PRIORITY = 45
@@ -207,7 +207,7 @@ def learn(typical_s: dict[str, float], rig: Rig) -> None:
 def run_cases(
     rig_type: type[Rig], cases: Sequence[Case], wire: str, given: argparse.Namespace, have: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """Run all repetitions of every case, some at a time, and yield its row.
+    """Run all repetitions of every case, several at a time, and yield its row.
 
     Args:
         rig_type: The robot.

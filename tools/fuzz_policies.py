@@ -41,9 +41,9 @@ from deal_hw.workflows.shipped import shipped_policy
 ROBOTS = ("cartpole", "go2")
 MEMORY_BYTES = 2**30
 SPEC_S = 5.0
-"""Most that a spec may take [s]: one of 500 kB with 100,000 wrong entries takes two."""
+"""Time limit of a spec [s]: one of 500 kB with 100,000 wrong entries takes two."""
 NETWORK_S = 20.0
-"""Most that a network may take in the worker, its imports included [s]."""
+"""Time limit of a network in the worker, with its imports [s]."""
 SETTINGS = TrialSettings(processor_s=5, nominal=2, random=5)
 ODD: tuple[Any, ...] = (
     None,
@@ -107,13 +107,13 @@ OPERATORS = (
 
 
 class Still:
-    """A policy that asks for the default pose, and refuses observations that are not finite."""
+    """A policy that requests the default pose, and refuses observations that are not finite."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """The policy has no state."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return zeros."""
@@ -132,7 +132,7 @@ def damaged_spec(rng: random.Random, good: dict[str, Any], spots: list[tuple[Any
     """Return a spec's text with one to three damages."""
     values = copy.deepcopy(good)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        # Whole fields as often as the many entries of the observation.
+        # Whole fields are damaged as often as the many entries of the observation.
         path = rng.choice(spots) if rng.random() < 0.5 else (rng.choice(list(good)),)
         place: Any = values
         try:
@@ -150,7 +150,7 @@ def damaged_spec(rng: random.Random, good: dict[str, Any], spots: list[tuple[Any
             else:
                 place[path[-1]] = rng.choice(ODD)
         except (LookupError, TypeError):
-            continue  # An earlier damage took this place away.
+            continue  # An earlier damage removed this value.
     text = json.dumps(values)
     if rng.random() < 0.05:
         at = rng.randrange(len(text))
@@ -159,7 +159,7 @@ def damaged_spec(rng: random.Random, good: dict[str, Any], spots: list[tuple[Any
 
 
 def judge_spec(text: str, description: RobotDescription, probes: list[Any]) -> str:
-    """Return what becomes of a spec; raises what nobody should."""
+    """Return the outcome of a spec; raises errors that are failures."""
     try:
         spec = PolicySpec.from_json(text)
         behaviour = PolicyBehaviour(Still(spec), description)
@@ -180,7 +180,7 @@ def judge_spec(text: str, description: RobotDescription, probes: list[Any]) -> s
 
 
 def fuzz_specs(count: int, seed: int) -> tuple[collections.Counter[str], list[str]]:
-    """Return the outcomes of so many specs, and the failures."""
+    """Return the outcomes of this number of specs, and the failures."""
     outcomes: collections.Counter[str] = collections.Counter()
     failures = []
     bases = []
@@ -210,7 +210,7 @@ def damaged_network(seed: int, number: int) -> tuple[str, bytes]:
     robot = rng.choice(ROBOTS)
     data = bytearray(Path(str(shipped_policy(robot))).read_bytes())
     for _ in range(rng.choice((1, 1, 2, 4, 16))):
-        # Graph and metadata are short, and stand at both ends; between them are weights.
+        # Graph and metadata are short and at both ends; the weights are between them.
         at = rng.choice(
             (
                 rng.randrange(min(800, len(data))),
@@ -263,7 +263,7 @@ def work(seed: int, first: int, last: int) -> None:
 
 
 def fuzz_networks(count: int, seed: int, every: int) -> tuple[collections.Counter[str], list[str]]:
-    """Return the outcomes of so many networks, and the failures."""
+    """Return the outcomes of this number of networks, and the failures."""
     outcomes: collections.Counter[str] = collections.Counter()
     failures: list[str] = []
     number = 0
@@ -293,7 +293,7 @@ def fuzz_networks(count: int, seed: int, every: int) -> tuple[collections.Counte
 
 
 def judge_network(seed: int, number: int) -> str:
-    """Return what the check of `deal-hw deploy` says of a network."""
+    """Return the result of `deal-hw deploy`'s check for a network."""
     robot, data = damaged_network(seed, number)
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -315,7 +315,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--specs", type=int, default=10_000)
     parser.add_argument("--networks", type=int, default=1_000)
-    parser.add_argument("--every", type=int, default=50, help="one network in so many gets the whole check")
+    parser.add_argument("--every", type=int, default=50, help="1 of N networks gets the whole check")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=int, nargs=3, default=None, help=argparse.SUPPRESS)
     given = parser.parse_args()

@@ -1,7 +1,7 @@
 """The two processes of ``tools/measure_go2_transport.py``: a controller and a robot that only measure.
 
-Each message carries its number and the time of its sending in bytes that the receiver leaves alone. Both
-processes run on one machine, so their clocks are the same and ages are exact.
+Each message has its number and its sending time in bytes that the receiver does not use. Both processes run
+on one machine, so their clocks are the same and ages are exact.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from deal_hw.transport import Message, TopicTransport, WireOptions
 _MARK: Final = struct.Struct("<IQ")
 _HEADER: Final = bytes.fromhex("00010000")
 _LAYOUT: Final[Mapping[str, tuple[int, int]]] = {LOW_COMMAND: (812, 748), LOW_STATE: (1180, 1104)}
-"""Topic -> bytes of its message, and where in them the field wireless_remote stands."""
+"""Topic -> bytes of its message, and the offset of the field wireless_remote."""
 LATE_NS: Final = 1_000_000
-"""Cycles that are delayed by more are listed one by one, for the stall monitor to judge [ns]."""
+"""Cycles with a larger delay are listed one by one, for the stall monitor to judge [ns]."""
 _MEETING_S: Final = 10.0
 _STALE_NS: Final = 100_000_000
 
 
 def mark(topic: str, number: int, sent_ns: int) -> bytes:
-    """Return a message with the size of the topic's, that carries its number and when it was sent [ns]."""
+    """Return a message of the topic's size with its number and sending time [ns]."""
     size, place = _LAYOUT[topic]
     message = bytearray(size)
     message[:4] = _HEADER
@@ -53,15 +53,15 @@ def read_mark(topic: str, payload: bytes) -> tuple[int, int]:
 
 @dataclass(slots=True)
 class Arrivals:
-    """What arrived of a numbered stream; number 0 is a hello and does not count.
+    """Arrivals of a numbered stream; number 0 is a hello and does not count.
 
     Attributes:
-        count: Messages that arrived, each number once.
+        count: Number of messages that arrived, each number once.
         newest: The highest number.
-        newest_sent_ns: When it was sent [ns].
+        newest_sent_ns: Its sending time [ns].
         disordered: Messages that came after a higher number, or twice.
         stale: Messages older than 0.1 s at arrival.
-        gaps: First missing number and how many are missing from there, flat.
+        gaps: First missing number and number of missing ones from there, flat.
         ages: Time from sending to arrival [ns].
     """
 
@@ -102,13 +102,13 @@ class Arrivals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Freeze:
-    """When the robot's process is stopped (SIGSTOP) and goes on (SIGCONT).
+    """Cycles at which the robot's process is stopped (SIGSTOP) and continued (SIGCONT).
 
     Attributes:
         pid: The process.
         first: Cycle before which it is stopped; 0 for never.
         last: Cycle before which it goes on.
-        settled: Last cycle that may still suffer.
+        settled: Last cycle that may still be disturbed.
     """
 
     pid: int
@@ -137,7 +137,7 @@ class Controller:
         self._period_errors = array("q")
 
     def run(self, cycles: int) -> dict[str, Any]:
-        """Meet the robot, run that many cycles and return what was measured."""
+        """Wait for the robot, run this number of cycles and return the measurements."""
         self._meet()
         print("running", flush=True)
         cpu_ns, begun_ns = time.process_time_ns(), self._clock.now_ns()
@@ -242,11 +242,11 @@ class RobotSide:
         self._stopped = False
 
     def stop(self, *_: object) -> None:
-        """Ask for the end."""
+        """Request the end."""
         self._stopped = True
 
     def run(self) -> dict[str, Any]:
-        """Serve until asked to stop and return what was measured."""
+        """Serve until the end is requested, and return the measurements."""
         while not self._stopped:
             with contextlib.suppress(TransportTimeoutError):
                 self._transport.receive(0.1)

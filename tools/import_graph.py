@@ -15,8 +15,8 @@ from typing import Literal
 import tomllib
 
 When = Literal["load", "call", "types", "text"]
-"""When an import happens: as its module loads, as a function runs, never (under ``TYPE_CHECKING``, for type
-checkers alone), or where a module's name is written as text."""
+"""Kind of an import: at the module's load, when a function runs, never (under ``TYPE_CHECKING``, for type
+checkers only), or a module's name as text."""
 
 MODULE_TEXT = re.compile(r"[A-Za-z_]\w*(?:\.\w+)+(?::\w+)?")
 IMPORT_CALLS = frozenset({"import_module", "importlib.import_module", "__import__"})
@@ -29,8 +29,8 @@ class Import:
     Attributes:
         line: Its line in the file.
         source: The module that it names; a relative one begins with dots.
-        names: What it takes from there (``from source import names``); empty where it takes the whole.
-        when: When it happens.
+        names: The imported names (``from source import names``); empty for the whole module.
+        when: Kind of the import.
         by_call: The name is the argument of `importlib.import_module` or of its like.
     """
 
@@ -44,8 +44,8 @@ class Import:
 def imports(tree: ast.AST) -> Iterator[Import]:
     """Yield all that a parsed file imports, at the top or inside functions, also by name as text.
 
-    Text counts where it is a dotted name, such as ``"deal_hw.calib.deal:Deal"``; whether there is such a
-    module is for the caller to know.
+    Text counts if it is a dotted name, such as ``"deal_hw.calib.deal:Deal"``. The caller checks whether the
+    module exists.
     """
     yield from _imports(tree, "load")
 
@@ -60,7 +60,7 @@ def _imports(node: ast.AST, when: When) -> Iterator[Import]:
         first = node.args[0] if node.args else None
         if isinstance(first, ast.Constant) and isinstance(first.value, str):
             yield Import(node.lineno, first.value, (), when, by_call=True)
-            # Not once more as text.
+            # Not counted again as text.
             for child in (*node.args[1:], *node.keywords):
                 yield from _imports(child, when)
             return
@@ -85,7 +85,7 @@ class SourceFile:
     Attributes:
         path: Its path from the root of the checkout.
         module: The name under which it is installed.
-        text: What is in it.
+        text: Its content.
         tree: The same, parsed.
     """
 
@@ -96,7 +96,7 @@ class SourceFile:
 
     @property
     def package(self) -> str:
-        """Name of the package that the file lies in, which for an ``__init__.py`` is its own name."""
+        """Name of the file's package; for an ``__init__.py`` its own name."""
         return self.module if self.path.name == "__init__.py" else self.module.rpartition(".")[0]
 
 
@@ -143,7 +143,7 @@ def absolute(source: str, package: str) -> str:
 def targets(found: Import, package: str, modules: Iterable[str]) -> set[str]:
     """Return which of these modules an import names.
 
-    ``from package import x`` names the module ``package.x`` where there is one, otherwise the package itself.
+    ``from package import x`` names the module ``package.x`` if it exists, otherwise the package itself.
     """
     source = absolute(found.source, package)
     names = [f"{source}.{name}" for name in found.names] or [source]

@@ -3,8 +3,8 @@
 Run it as ``python tools/measure_bridge.py --out FILE.json``. All processes run on this machine, so that their
 monotonic clock is the same.
 
-``latency``: a controller and a robot only measure, with 500 commands and states a second over TLS, through
-the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge run in a
+``latency``: a controller and a robot exchange 500 commands and states a second over TLS: through the
+bridge (with DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge run in a
 network namespace, and its interface goes down in a command stream. The time from there to the first damping
 at the robot counts, beside a stall monitor of the bridge's priority. ``restart``: the bridge is killed with
 SIGKILL in a command stream and started again. ``refuse``: replayed commands and a second controller beside
@@ -190,7 +190,7 @@ def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any
     }
 
 
-# What breaks.
+# Faults.
 
 
 def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
@@ -300,10 +300,10 @@ def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
 
 
 def refuse(config: MeasureBridge, folder: Path) -> dict[str, Any]:
-    """Return the refusals beside a controller that is not disturbed."""
+    """Return the refusals while a controller runs undisturbed."""
     with BridgeRig(folder, config.domain) as rig:
         options = rig.options("controller")
-        # Opened before the first one commands: a handshake would hold up the threads of this process.
+        # Opened before the first one commands, because a handshake would delay the threads of this process.
         with BridgeClient(rig.port, options) as client, BridgeClient(rig.port, options) as second:
             client.take_over()
             told = rig.commands()

@@ -73,7 +73,7 @@ class CartpoleRig(Rig):
     phases = (CONNECTING, TAKING_OVER, ARMING, RUNNING, ENDING)
 
     def emulator_options(self) -> list[str]:
-        """A port whose name stays when the cable is put back."""
+        """A port that keeps its name when the cable is put back."""
         link = ["--link", str(self.folder / "port")]
         return ["--transport", self.wire, "--profile", "sensor", "--nominal", *link]
 
@@ -85,8 +85,8 @@ class CartpoleRig(Rig):
     def command(self, out: str, port: str = "") -> list[str]:
         """Return the command line of a run.
 
-        A faulty policy goes wrong at a wanted velocity, so that its trial does not find the fault. `deploy`
-        refuses that option for a robot without legs: a program runs the same plan.
+        A policy's fault begins at a commanded velocity, so that its trial does not find the fault. `deploy`
+        refuses that option for a robot without legs, so a program runs the same plan.
         """
         if not (self.case.policy or self.case.dry):
             return super().command(out, port)

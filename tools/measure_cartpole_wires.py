@@ -4,11 +4,11 @@
 python tools/measure_cartpole_wires.py --transports serial can odrive --seconds 120 --out wires.json
 python tools/measure_cartpole_wires.py --table wires.json
 
-Each row is an emulator in a process of its own and a control loop here, with one command for each cycle and
-all states read. Round trip: from sending a command until the first state that names it has been read [ms].
-The device ticks once a millisecond and sends a state every 5 ms, so 1 to 6 ms are the device's own. Cycle:
-lateness of its start [ms]. Wire: worst transit of a command and a state at the bit rate [ms]. Add it, because
-the emulators' wires take no time. Only the emulated Dynamixel servos include it.
+Each row has an emulator in a separate process and a control loop here. The loop sends one command for each
+cycle and reads all states. Round trip: from sending a command until the first state that names it has been
+read [ms]. The device ticks once a millisecond and sends a state every 5 ms, so 1 to 6 ms are the device's
+own. Cycle: lateness of its start [ms]. Wire: worst transit of a command and a state at the bit rate [ms]. Add
+it, because the emulators' wires take no time. Only the emulated Dynamixel servos include it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
     Args:
         transport: The wire.
         rate_hz: Commands a second.
-        seconds: How long [s].
+        seconds: Duration [s].
     """
     clock = MonotonicClock()
     trips: list[float] = []

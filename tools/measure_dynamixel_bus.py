@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Round trips on a Dynamixel bus: both servos' registers, asked for at a fixed rate.
+"""Round trips on a Dynamixel bus: both servos' registers, requested at a fixed rate.
 
     python tools/measure_dynamixel_bus.py --seconds 120
     python tools/measure_dynamixel_bus.py --port /dev/ttyUSB0 --rates 50 200
 
-A round trip is from the request's write to the last byte of both servos' answers, as for each sample of the
-driver (Fast Sync Read of 72 bytes each). The time of these bytes on the wire is shown beside it. Without
---port two emulated servos answer, which take the wire's time, too. --absent asks an absent servo, to measure
-the cost of a dead one.
+A round trip is the time from writing the request to the last byte of both servos' answers. The driver does
+one for each sample (Fast Sync Read of 72 bytes each). The time of these bytes on the wire is shown beside it.
+Without --port two emulated servos answer, which take the wire's time, too. --absent addresses an absent
+servo, to measure the cost of a dead one.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class MeasureBus:
     """Baud rate of the emulated servos."""
 
     absent: bool = False
-    """Ask an absent servo."""
+    """Address an absent servo."""
 
     out: Path | None = field(default=None)
     """Write the rows to this JSON file."""

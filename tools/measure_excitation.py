@@ -1,4 +1,4 @@
-"""Does an excitation help the calibration itself: error and interval width on emulated cart-poles.
+"""Effect of an excitation on the calibration: error and interval width on emulated cart-poles.
 
 Each robot is recorded once with each excitation, and calibrated by the default method; K9, range ratio 5.
 

@@ -39,7 +39,7 @@ def armed_chip() -> Chip:
 
 
 def row(name: str, period: int, cart: int, pole: int, ticks: int = 1000) -> str:
-    """Return a line of the table: targets every so many ticks, counts of both encoders in each."""
+    """Return a line of the table: ticks between targets, counts of both encoders in each."""
     chip, plain = armed_chip(), 0
     for tick in range(ticks):
         data = b""
@@ -61,7 +61,7 @@ def main() -> None:
     """Print both tables."""
     with tempfile.TemporaryDirectory() as folder:
         print(native.write_image(Path(folder)))
-    print("| what goes on | with a state frame | without | left of 16 000 | asleep |\n|---|---|---|---|---|")
+    print("| situation | with a state frame | without | left of 16 000 | asleep |\n|---|---|---|---|---|")
     print(row("armed, at rest, targets at 50 Hz", 20, 0, 0))
     print(row("armed, at rest, targets at 200 Hz", 5, 0, 0))
     print(row("1 m/s, pole at 2 turns a second, 50 Hz", 20, 40, 8))

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Calibration of the emulated suspended Go2 over its wire, against a truth that is revealed afterwards.
+"""Calibration of the emulated Go2 on a stand over its wire, compared with its hidden truth.
 
-For each seed an emulator, `deal-hw collect` (a multisine to fit, a motion of another family to judge by) and
-`deal-hw calibrate` run as processes of their own, over a real wire. The emulator writes its truth when it
-ends; it is read after the calibration has written its result.
+For each seed an emulator, `deal-hw collect` and `deal-hw calibrate` run as separate processes, over a real
+wire. `collect` records a multisine to fit, and a motion of another family to judge. The emulator writes its
+truth when it ends; it is read after the calibration has written its result.
 
     python tools/measure_go2_calibration.py --transport zenoh --seeds 1000-1004 --out FILE.json
 
@@ -87,10 +87,10 @@ def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
 
 
 def recorded(options: argparse.Namespace, seed: int, folder: Path) -> tuple[Path, list[str], list[str]]:
-    """Record both episodes, again where a run ended early: on a busy machine states come too late at times.
+    """Record both episodes, again if a run ended early: on a busy machine states may be late.
 
     Returns:
-        The run folder, what `collect` said of both, and what it said of recordings that ended early.
+        The run folder, the output of `collect` for both, and its output for recordings that ended early.
 
     Raises:
         RuntimeError: Each attempt ended early.
@@ -107,7 +107,7 @@ def recorded(options: argparse.Namespace, seed: int, folder: Path) -> tuple[Path
 
 
 def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
-    """Record both episodes from a new emulator; return what `collect` said of them."""
+    """Record both episodes from a new emulator; return the output of `collect`."""
     wire = (
         "--transport",
         options.transport,
@@ -150,10 +150,10 @@ def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
 
 
 def verb(*words: str) -> str:
-    """Run a verb of deal-hw as a process of its own; return what it printed.
+    """Run a verb of deal-hw as a separate process; return its output.
 
     Raises:
-        RuntimeError: It failed; the text holds what it said.
+        RuntimeError: It failed; the text has its output.
     """
     done = subprocess.run(
         [sys.executable, "-m", "deal_hw", *words],

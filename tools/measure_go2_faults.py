@@ -63,7 +63,7 @@ class Go2Rig(Rig):
     inactive = frozenset({DAMPING, OFF})
 
     def emulator_options(self) -> list[str]:
-        """Listen at a free port, or in a domain that is far from real robots."""
+        """Listen at a free port, or in a domain that no real robot uses."""
         standing = "standing" in self.case.emulator or self.case.dry
         sport = [] if standing else ["--sport", "off"]
         if self.case.dry:
@@ -209,7 +209,7 @@ CASES = (
     Case(name="a joint reports NaN", emulator=after("--nan-after-s")),
     Case(name="a motor reports 95 degrees", emulator=after("--hot-after-s")),
     Case(name="L2+B on the remote", emulator=after("--stop-after-s"), codes=(130,)),
-    # Some pushes find it lying or on all feet, and it stays up: then the run goes on.
+    # If it lies or stands on all feet at the push, it may stay up, and the run goes on.
     Case(name="a hard push to its side", emulator=(*after("--push-after-s"), "--push", "60"), codes=(0, 3)),
     Case(name="the policy answers NaN", policy="nan"),
     Case(name="the policy takes over 100 ms", policy="late"),

@@ -1,4 +1,4 @@
-"""Measure the signals that tell floor from stand on the emulated Go2, for ``deal_hw.drivers.go2.support``.
+"""Measure the signals that distinguish floor and stand, for ``deal_hw.drivers.go2.support``.
 
     python tools/measure_go2_support.py --out docs/measured/go2_support.json
 
@@ -35,7 +35,7 @@ COLUMNS = ("reach_m", "third_foot_m", "load_n", "foot_sensors", "fastest_joint_r
 
 
 def window(device: Go2Device, after_ms: int) -> list[LowStateFrame]:
-    """Return the states of 0.3 s, so long after the start."""
+    """Return the states of 0.3 s, at a time after the start."""
     sent = device.advance_to((after_ms + WINDOW_MS) * 1_000_000)
     states = [decode_low_state(payload) for topic, payload in sent if topic == topics.LOW_STATE]
     return states[-WINDOW_MS // 2 :]

@@ -33,9 +33,9 @@ _START_S: Final = 30.0
 _END_S: Final = 20.0
 _SETTLE_S: Final = 2.0
 _PAUSE_NS: Final = 200_000
-"""Pauses of the machine shorter than this are not told apart from ordinary wake-ups [ns]."""
+"""Shortest pause of the machine that differs from an ordinary wake-up [ns]."""
 FREEZE_LIMIT_S: Final = 2e-3
-"""No control cycle may be delayed by more than this while the peer is frozen [s]."""
+"""Largest allowed delay of a control cycle while the peer is frozen [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class TransportBench:
     """Network interface (dds) or end point (zenoh); by default on this machine's loopback."""
 
     seconds: Annotated[float, Range(0.1, 86_400, "s")] = 20.0
-    """How long to measure [s]."""
+    """Duration of the measurement [s]."""
 
     rate: Annotated[float, Range(1, 10_000, "Hz")] = 500.0
     """Commands and states a second [1/s]."""
@@ -115,7 +115,7 @@ def measure(settings: TransportBench) -> tuple[dict[str, Any], dict[str, Any]]:
         "cycles": round(settings.seconds * settings.rate),
     }
     wire = {**settings.wire.to_json(), "listen": False}
-    # Zenoh needs one side that waits, and a client cannot; DDS has no sides.
+    # Zenoh needs one side that listens, and a client cannot; DDS has no sides.
     robot_wire = {**wire, "listen": True, "mode": "peer"} if settings.transport == "zenoh" else wire
     with (
         _monitored() as seen,
@@ -156,7 +156,7 @@ def _freeze_cycles(settings: TransportBench) -> dict[str, int]:
 def summary(
     settings: TransportBench, controller: Mapping[str, Any], robot: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the row of the result from what both sides measured.
+    """Return the row of the result from the measurements of both sides.
 
     Losses in the freeze and the 2 s after it are counted apart, because no transport could avoid them.
     """
@@ -202,10 +202,7 @@ def _awake_delay(frozen: Mapping[str, Any] | None, seen: Account | None) -> dict
 
 
 def _awake_s(cycles: Mapping[str, Any], seen: Account | None) -> float | None:
-    """Return the longest delay of a cycle, times in which the machine stood still left out [s].
-
-    None where nobody watched the machine.
-    """
+    """Return the longest delay of a cycle, without the machine's pauses [s]; None if no monitor ran."""
     if seen is None:
         return None
     late = cycles.get("late", ())

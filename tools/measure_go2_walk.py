@@ -29,7 +29,7 @@ from deal_hw.workflows.emulation.walk_script import PROFILE, PROFILE_S
 from deal_hw.workflows.shipped import shipped_policy
 
 NAMES = ("stand", "ahead", "left", "turn")
-"""Of the parts of the profile."""
+"""Durations of the profile's parts."""
 
 
 class Rounds:
@@ -47,11 +47,11 @@ def measure(policy: OnnxPolicy, profile: str, seed: int | None, rounds: int) -> 
     Args:
         policy: The policy.
         profile: The emulator's profile.
-        seed: Of its hidden parameters; None: the nominal ones.
-        rounds: How many.
+        seed: Seed of its hidden parameters; None: the nominal ones.
+        rounds: Number of rounds.
 
     Returns:
-        Plain JSON values: how the run ended, what was clipped, and mean errors by part [m/s, rad/s].
+        Plain JSON values: end of the run, clipped commands, and mean errors by part [m/s, rad/s].
     """
     truth = nominal_truth(profile) if seed is None else draw_truth(profile, seed)
     done = walk(truth, policy, Rounds(), rounds * PROFILE_S, record=False)

@@ -57,7 +57,7 @@ def _late_cycles(recording: Episode) -> list[tuple[int, int]]:
     skipped = np.diff(cycles.cycle) - 1
     late = []
     for index in np.flatnonzero(skipped) + 1:
-        # The recorded deadline is that of the grid's cycle that was run; the skipped ones were due before it.
+        # The recorded deadline is that of the cycle that ran; skipped cycles were due before it.
         due_s = cycles.deadline_s[index] - skipped[index - 1] / RATE_HZ
         due_ns, start_ns = (
             recording.start_ns + round(float(t) * 1e9) for t in (due_s, cycles.start_s[index])
@@ -78,7 +78,7 @@ def _judge(overruns: list[tuple[int, int]], seen: Account) -> list[dict[str, Any
 
 
 def measure(config: MeasureLoopTiming) -> dict[str, Any]:
-    """Run and return the report with the machine it was measured on."""
+    """Run and return the report, with a description of the machine."""
     load_before = os.getloadavg()
     with tempfile.TemporaryDirectory() as folder, watch_stalls(_PAUSE_NS) as seen, _port(config.port) as port:
         report = collect(

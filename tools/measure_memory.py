@@ -67,14 +67,14 @@ WHOLES = ("least-squares", "least-squares-multistart", "mujoco-sysid", "local", 
 """Methods without; `midpoint` and `nominal`, which only draw once, are not measured."""
 
 LONGER = {"bo": 2, "gauss-newton": 4}
-"""Times as many generations: until the Gaussian process has its most points (49 generations), and until
-`gauss-newton` has begun anew (62 draws, some 25 refinements)."""
+"""Factor on the generations: until the Gaussian process has all its points (49 generations), and until
+`gauss-newton` has restarted (62 draws, some 25 refinements)."""
 
 LEAST_SECONDS = {"local": 1.6, "output-error": 1.6, REFINED: 1.6}
-"""Recordings that these refuse to judge are shorter [s]."""
+"""Length of recordings for methods that refuse shorter ones [s]."""
 
 RUN_GENERATIONS = 5
-"""So many generations are given to one run of a method without; a run is wanted for as many."""
+"""Generations that count as one run of a method without generations."""
 
 FLAT_KIB: Mapping[Unit, float] = {"generation": 10.0, "run": 10.0 * RUN_GENERATIONS}
 """Growth below this counts as chance: 1 MiB in a hundred generations [KiB]."""
@@ -153,7 +153,7 @@ class Series:
 
 
 def make_problem(seconds: float) -> Problem:
-    """Return a problem with a recording of so many seconds."""
+    """Return a problem with a recording of this length."""
     space = k9_space().with_ratio(5.0)
     theta = space.unnormalize(np.random.default_rng(1).uniform(0.3, 0.7, len(space)))
     made = simulated_episode(DESCRIPTION, space, theta, seconds=seconds, latency_ticks=5, sensor=True, seed=1)
@@ -163,7 +163,7 @@ def make_problem(seconds: float) -> Problem:
 
 
 def watch(method: str, generations: int, population: int, seconds: float) -> dict[str, Any]:
-    """Run a method as often as it takes and return its memory over generations or runs.
+    """Run a method often enough and return its memory over generations or runs.
 
     Args:
         method: Name of the method.
@@ -233,7 +233,7 @@ def measured(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write(path: Path, settings: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write settings and rows, a line each; rows of other methods stay where the settings are the same."""
+    """Write settings and rows, a line each; rows of other methods stay if the settings are the same."""
     settings = {**settings, "flat_kib": FLAT_KIB, "libc": " ".join(platform.libc_ver())}
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     kept = before["rows"] if before.get("settings") == settings else []

@@ -1,6 +1,6 @@
 """Kill real recorder processes with SIGKILL at random moments, and print the loss of each.
 
-The loss is the time between the last state sample handed over and the last one in the repaired file. Both
+The loss is the time from the last sample in the repaired file to the last sample given to the recorder. Both
 times are the samples' own stamps, so the time at which the kill is noticed has no effect.
 """
 
@@ -90,7 +90,7 @@ def loss_of_one_kill(folder: Path, rng: np.random.Generator) -> tuple[float, int
 
 
 def main() -> None:
-    """Print one line a kill, then the worst."""
+    """Print one line for each kill, then the worst."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)

@@ -31,7 +31,7 @@ START_NS = 1_000_000_000_000
 
 
 def body(rng: np.random.Generator, joints: int) -> BodyState:
-    """Return what a robot with legs senses."""
+    """Return the sensor values of a robot with legs."""
     return BodyState(
         orientation=np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0, 1e-3, 4),
         angular_velocity=rng.normal(size=3),
@@ -119,7 +119,7 @@ def record(robot: str, made: list[CycleRecord], left_out: frozenset[str]) -> tup
 
 
 def main() -> None:
-    """Print a line a robot."""
+    """Print a line for each robot."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

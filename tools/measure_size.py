@@ -39,9 +39,9 @@ from deal_hw.testing.plain_robots import RATE_HZ, PlainRobot, record
 STEP_S = 0.0025
 AXES = ("0 0 1", "0 1 0", "1 0 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
 TILT = 0.5
-"""Of an arm's base about its x axis [rad]."""
+"""Tilt of an arm's base about its x axis [rad]."""
 BENDS = (0.0, -0.7, 0.0, 1.1, 0.0, 0.6, 0.0)
-"""How far each link is turned about its y axis where all joints are at zero [rad]: weight and biases show."""
+"""Angle of each link about its y axis at zero joint positions [rad]; it makes weight and biases visible."""
 WEIGHED = 1
 """The link whose mass is known."""
 LENGTHS = (0.05, 0.18, 0.14, 0.14, 0.12, 0.10, 0.08)
@@ -121,7 +121,7 @@ def _chain(side: str, values: Sequence[dict[str, dict[str, float]]], which: str)
     for k in reversed(range(len(values))):
         own, joint, link = values[k][which], f"{side}{k + 1}", f"{side}{k + 1}_link"
         dynamics = " ".join(f'{name}="{own[f"{joint}.{name}"]:.9g}"' for name in SHARES)
-        # An encoder's bias is a joint whose zero lies elsewhere: the servo closes its loop on what it reads.
+        # An encoder's bias shifts the joint's zero, because the servo closes its loop on its reading.
         bias = own.get(f"{joint}.encoder_bias", 0.0)
         mass = own.get(f"{link}.mass", MASSES[k])
         bodies = (
@@ -152,8 +152,8 @@ def write_arm(folder: Path, joints: int, seed: int, seconds: float) -> tuple[Pla
     """Write model, parameters and recordings; return the robot and the arguments of ``deal-hw calibrate``.
 
     Args:
-        folder: Where.
-        joints: Of the robot.
+        folder: Folder for the files.
+        joints: Joints of the robot.
         seed: Of truth, motions and noise.
         seconds: Length of what is fitted, in two recordings; a third recording only judges [s].
     """
@@ -251,7 +251,7 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
         "exit_code": process.returncode,
         "seconds": time.monotonic() - began,
         "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
-        # Of the largest child so far, which is this one: [KiB] on Linux.
+        # Peak of the largest child so far, which is this one, in KiB on Linux.
         "peak_mib": after.ru_maxrss / 1024,
         "said": said,
     }
@@ -318,7 +318,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--joints", type=int, nargs="+", default=[7, 14], choices=range(1, 15), metavar="N")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="SEED")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of what is fitted [s]")
-    parser.add_argument("--limit", type=float, default=1200.0, help="stop a calibration after so long [s]")
+    parser.add_argument("--limit", type=float, default=1200.0, help="stop a calibration after this time [s]")
     parser.add_argument("--options", default="", help="more options of deal-hw calibrate, in one word")
     parser.add_argument("--profile", type=Path, help="file for cProfile's figures; the last run's are kept")
     parser.add_argument("--out", type=Path, help="file of the rows (JSON)")

@@ -38,7 +38,7 @@ SETS = {
         ("tests/control/test_control_exit_[sv]*.py", "tests/control/test_control_words.py"),
     ),
 }
-"""What is changed, the tests that must notice, what else pytest is told; each set is a run of its own."""
+"""Sources to change, tests that must notice, further arguments of pytest; each set is a separate run."""
 SURVIVED = ("survived", "no tests", "suspicious", "skipped")
 CONFIGURATION = """
 [tool.mutmut]

@@ -42,10 +42,10 @@ class Refusal:
 
     Attributes:
         path: The source, relative to the checkout.
-        function: Where in it, as ``Class.method``; "" at module level.
-        kind: What is called: an error's class or a helper.
+        function: Its function, as ``Class.method``; "" at module level.
+        kind: The called name: an error's class or a helper.
         words: Its arguments.
-        exit_code: What `deal-hw` ends with where nothing catches the error; "-" for none of its own.
+        exit_code: Exit code of `deal-hw` if nothing catches the error; "-" for none of its own.
         line: First line of the call.
         column: Column of the call.
         last_line: Its last line.
@@ -108,7 +108,7 @@ def calls(tree: ast.Module, known: frozenset[str], defines: bool) -> Iterator[tu
     Args:
         tree: A module.
         known: Names of error classes.
-        defines: It is errors.py, where a class hands its words to the one above.
+        defines: It is errors.py, where a class passes its words to its base class.
     """
 
     def walk(node: ast.AST, function: str, raised: bool) -> Iterator[tuple[ast.Call, str]]:
@@ -181,7 +181,7 @@ def _arguments(call: ast.Call) -> Iterator[str]:
 
 
 def words(node: ast.AST) -> str:
-    """Return the text of an argument, `{...}` for what comes in at run time."""
+    """Return the text of an argument, with `{...}` for values of the run time."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return " ".join(f"x{node.value}x".split())[1:-1]
     if isinstance(node, ast.JoinedStr):

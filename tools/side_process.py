@@ -18,16 +18,16 @@ _SIDES = Path(__file__).with_name("go2_transport_sides.py")
 
 
 class SideProcess:
-    """One of the two processes; it never outlives the block.
+    """One of the two processes; it is ended with the block.
 
     Args:
-        name: Which, "controller" or "robot".
-        orders: What it is told on standard input.
+        name: "controller" or "robot".
+        orders: Its orders on standard input.
     """
 
     def __init__(self, name: str, orders: Mapping[str, Any]) -> None:
         self._name = name
-        # A session of its own: Ctrl-C in the terminal is this process's to handle.
+        # A session of its own, so that only this process handles Ctrl-C in the terminal.
         self._process = subprocess.Popen(
             [sys.executable, str(_SIDES), name],
             stdin=subprocess.PIPE,
@@ -38,7 +38,7 @@ class SideProcess:
         )
         with _pipe(self._process.stdin) as orders_pipe:
             orders_pipe.write(json.dumps(orders).encode())
-        self._process.stdin = None  # Or communicate() would flush it.
+        self._process.stdin = None  # Otherwise communicate() would flush it.
         self._out = b""
 
     @property
@@ -47,7 +47,7 @@ class SideProcess:
         return self._process.pid
 
     def stop(self) -> None:
-        """Ask it to end and to print its result."""
+        """Request its end and its result."""
         self._process.terminate()
 
     def expect(self, word: str, timeout_s: float) -> None:
@@ -61,7 +61,7 @@ class SideProcess:
             raise self._failed(line)
 
     def result(self, timeout_s: float, update: Callable[[float], None] | None = None) -> dict[str, Any]:
-        """Wait for the result, telling ``update`` the seconds that have passed.
+        """Wait for the result, and pass the elapsed seconds to ``update``.
 
         Raises:
             TransportError: The process failed, or said nothing in time.

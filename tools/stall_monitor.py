@@ -79,8 +79,9 @@ def watch_stalls(
 
     Args:
         least_ns: Shorter pauses are not noted [ns].
-        processors: Which; by default all that this process may use.
-        priority: Of the monitor; that of the watched program counts what other real-time programs take, too.
+        processors: Their numbers; by default all that this process may use.
+        priority: Priority of the monitor. With that of the watched program, the time of other real-time
+            programs counts as a pause, too.
 
     Raises:
         ConfigurationError: SCHED_FIFO was refused.
@@ -109,7 +110,7 @@ def watch_stalls(
 
 
 def watch(number: int, least_ns: int, priority: int) -> None:
-    """Print each pause of a processor, for ever: number, when the monitor was due and when it woke [ns]."""
+    """Print each pause of a processor, for ever: number, due time and wake-up time of the monitor [ns]."""
     os.sched_setaffinity(0, {number})
     become_realtime()
     try:
@@ -133,7 +134,7 @@ def main() -> int:
     )
     parser.add_argument("--seconds", type=float, default=60.0, help="how long to watch [s]")
     parser.add_argument("--least-ms", type=float, default=1.0, help="shorter pauses are not noted [ms]")
-    parser.add_argument("--watch", type=int, help="be the monitor of this processor, until killed")
+    parser.add_argument("--watch", type=int, help="run as the monitor of this processor, until killed")
     parser.add_argument("--priority", type=int, default=TOP_PRIORITY, help="of the monitor, 1 to 99")
     given = parser.parse_args()
     if given.watch is not None:

@@ -32,8 +32,8 @@ Closure of a verb (``--verb``, by default calibrate) inside the folder
     with tables: also modules named as text, so each method that a name can choose.
 
 Circles
-    Groups of modules that all reach each other by imports at the top, inside functions or under
-    ``TYPE_CHECKING`` (strongly connected components of more than one module), over all product modules.
+    Groups of more than one module that all reach each other by imports (strongly connected components), over
+    all product modules. Imports at the top, inside functions and under ``TYPE_CHECKING`` count.
     Beside it: without ``TYPE_CHECKING``, and circles of rooms of the folder.
 
 Numeric module constants of the folder
@@ -46,9 +46,10 @@ Numeric module constants of the folder
     arithmetic and containers alone. UPPER_CASE: how many are so written.
 
 Own least-squares loops of the folder: candidates for a person to judge
-    Functions that solve a linear system again and again: a loop or comprehension whose body calls ``solve``,
-    ``lstsq``, ``cho_solve``, ``lu_solve``, ``solve_triangular`` or ``pinv`` of numpy, scipy or torch,
-    directly or by one function in between (of the same file, of the same object, or imported by name).
+    Functions that solve a linear system repeatedly: a loop or comprehension whose body calls a solver of
+    numpy, scipy or torch: ``solve``, ``lstsq``, ``cho_solve``, ``lu_solve``, ``solve_triangular`` or
+    ``pinv``. The call is direct or by one function in between (of the same file, of the same object, or
+    imported by name).
     accepting: it is a ``for`` or ``while`` statement with an ``if`` in it that compares and then breaks,
     returns or continues.
     The list is to be read, its length is not the figure: a hand-written Levenberg-Marquardt loop is in it,
@@ -88,7 +89,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Count, print, and write or compare where asked; return 0, or 2 where something cannot be read."""
+    """Count, print, and write or compare if requested; return 0, or 2 if a file cannot be read."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -232,7 +233,7 @@ def numeric_constants(
     """Return the module-level names that are bound to numbers, with file and value."""
     names: dict[str, set[str]] = {}
     found: dict[tuple[str, str], dict[str, Any]] = {}
-    # Again until nothing is added, as a constant may be made of another file's.
+    # Repeated until nothing is added, because a constant may use another file's.
     while True:
         before = len(found)
         for file in inside.values():
@@ -358,7 +359,7 @@ def _is_solve(node: ast.AST) -> bool:
 
 
 def _solve_calls(loop: ast.AST, here: Mapping[str, tuple[str, str]], own: str) -> Iterator[str]:
-    """Yield what is called in a loop and solves; a function's call of itself is not looked at."""
+    """Yield the solving calls in a loop; recursive calls are ignored."""
     for node in ast.walk(loop):
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func)

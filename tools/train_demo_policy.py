@@ -36,7 +36,7 @@ ASSETS = Path(__file__).parents[1] / "policies" / "assets"
 FILES = {"allegro": "allegro_udr", "ant": "ant_udr", "go2": "go2_walk", "humanoid": "humanoid_udr"}
 JUDGED = 256
 JUDGE_SEED = 1_000_003
-"""Robots, commands and starts that the policy is judged by are the draws of this seed, none of training's."""
+"""Seed of the robots, commands and starts that judge the policy; training uses another one."""
 
 
 def train(
@@ -83,7 +83,7 @@ def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged
 
 
 class _Rest:
-    """A policy that does nothing, to compare with."""
+    """A policy without motion, for comparison."""
 
     def __init__(self, policy: OnnxPolicy) -> None:
         self.spec = policy.spec

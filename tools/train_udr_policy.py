@@ -2,11 +2,10 @@
 
     python tools/train_udr_policy.py
 
-writes policies/assets/cartpole_udr.onnx and, beside it, the record of its training and of what it can do: how
-it balances the hidden robots of the tuning seeds. Steps and settings are those of `deal-hw train`, as every
-comparison of policies is made at equal steps and settings. Of several training seeds the one that balances
-most robots is kept; a user who trains under a calibrated distribution takes one seed only, so the choice
-favours the policy to beat.
+writes policies/assets/cartpole_udr.onnx and, beside it, the record of its training and its results on the
+hidden robots of the tuning seeds. Steps and settings are those of `deal-hw train`, because policies are
+compared at equal steps and settings. Of several training seeds the one that balances most robots is kept. A
+user who trains under a calibrated distribution uses one seed only, so the choice favours this policy.
 """
 
 from __future__ import annotations

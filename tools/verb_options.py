@@ -1,4 +1,4 @@
-"""Every option of a verb with a value that is not its default: what tests of all options go through."""
+"""Every option of a verb with a value that is not its default, for tests of all options."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class OverlayPanel:
 
     Attributes:
         title: The recording's file, with its part if several are shown.
-        heldout: The search never saw it.
+        heldout: It was not used in the fit.
         names: The M measured channels.
         units: Unit of each channel, (M,).
         time_s: Time of each sample since the recording's first, (T,) [s].

@@ -103,7 +103,7 @@ def render(inputs: ReportInputs) -> str:
             if word in result.verdicts
         ],
         weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
-        untold=[
+        undetermined=[
             n
             for n, v in zip(result.space.names, result.verdicts, strict=False)
             if v == "not identifiable" and not any(n in words for words in result.null_directions)

@@ -1,5 +1,5 @@
 "use strict";
-// Reads series back from their paths: points at a time (pointer or keys), zooms along x. Without it charts stand still.
+// Shows the values of all series at one time (pointer or keys), and zooms along x. It reads the values from the paths.
 (() => {
   const numbers = (text) => text.split(" ").map(Number);
   const clip = (value, low, high) => Math.min(Math.max(value, low), high);
@@ -75,12 +75,12 @@
       return value.toPrecision(digits).replace("-", "\u2212");
     }
 
-    point(unit, told) {
+    point(unit, withValues) {
       this.clear();
       this.at = clip(unit, ...this.view);
       const share = (this.at - this.view[0]) / (this.view[1] - this.view[0]);
       add(this.plot, "div", "cross").style.left = `${100 * share}%`;
-      if (!told) return;
+      if (!withValues) return;
       const tip = add(this.plot, "div", "tip");
       tip.setAttribute("role", "status");
       const name = /^(.*?)(?: \[(.*)\])?$/.exec(this.xTitle), unitOf = /\[(.*)\]$/.exec(this.title);

@@ -27,6 +27,7 @@ from deal_hw.workflows.say import aloud
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
 EXIT_OK, EXIT_UNSOUND = 0, 1
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
@@ -191,24 +192,23 @@ def _info(config: InfoSettings) -> int:
 
 
 def _dataset_table(dataset: Dataset) -> Table:
-    from rich.table import Table
     from rich.text import Text
 
     # Text, since words from a file could look like markup.
     title = Text(f"{dataset.folder}: {dataset.description['name']}, description {dataset.digest}")
-    table = Table(title=title, title_justify="left")
+    table = _plain_table(title)
     table.add_column("no.", justify="right", no_wrap=True)
-    for name in ("motion", "recorded (UTC)"):
-        table.add_column(name)
+    table.add_column("motion")
+    table.add_column("UTC", no_wrap=True)
     for name in ("s", "states", "commands"):
         table.add_column(name, justify="right", no_wrap=True)
-    for name in ("moves by", "checks"):
-        table.add_column(name)
+    table.add_column("moves by")
+    table.add_column("checks", no_wrap=True)
     for episode in dataset.episodes:
         table.add_row(
             str(int(Path(episode.file).stem)),
             Text(_motion(episode)),
-            Text(episode.wall_utc[2:16].replace("T", " ")),
+            Text(episode.wall_utc[5:16].replace("T", " ")),
             f"{episode.duration_s:.1f}",
             str(episode.states),
             str(episode.commands),
@@ -216,6 +216,14 @@ def _dataset_table(dataset: Dataset) -> Table:
             _worst(episode),
         )
     return table
+
+
+def _plain_table(title: Text) -> Table:
+    """Return a table without vertical lines, which would take a quarter of 80 columns."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
 
 
 def _motion(episode: EpisodeInfo) -> str:
@@ -230,6 +238,9 @@ def _position_ranges(episode: EpisodeInfo, description: Mapping[str, Any]) -> st
     ranges = (episode.excitation or {}).get("position_range") or ()
     units, names = description.get("position_units") or (), description.get("joint_names") or ()
     parts = [f"{value:.2f} {unit}" for value, unit in zip(ranges, units, strict=False)]
+    if len(parts) == 2 and len(set(units)) == 1:
+        # The unit once, so that the row fits its line.
+        return ", ".join(parts).replace(f" {next(iter(units))},", ",")
     if len(parts) <= 2:
         return ", ".join(parts)
     widest = max(range(len(parts)), key=lambda index: ranges[index])
@@ -266,22 +277,25 @@ def _print_problems(console: Console, episode: EpisodeInfo) -> None:
 
 
 def _print_episode(console: Console, episode: EpisodeInfo) -> None:
-    from rich.table import Table
     from rich.text import Text
 
-    title = Text(f"{episode.file}: {episode.purpose} {episode.wall_utc[:19]}")
-    table = Table(title=title, title_justify="left")
-    table.add_column("check")
-    table.add_column("verdict")
-    table.add_column("what")
+    table = _plain_table(Text(f"{episode.file}: {episode.purpose} {episode.wall_utc[:19]} UTC"))
+    table.add_column("check", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("finding")
     for verdict in episode.verdicts:
         colour = _COLOURS[verdict["severity"]]
         table.add_row(verdict["name"], f"[{colour}]{verdict['severity']}[/]", Text(verdict["message"]))
     offset, drift = _clock_texts(episode)
     table.add_row("clocks", "", f"host minus device {offset}, drift {drift}")
-    for name, value in (episode.excitation or {}).items():
-        table.add_row(f"excitation: {name}", "", _plain(value))
     console.print(table)
+    if episode.excitation:
+        moved = _plain_table(Text("motion, for each joint"))
+        moved.add_column("quantity", no_wrap=True)
+        moved.add_column("value")
+        for name, value in episode.excitation.items():
+            moved.add_row(name, _plain(value))
+        console.print(moved)
 
 
 def _plain(value: Any) -> str:

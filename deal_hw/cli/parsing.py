@@ -44,6 +44,7 @@ class Rules:
         self.registry = ConstructorRegistry()
         self.registry.primitive_rule(_choice)
         self.registry.primitive_rule(_path)
+        self.registry.primitive_rule(_number)
         self.registry.struct_rule(self._struct)
 
     def hides(self, hint: Any) -> set[str]:
@@ -120,5 +121,29 @@ def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path | str | None
         metavar="PATH",
         instance_from_str=lambda words: None if optional and words[0] == "None" else Path(words[0]),
         is_instance=lambda value: isinstance(value, Path | str) or (optional and value is None),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float | None] | None:
+    """Parse a number; the parser's own rule reports a wrong optional one twice, as None and as a number."""
+    if info.type not in (int, float, int | None, float | None):
+        return None
+    kind: type[int] | type[float] = int if info.type in (int, int | None) else float
+    optional = info.type is not kind
+
+    def read(words: list[str]) -> float | None:
+        if optional and words[0] == "None":
+            return None
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"{words[0]!r} is no {'whole ' if kind is int else ''}number") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: (optional and value is None) or isinstance(value, int | float),
         str_from_instance=lambda value: [str(value)],
     )

@@ -50,6 +50,11 @@ def _print(training: Training) -> None:
     print(f"policy: {training.path}")
     print(f"record: {training.record}")
     print(f"checkpoint: {training.checkpoint}")
+    if training.status is not None and training.first_return is not None:
+        print(
+            f"return: {training.status.mean_return:.1f}, at first {training.first_return:.1f} (mean of up to "
+            "100 episodes; page 'Train a policy' of the documentation says what is good)"
+        )
 
 
 def _with_bar(config: Train) -> Training:

@@ -57,7 +57,8 @@ def check_display() -> None:
     """
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigurationError(
-            "there is no desktop to open a window on; use --web and a browser, --save FILE.rrd or "
+            "no desktop was found (neither DISPLAY nor WAYLAND_DISPLAY is set), so no window can open. Add "
+            "--web (a browser on this machine), --save FILE.rrd (to open it elsewhere: rerun FILE.rrd), or "
             "--screenshot FILE.png"
         )
 

@@ -104,6 +104,8 @@ class Training:
         record: The .json file with the settings of the training.
         checkpoint: The .safetensors file from which a training can continue.
         status: Progress at the end; None if it ended before the first update.
+        first_return: Mean return of the first episodes of this run; None if none ended. A new policy is then
+            hardly trained.
     """
 
     policy: OnnxPolicy
@@ -111,6 +113,7 @@ class Training:
     record: Path
     checkpoint: Path
     status: TrainingStatus | None
+    first_return: float | None = None
 
     def table(self) -> str:
         """Return the training's progress and files, as text."""
@@ -124,6 +127,8 @@ class Training:
         reached = (
             {} if status is None else {"steps": status.steps, "mean return": f"{status.mean_return:.4g}"}
         )
+        if self.first_return is not None:
+            reached["mean return at first"] = f"{self.first_return:.4g}"
         measures = {} if status is None else {n: f"{v:.4g}" for n, v in status.measures.items()}
         files = {"policy": self.path, "record": self.record, "checkpoint": self.checkpoint}
         return list({**reached, **measures, **files}.items())
@@ -177,9 +182,13 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
             "training that was stopped"
         )
     reached: list[TrainingStatus] = []
+    first: list[float] = []
 
     def follow(status: TrainingStatus) -> None:
         reached[:] = [status]
+        # It is 0 until the first episode has ended.
+        if not first and status.mean_return:
+            first.append(status.mean_return)
         progress(status)
 
     with _stopped_by_signal() as stopped:
@@ -209,6 +218,7 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
         record=path.with_suffix(".json"),
         checkpoint=checkpoint,
         status=reached[0] if reached else None,
+        first_return=first[0] if first else None,
     )
     if stopped:
         raise InterruptedTrainingError(training)

@@ -18,24 +18,25 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
 
 STALL_NS = 50_000_000
-"""Behind by more than this, the device's time stands still instead of catching up."""
+"""If the process is behind by more than this, device time stands still instead of catching up."""
 
 _MOST_CHANGES = 2000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CanFaults:
-    """How an emulated CAN bus is set up, and what goes wrong on it, counted from the first arming.
+    """Settings and faults of an emulated CAN bus. Times are counted from the first arming.
 
     Attributes:
         node: Number of the device.
-        bitrate: Of the bus [bit/s]; an adapter that is set to another one hears nothing.
+        bitrate: Bit rate of the bus [bit/s]; an adapter set to another rate receives nothing.
         bus_off_after_s: The adapter's controller goes bus-off [s]; None for never.
-        bus_off_s: From then on for so long it cannot be brought back on the bus [s].
+        bus_off_s: Time after that in which it cannot return to the bus [s].
         tx_full_after_s: The adapter's transmit buffer is full [s]; None for never.
-        tx_full_s: For how long [s].
-        lost_node_after_s: The device loses its wire to the bus, the adapter stays [s]; None for never.
-        no_acknowledge: Nobody is on the bus from the start.
+        tx_full_s: Duration of that [s].
+        lost_node_after_s: The device loses its wire to the bus; the adapter stays connected [s]; None for
+            never.
+        no_acknowledge: No node acknowledges a frame, from the start.
         duplicate_node: A second device has the same number.
         dbc_version: Version of the protocol that the device speaks.
     """
@@ -54,10 +55,10 @@ class CanFaults:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServoFaults:
-    """How emulated servos are set up, and what goes wrong, counted from the first arming.
+    """Settings and faults of emulated servos. Times are counted from the first arming.
 
     Attributes:
-        baud_rate: Of both.
+        baud_rate: Baud rate of both.
         duplicate_id: Both have the belt servo's id.
         wrong_mode: The belt servo is in velocity mode.
         protocol: Version that the pole servo speaks.
@@ -77,16 +78,16 @@ class ServoFaults:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hazards:
-    """What goes wrong on purpose, counted from the moment the motor is first armed.
+    """Faults that the emulator makes. Times are counted from the first arming.
 
     Attributes:
-        freeze_after_s: The firmware hangs: nothing is sent or heard any more [s]; None for never.
-        cut_after_s: The wire is cut: nothing goes out or is heard, the firmware goes on [s]; None for
+        freeze_after_s: The firmware hangs: it sends and receives nothing any more [s]; None for never.
+        cut_after_s: The wire is cut: nothing is sent or received, but the firmware runs on [s]; None for
             never.
-        cut_s: How long it is cut [s].
-        vanish_after_s: The port disappears as if unplugged, the firmware goes on [s]; None for never.
-        return_after_s: It comes back so long after that, as a new port under the same link [s]; None: never,
-            and the emulator ends.
+        cut_s: Duration of the cut [s].
+        vanish_after_s: The port disappears as if unplugged, but the firmware runs on [s]; None for never.
+        return_after_s: Time after that until it returns, as a new port under the same link [s]; None: it does
+            not return, and the emulator ends.
         faults: What happens to frames from the device.
         can: A CAN bus and its faults.
         servo: Dynamixel servos and their faults.
@@ -103,18 +104,18 @@ class Hazards:
 
 
 class PtyDevice(Protocol):
-    """What is behind the port: characters in, characters out, in device time.
+    """The device behind the port: takes and returns characters, in device time.
 
     Attributes:
-        received_bytes: How many have come from the host.
-        trouble: What is wrong with its wire now; "" for nothing.
+        received_bytes: Number of bytes from the host.
+        trouble: Present fault of its wire, in words; "" for none.
     """
 
     received_bytes: int
 
     @property
     def trouble(self) -> str:
-        """What is wrong with its wire now."""
+        """Present fault of its wire, in words; "" for none."""
         ...
 
     @property
@@ -129,7 +130,7 @@ class PtyDevice(Protocol):
 
     @property
     def mode(self) -> str:
-        """What the motor does."""
+        """Mode of the motor."""
         ...
 
     @property
@@ -149,20 +150,20 @@ class PtyDevice(Protocol):
 class CartpoleEmulator:
     """Runs a device core behind a pty; device time follows the clock.
 
-    A host may close the port and open it again. Nobody reading means frames are dropped, as on a UART.
+    A host may close the port and open it again. Frames that nobody reads are dropped, as on a UART.
 
     Attributes:
         slips: Times that this process was stalled and device time stood still.
         dropped: Writes that found no room.
-        changes: What the motor and the port did, and when: device ms, host ns, and a mode of the device,
-            "frozen", "cut", "gone" or "back", or what is wrong with a bus; the first 2000.
+        changes: Changes of the motor and the port, the first 2000: device ms, host ns, and a mode of the
+            device, "frozen", "cut", "gone" or "back", or the fault of a bus.
 
     Args:
         device: The device.
         link: A symbolic link to make to the port; None for none.
-        hazards: What goes wrong on purpose.
+        hazards: Faults to make.
         clock: Real time.
-        port: Makes of the path what a host gives as ``--port``.
+        port: Turns the path into the host's ``--port``.
     """
 
     def __init__(
@@ -191,7 +192,7 @@ class CartpoleEmulator:
         self._mode, self._trouble = device.mode, ""
 
     def open(self) -> str:
-        """Make the pty; return what a host gives as its port."""
+        """Make the pty; return the host's ``--port``."""
         self._origin_ns = self._clock.now_ns() - self._device.device_ns
         return self._open_port()
 
@@ -226,7 +227,7 @@ class CartpoleEmulator:
         """Wait for bytes or for the next tick, at most ``wait_s``, then let the device catch up.
 
         Returns:
-            Whether there is still a port; False once it has vanished.
+            Whether the port exists; False once it has vanished.
         """
         next_tick_ns = self._origin_ns + self._device.device_ns
         wait_s = min(wait_s, max(0, next_tick_ns - self._clock.now_ns()) / 1e9)
@@ -234,7 +235,7 @@ class CartpoleEmulator:
         now_ns = self._clock.now_ns()
         late_ns = now_ns - self._origin_ns - self._device.device_ns
         if late_ns > STALL_NS:
-            # Catching up would make the device's watchdog see a silence that the host is not guilty of.
+            # If it caught up, the device's watchdog would see a silence that the host did not cause.
             self._origin_ns += late_ns
             self.slips += 1
         armed_s = 0.0 if self._armed_ns is None else (now_ns - self._armed_ns) / 1e9
@@ -258,7 +259,7 @@ class CartpoleEmulator:
         return True
 
     def cut(self) -> None:
-        """Cut the wire from now on, for as long as the hazards say."""
+        """Cut the wire now, for the hazards' ``cut_s``."""
         now_ns = self._clock.now_ns()
         self._cut_end_ns = now_ns + round(self._hazards.cut_s * 1e9)
         self._note(now_ns, "cut")
@@ -276,7 +277,7 @@ class CartpoleEmulator:
         }
 
     def _have_port(self, now_ns: int, armed_s: float) -> bool:
-        """Pull the cable and put it back when it is time; return False where nothing is left to do."""
+        """Remove the port and return it when it is time; return False if it stays away."""
         again_s = self._hazards.return_after_s
         if self._gone_ns < 0 and _passed(self._vanish_after_s, armed_s):
             self.close()
@@ -313,7 +314,7 @@ class CartpoleEmulator:
         if out and self._hazards.faults is not None:
             out = self._hazards.faults.apply(out)
         if self._unsent and out:
-            # A frame that was cut short must be finished before another may start.
+            # A frame that was written in part must be finished before the next one starts.
             self.dropped += 1
             out = b""
         data = self._unsent or out

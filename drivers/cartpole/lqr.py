@@ -1,8 +1,7 @@
 """A linear-quadratic balancer for known parameters: the oracle of the emulator and a reference for policies.
 
-It reads positions only. A steady-state Kalman filter on the same linear model supplies the velocities, and
-past targets that have not acted yet are part of the state, so that latency is planned for instead of
-suffered.
+It reads positions only. A steady-state Kalman filter on the same linear model estimates the velocities. Past
+targets that have not acted yet are part of the state, which compensates latency.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ STATE_COST = (1 / 0.1**2, 0.0, 1 / 0.1**2, 0.0)
 TARGET_COST = 1 / 0.1**2
 """Cost of the distance between target and middle of the rail."""
 _POSITION_FLOOR = (0.2e-3, 1e-3)
-"""The filter trusts no position further than this [m, rad]."""
+"""Smallest standard deviation of a position in the filter [m, rad]."""
 _DISTURBANCE_FLOOR = (0.3, 0.002)
 _EPSILON = 1e-5
 _MAX_ITERATIONS = 2000
@@ -38,7 +37,7 @@ _MAX_ITERATIONS = 2000
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
-    """One control period about the upright pose, with q past targets that are still to act.
+    """Linear model of one control period about the upright pose, with q past targets that have not acted yet.
 
     Attributes:
         A: (4 + q, 4 + q); the state is cart, pole, cart velocity, pole velocity, newest past target first.
@@ -96,8 +95,8 @@ def design_lqr(parameters: Mapping[str, float], latency_ticks: int, sensor: Sens
 
 
 def _filter_gain(model: LinearModel, parameters: Mapping[str, float], sensor: SensorModel) -> FloatArray:
-    # What the linear model leaves out is mostly friction, so that is the size of the filter's process noise;
-    # the floor stands for the slewing set-point and the effort limit, which it leaves out too.
+    # The linear model mainly lacks friction, which therefore sets the filter's process noise;
+    # the floor represents the slewing set-point and the effort limit, which it lacks, too.
     friction = np.maximum(
         (parameters["cart.frictionloss"], parameters["pole.frictionloss"]), _DISTURBANCE_FLOOR
     )
@@ -110,7 +109,7 @@ def _filter_gain(model: LinearModel, parameters: Mapping[str, float], sensor: Se
 
 
 def _riccati(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    # Plain value iteration: scipy's solve_discrete_are gives up on some of these, because past targets are
+    # Plain value iteration: scipy's solve_discrete_are fails on some of these, because past targets are
     # pure delays (eigenvalues 0) beside stiff mechanics. Slow, but the slowest closed-loop mode here settles
     # in some hundred steps.
     X = Q.copy()
@@ -138,7 +137,7 @@ def linearise(parameters: Mapping[str, float], latency_ticks: int) -> LinearMode
     A, B, G = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((size, 2))
     A[:4, :4] = np.column_stack(columns[:4])
     A[:4, 4 + whole] = columns[4]
-    # The target that acts in the rest of the period: this one, or one still on its way.
+    # The target that acts in the rest of the period: this one, or one that has not acted yet.
     if whole:
         A[:4, 3 + whole] = columns[5]
     else:

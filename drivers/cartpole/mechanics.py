@@ -1,4 +1,4 @@
-"""The mechanics and sensors of an emulated cart-pole: everything but its firmware, one tick at a time."""
+"""The mechanics and sensors of an emulated cart-pole, without its firmware, one tick at a time."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ def build_simulation(parameters: Mapping[str, float]) -> SingleSimulation:
 
 
 class Mechanics:
-    """Cart, pole, the hand that sets them, and what their sensors say.
+    """Cart, pole, their sensors, and a simulated hand that sets them.
 
     One tick of a device is: :meth:`motor`, :meth:`observe`, :meth:`read` where a report is due, :meth:`step`.
-    At first the pole hangs. :meth:`begin_homing` has the hand move cart and pole to the start pose, where it
-    holds them until :meth:`release`.
+    At first the pole hangs. After :meth:`begin_homing` the hand moves cart and pole to the start pose, and
+    holds them there until :meth:`release`.
 
     Attributes:
-        homing: Whether the hand is on its way to the start pose.
-        held: Whether it holds cart and pole there.
+        homing: Whether the hand is moving them to the start pose.
+        held: Whether it holds them there.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
-        start_angle_rad: Where the hand sets the pole [rad]; None: within +-0.03 rad, by the seed.
-        read_rate_hz: How often :meth:`read` is called.
+        start_angle_rad: Start angle of the pole [rad]; None: within +-0.03 rad, by the seed.
+        read_rate_hz: Rate at which :meth:`read` is called.
     """
 
     def __init__(
@@ -82,43 +82,43 @@ class Mechanics:
 
     @property
     def position(self) -> tuple[float, float]:
-        """True cart position and pole angle now [m, rad]; never on the wire."""
+        """True cart position and pole angle now [m, rad]; not reported."""
         cart, pole = self._sim.position()
         return cart, pole
 
     def motor(self) -> Motor:
-        """Return what the motor's own encoder says now, without delay; the play lies behind it."""
+        """Return the reading of the motor's own encoder, without delay; the play lies behind it."""
         self._now = self._sim.position(), self._sim.velocity()
         cart, play = self._now[0][_CART], self._profile.backlash_m / 2
         self._motor_m = min(max(self._motor_m, cart - play), cart + play)
         return Motor(self._motor_m, self._now[1][_CART])
 
     def truth_row(self) -> tuple[float, float, float, float]:
-        """Return what :meth:`motor` saw: cart and pole [m, rad], their velocities [m/s, rad/s]."""
+        """Return the state at the last :meth:`motor`: cart, pole [m, rad], and velocities [m/s, rad/s]."""
         (cart, pole), (cart_velocity, pole_velocity) = self._now
         return cart, pole, cart_velocity, pole_velocity
 
     def command_delay(self) -> int:
-        """Return how many ticks after its reception a command acts; drawn anew for each."""
+        """Return the delay of a command from reception to effect [ticks], drawn for each command."""
         jitter = self._profile.actuation_jitter_ticks
         return self._actuation_ticks + (int(self._jitter_rng.integers(0, jitter + 1)) if jitter else 0)
 
     def observe(self, setpoint: float) -> None:
-        """Let the sensors take the state that :meth:`motor` saw, and the set-point of that moment [m]."""
+        """Let the sensors sample the state at the last :meth:`motor`, and its set-point [m]."""
         _, pole, cart_velocity, pole_velocity = self.truth_row()
         self._sensor.observe(Sample(self._motor_m, cart_velocity, pole, pole_velocity, setpoint))
 
     def read(self) -> Reading:
-        """Return what the sensors say now: late, noisy and in steps, as the profile has it."""
+        """Return the sensors' readings: delayed, noisy and quantised as in the profile."""
         return self._sensor.read()._replace(at_end_stop=abs(self._now[0][_CART]) >= _END_STOP_M)
 
     def loses_frame(self) -> bool:
-        """Draw whether a state frame is never sent."""
+        """Draw whether a state frame is lost."""
         share = self._profile.drop_probability
         return bool(share) and bool(self._drop_rng.random() < share)
 
     def begin_homing(self) -> None:
-        """Have the hand take cart and pole to the start pose, in 500 ticks."""
+        """Begin to move cart and pole to the start pose by hand, in 500 ticks."""
         cart, pole = self._sim.position()
         self._homing_from = (cart, math.remainder(pole, math.tau))
         drawn = float(self._hand_rng.uniform(-START_ANGLE_RAD, START_ANGLE_RAD))
@@ -129,11 +129,11 @@ class Mechanics:
         self.homing, self.held = True, False
 
     def release(self) -> None:
-        """Have the hand let go."""
+        """Let go of cart and pole."""
         self.homing = self.held = False
 
     def step(self, force: float) -> bool:
-        """Hold a force on the cart for one tick [N]; return whether the hand reached the start pose in it."""
+        """Hold a force on the cart for one tick [N]; return whether the hand reached the start pose."""
         if self.held:
             return False
         if self.homing:

@@ -34,13 +34,13 @@ from deal_hw.types import Status
 ENABLE_WATCHDOG, WATCHDOG_TIMEOUT = 437, 438
 """Numbers of the emulated drive's settings; a real one's are in its firmware's flat_endpoints.json."""
 _TURNS_AT_ZERO: Final = 12.25
-"""What the drive's encoder says in the middle of the rail: it counts from its power-on."""
+"""Reading of the drive's encoder in the middle of the rail: it counts from its power-on."""
 _REPORTS_PER_HEARTBEAT: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
 class _Settings:
-    """What the drive was told last; the position acts late, with the gains of that moment."""
+    """The newest settings from the host; the position acts late, with the gains of that moment."""
 
     pos_gain: float = 0.0
     vel_gain: float = 0.0
@@ -53,15 +53,15 @@ class OdriveFirmware:
     """Drive and encoder as the firmware of an emulated device.
 
     Attributes:
-        homings: How often homing began.
-        armings: How often the motor was armed.
-        frame_errors: Frames to the drive that were none.
+        homings: Number of homings that began.
+        armings: Number of armings.
+        frame_errors: Number of invalid frames to the drive.
 
     Args:
         truth: Hidden factors of gains and effort limit.
-        parts: How the parts are joined.
+        parts: Numbers and mechanics of the parts.
         identity: The encoder's serial number.
-        command_delay: Called for every position: it acts that many ticks after it was received.
+        command_delay: Called for every position target; returns its delay from reception to effect [ticks].
         version: Of the encoder's protocol.
     """
 
@@ -94,7 +94,7 @@ class OdriveFirmware:
 
     @property
     def mode(self) -> Mode:
-        """What the motor does."""
+        """Mode of the motor."""
         return self._mode
 
     @property
@@ -103,7 +103,7 @@ class OdriveFirmware:
         return (self._acting.turns - _TURNS_AT_ZERO) * self._parts.metres_per_turn
 
     def receive(self, data: bytes, motor: Motor) -> bytes:
-        """Handle the frames that came before this tick; return the answers."""
+        """Handle the frames received before this tick; return the answers."""
         out = b""
         for begin in range(0, len(data), FRAME.size):
             frame = data[begin : begin + FRAME.size]
@@ -157,7 +157,7 @@ class OdriveFirmware:
         return out + self._encoder.encode(angle)
 
     def finish_homing(self) -> None:
-        """Take note that the cart is in the middle and the pole upright."""
+        """Note that the cart is in the middle and the pole upright."""
         if self._mode is Mode.HOMING:
             self._mode = Mode.IDLE
             self._homed = True
@@ -166,7 +166,7 @@ class OdriveFirmware:
         parts, now = self._parts, self._acting
         position = motor.position / parts.metres_per_turn + _TURNS_AT_ZERO
         speed = motor.velocity / parts.metres_per_turn
-        # Hidden: what the drive really makes of its gains and its current limit.
+        # Hidden: the drive's true gains and current limit.
         pos_gain = now.pos_gain * self._stiffness_factor / self._damping_factor
         vel_gain = now.vel_gain * self._damping_factor
         wanted = min(max(pos_gain * (now.turns - position), -now.velocity_limit), now.velocity_limit)
@@ -227,7 +227,7 @@ class OdriveFirmware:
         if state == IDLE:
             self._disarm()
         elif state == CLOSED_LOOP and self._mode is Mode.IDLE and not self._axis_errors:
-            # The drive starts where it is.
+            # The set-point starts at the present position.
             turns = motor.position / self._parts.metres_per_turn + _TURNS_AT_ZERO
             self._told = self._acting = replace(self._told, turns=turns)
             self._mode, self._fed_tick = Mode.ARMED, self._tick
@@ -262,7 +262,7 @@ def odrive_device(
 
     Args:
         truth: Its hidden parameters.
-        parts: How the parts are joined.
+        parts: Numbers and mechanics of the parts.
         version: Of the encoder's protocol.
         identity: Changes the encoder's serial number.
     """

@@ -1,6 +1,6 @@
 """CANSimple: the public CAN frames of ODrive motor drives, as firmware 0.6 has them.
 
-An id is ``node * 32 + number``. Only what a cart-pole needs is here; ODrive publishes the whole as a DBC.
+An id is ``node * 32 + number``. This file has the frames of a cart-pole only; ODrive publishes all as a DBC.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A cart-pole of parts: an ODrive on the belt (its public CANSimple frames) and a pole encoder node.
 
-The host side of the wire. The messages of the cart-pole become CANSimple frames and back, so the robot in
-front of it is the same as on other wires. Page 'ODrive' of the documentation shows how to set up the parts.
+The host side of the wire. It converts the messages of the cart-pole to CANSimple frames and back, so the
+robot class is the same as on other wires. Page 'ODrive' of the documentation shows how to set up the parts.
 """
 
 from __future__ import annotations
@@ -40,17 +40,18 @@ _U32 = 0xFFFF_FFFF
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdriveSettings:
-    """How the parts are joined.
+    """Numbers of the parts on the bus, and the mechanics between them.
 
     Attributes:
         drive: Node number of the ODrive.
         encoder: Node number of the pole encoder.
-        metres_per_turn: Travel of the cart a turn of the motor [m]; a pulley with 20 teeth of 2 mm has 0.04.
-        torque_constant: Of the motor [N*m/A]; 8.27 / KV, here for 270 KV.
-        velocity_limit_m_s: Speed at which the drive's own limit is set; above what the safety filter trips
-            at, since a drive that exceeds it switches off [m/s].
-        heartbeat_age_s: The drive's heartbeat may be so old [s].
-        watchdog_s: Time without a command after which the drive switches off [s].
+        metres_per_turn: Travel of the cart for one turn of the motor [m]; 0.04 for a pulley with 20 teeth of
+            2 mm.
+        torque_constant: Torque constant of the motor [N*m/A]: 8.27 / KV; the default is for 270 KV.
+        velocity_limit_m_s: The drive's own speed limit [m/s]. It is above the trip speed of the safety
+            filter, because a drive that exceeds it switches off.
+        heartbeat_age_s: Largest age of the drive's heartbeat [s].
+        watchdog_s: The drive switches off after this time without a command [s].
         enable_watchdog: Number of the drive's setting axis0.config.enable_watchdog; it differs between
             firmware versions. 0: the watchdog is not set.
         watchdog_timeout: Number of axis0.config.watchdog_timeout.
@@ -90,13 +91,13 @@ class OdriveSettings:
 
     @property
     def newtons_per_nm(self) -> float:
-        """Force on the belt a torque of the motor [N/(N*m)]."""
+        """Force on the belt for a motor torque of 1 N*m [N/(N*m)]."""
         return 2 * math.pi / self.metres_per_turn
 
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
-    """What an ODrive is told with a target; float32, as it goes over the wire.
+    """Gains and limits that the host sends with a target; float32, as on the wire.
 
     Attributes:
         pos_gain: [(rev/s)/rev].
@@ -118,7 +119,7 @@ def drive_command(target: protocol.Target, s: OdriveSettings) -> DriveCommand:
     pos_gain is kp / kd and vel_gain is kd in its units.
 
     Raises:
-        FrameError: A stiffness without damping: the cascade has none.
+        FrameError: Stiffness without damping, which the cascade cannot have.
     """
     if target.stiffness_mn_m and not target.damping_mns_m:
         raise FrameError("an ODrive has no stiffness without damping; send a damping above 0")
@@ -135,19 +136,19 @@ def drive_command(target: protocol.Target, s: OdriveSettings) -> DriveCommand:
 class OdriveLink:
     """The host's side of a bus with an ODrive and a pole encoder.
 
-    The encoder node samples when it sees the drive's estimates, so cart and pole are of the same moment; a
-    sample without the drive's part is refused. The set-point is moved towards its target here, since the
-    drive has no such limit that leaves its control law alone.
+    The encoder node samples when it receives the drive's estimates, so cart and pole are of the same moment.
+    A sample without the drive's part is refused. This class moves the set-point towards its target, because
+    the drive has no speed limit that leaves its control law unchanged.
 
-    The drive names no command that it got. A state names the newest one that was sent before the state was
-    sampled, judged by the encoder's clock, which this side follows between samples.
+    The drive does not report which command it received. A state names the newest command sent before the
+    state was sampled. The encoder's clock decides that; this class extrapolates it between samples.
 
     Attributes:
-        errors: Messages that were corrupt or unknown so far.
+        errors: Number of corrupt or unknown messages.
 
     Args:
-        settings: How the parts are joined.
-        clock: Follows the encoder's clock between samples.
+        settings: Numbers and mechanics of the parts.
+        clock: Extrapolates the encoder's clock between samples.
     """
 
     resync: ClassVar[bytes] = b""
@@ -174,7 +175,7 @@ class OdriveLink:
 
     @property
     def fault(self) -> str:
-        """What was heard that forbids going on."""
+        """A received fault that forbids to continue; "" for none."""
         if self._encoder.fault:
             return self._encoder.fault
         if self._armed and self._axis_errors:
@@ -189,7 +190,7 @@ class OdriveLink:
 
     @property
     def hint(self) -> str:
-        """What to check where frames come but no answer."""
+        """Advice for the case that frames arrive but no answer."""
         drive, encoder = self._s.drive, self._s.encoder
         if self._heartbeat_us is None:
             return f"no heartbeat of an ODrive at node {drive}; check its axis0.config.can.node_id"
@@ -203,7 +204,7 @@ class OdriveLink:
     def feasible(self, target: protocol.Target) -> protocol.Target:
         """Return the target with its set-point moved no further than the speed limit allows in one cycle.
 
-        The speed limit of what is sent is the drive's own.
+        The speed limit in the sent target is the drive's own.
         """
         here = target.position_um if self._setpoint_um is None else self._setpoint_um
         step = round(target.speed_limit_um_s / DESCRIPTION.control_rate_hz)
@@ -239,7 +240,7 @@ class OdriveLink:
         return idle
 
     def decode(self, data: bytes) -> Iterator[protocol.AnyMessage]:
-        """Take frames; return the messages that they complete, and count what is none."""
+        """Take frames; return the messages that they complete, and count invalid ones."""
         if len(data) % FRAME.size:
             self.errors += 1
             return
@@ -259,7 +260,7 @@ class OdriveLink:
             while self._answers:
                 yield self._answers.pop(0)
 
-    # What the host asks for.
+    # Requests of the host.
 
     def _pack(self, command: Command, *values: float | bytes) -> bytes:
         try:
@@ -293,8 +294,8 @@ class OdriveLink:
             return idle
         self._arming = message.request
         self._setpoint_um = round((self._turns * self._s.metres_per_turn - self._zero_m) * 1e6)
-        # Until the first target the force is zero, because gains come only with targets. A command comes
-        # first: it feeds the watchdog, whose error would keep the axis from being armed.
+        # Until the first target the force is zero, because only targets have gains. A command is sent
+        # first: it feeds the watchdog, whose error would prevent arming.
         return (
             self._pack(Command.SET_CONTROLLER_MODE, POSITION_CONTROL, PASSTHROUGH)
             + self._pack(Command.SET_POS_GAIN, 0.0)
@@ -317,7 +318,7 @@ class OdriveLink:
             + self._pack(Command.SET_INPUT_POS, turns, 0, 0)
         )
 
-    # What drive and encoder say.
+    # Messages of drive and encoder.
 
     def _take_drive(self, number: int, data: bytes) -> None:
         if number not in (Command.HEARTBEAT, Command.ENCODER_ESTIMATES, Command.TORQUES, Command.TX_SDO):
@@ -364,16 +365,16 @@ class OdriveLink:
 
     def _take_angle(self, angle: Angle) -> Iterator[protocol.State]:
         cart, self._cart = self._cart, None
-        # Number and time have gone on by less than their fields hold, or the host has started anew.
+        # Number and time advanced by less than their fields can hold, or the host started anew.
         passed_us = (angle.device_us - self._device_us) & _U32
         self._sequence = (self._sequence + (((angle.sequence - self._sequence - 1) & 0xFF) + 1)) & _U32
         self._device_us += passed_us
         self._heard_ns = self._clock.now_ns()
-        # After a silence, as between two processes, a heartbeat gets its time anew.
+        # After a silence, as between two processes, the heartbeat's time is set anew.
         if self._heartbeat_us is not None and passed_us > self._s.heartbeat_age_s * 1e6:
             self._heartbeat_us = self._device_us
         if cart is None:
-            return  # Its number is missing from the states: that counts.
+            return  # Its number is missing from the states, and the gap is counted.
         position_m = cart[0] * self._s.metres_per_turn
         status = Status(angle.status) & (Status.HOMED | Status.HOMING)
         if self._homing and status & Status.HOMED and not status & Status.HOMING:

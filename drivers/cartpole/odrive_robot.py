@@ -31,21 +31,22 @@ class OdriveRobot(CartpoleRobot):
     Args:
         transport: A stream of CAN frames.
         clock: The clock of the transport's stamps.
-        settings: How the parts are joined.
+        settings: Numbers and mechanics of the parts.
     """
 
     def __init__(self, transport: Transport, clock: Clock, settings: OdriveSettings) -> None:
         super().__init__(transport, clock, link=lambda: OdriveLink(settings, clock))
-        # Without the drive's watchdog it holds its last command for ever, and the operator is told so.
+        # Without its watchdog the drive holds its last command for ever; the operator gets a warning.
         self.watchdog_s = settings.watchdog_s if settings.enable_watchdog else 0.0  # type: ignore[misc]
 
 
 def odrive_settings(port: str) -> tuple[str, OdriveSettings]:
-    """Return the bus of a port, and what the port says of the parts.
+    """Return the bus of a port, and the settings of the parts in it.
 
     Args:
-        port: Such as ``can0?node=5&mm_per_turn=60&kv=150``: numbers on the bus, travel of the cart a turn of
-            the motor [mm], the motor's constant [rev/min/V], numbers of the drive's watchdog settings.
+        port: Such as ``can0?node=5&mm_per_turn=60&kv=150``: numbers on the bus, travel of the cart for one
+            turn of the motor [mm], the motor's constant [rev/min/V], numbers of the drive's watchdog
+            settings.
 
     Raises:
         ConfigurationError: The port means nothing.

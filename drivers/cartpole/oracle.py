@@ -1,4 +1,4 @@
-"""Draws hidden truths that can be balanced at all: an oracle that knows the truth must manage it."""
+"""Draws hidden truths that a balancer with known parameters can balance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_DRAWS = 200
 
 
 def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> CartpoleTruth:
-    """Return the hidden truth of a seed: the first draw that the oracle balances.
+    """Return the hidden truth of a seed: the first draw that the balancer balances.
 
     Args:
         profile: Name of the profile.
@@ -48,9 +48,9 @@ def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> Cartpole
 
 
 def oracle_balances(truth: CartpoleTruth) -> bool:
-    """Return whether the balancer that knows the truth holds the pole for 6 s from either side."""
+    """Return whether the balancer with the true parameters holds the pole for 6 s from either side."""
     profile = find_profile(truth.profile)
-    # It plans for the mean of the jitter: that is all that anybody could.
+    # It plans for the mean of the jitter, because single values are unknown in advance.
     jitter = (profile.actuation_jitter_ticks + profile.sensing_jitter_ticks) / 2
     latency_ticks = truth.actuation_ticks + truth.sensing_ticks + round(jitter)
     controller = design_lqr(truth.parameters, latency_ticks, profile.sensor)

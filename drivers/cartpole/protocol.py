@@ -4,10 +4,10 @@ Page 'Cart-pole, serial' of the documentation describes it.
 
 A frame on the wire is ``COBS(version, type, body, CRC-16) 00``: version and type are one byte each, all
 numbers are little-endian, the CRC is CRC-16/IBM-3740 (poly 0x1021, init 0xFFFF) over version, type and body.
-The zero byte occurs nowhere else, so a receiver that lost its place finds it again at the next zero.
+The zero byte occurs nowhere else, so a receiver synchronises again at the next zero.
 
-Payloads are integers (um, urad, um/s, urad/s, mN, mN/m, mN*s/m, us), so that a microcontroller can be
-bit-equal.
+Payloads are integers (um, urad, um/s, urad/s, mN, mN/m, mN*s/m, us), so that a microcontroller can
+compute the same bits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DEVICE_KIND: Final = "cartpole"
 BAUD_RATE: Final = 1_000_000
 DELIMITER: Final = b"\x00"
 MAX_FRAME: Final = 64
-"""Longest COBS block, without its delimiter; longer ones are garbage."""
+"""Longest COBS block, without its delimiter; longer ones are invalid."""
 NO_COMMAND: Final = 0xFFFF_FFFF
 """Stands for "no command yet" in a state frame; never the number of a command."""
 
@@ -67,7 +67,7 @@ class Hello:
 class Info:
     """Device: the answer to hello.
 
-    Its layout never changes, so that any two versions can tell each other apart.
+    Its layout never changes, so that any two versions can name the difference.
 
     Attributes:
         request: Number of the hello that is answered.
@@ -136,15 +136,15 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Host: a position target with the gains and limits that go with it.
+    """Host: a position target with gains and limits.
 
     Attributes:
         sequence: Number of the command; the device ignores a repeated one.
         position_um: Position target of the cart.
         stiffness_mn_m: P.
         damping_mns_m: D.
-        effort_limit_mn: Force the device may use.
-        speed_limit_um_s: How fast the device may move its set-point.
+        effort_limit_mn: Largest force of the device.
+        speed_limit_um_s: Largest speed of the set-point.
     """
 
     FORMAT: ClassVar[str] = "<IiIIHI"
@@ -303,11 +303,11 @@ def decode(payload: bytes) -> AnyMessage:
 
 
 class FrameDecoder:
-    """Cuts a byte stream into payloads and survives whatever else is in it.
+    """Cuts a byte stream into payloads, and skips invalid bytes.
 
     Attributes:
-        errors: Corrupt frames so far. What comes before the first delimiter is not counted: whoever opens a
-            running stream starts in the middle of a frame.
+        errors: Corrupt frames so far. Bytes before the first delimiter are not counted, because a running
+            stream begins in the middle of a frame.
     """
 
     def __init__(self) -> None:
@@ -328,7 +328,7 @@ class FrameDecoder:
                 self.errors += 1
             self._overrun = False
             self._synchronised = True
-        # A block without end must not fill the memory; its head is enough to know that it is garbage.
+        # A block without end must not fill the memory; its head shows that it is invalid.
         if len(rest) > MAX_FRAME:
             self._overrun, rest = True, b""
         self._rest = rest

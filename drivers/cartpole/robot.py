@@ -37,18 +37,18 @@ _REFUSALS = {
 class CartpoleRobot(Robot):
     """A cart-pole that speaks protocol version 1, on any frames.
 
-    ``connect`` says hello to the device, which switches its motor off; on an inherited port a child process
-    connects again, with a transport that adopted the descriptor, and so starts from the passive state. Over a
-    transport that only listens ``connect`` waits for a state instead: kind and version are not checked then.
+    ``connect`` says hello to the device, which switches its motor off. On an inherited port a child process
+    connects again, with a transport that adopted the descriptor, and starts from the passive state. Over a
+    transport that only listens, ``connect`` waits for a state instead, and does not check kind and version.
 
     Attributes:
-        info: What the device said of itself; None before ``connect``, and where it was only listened to.
-        resent: Requests that had to be sent again because no answer came within :data:`RETRY_S`.
+        info: The device's answer to hello; None before ``connect``, and over a transport that only listens.
+        resent: Number of requests sent again because no answer came within :data:`RETRY_S`.
 
     Args:
         transport: A stream of the link's bytes.
         clock: The clock of the transport's stamps.
-        link: Makes the wire's codec, new for each connection.
+        link: Makes the wire's codec for each connection.
     """
 
     description: ClassVar[RobotDescription] = DESCRIPTION
@@ -74,7 +74,7 @@ class CartpoleRobot(Robot):
         self._torn = self._connected = False
 
     def connect(self) -> None:
-        """Open the transport, say hello to the device and check what it is."""
+        """Open the transport, say hello to the device and check its kind and version."""
         if self._connected:
             return
         self._transport.open()
@@ -95,7 +95,7 @@ class CartpoleRobot(Robot):
         self._link = self._make_link()
 
     def reopen(self) -> None:
-        """Open the port again where the device vanished; bytes from before make no frame with new ones."""
+        """Open the port again after the device vanished; old bytes are discarded."""
         self._transport.reopen()
         self._torn = True
 
@@ -104,7 +104,7 @@ class CartpoleRobot(Robot):
         self._ask(protocol.Home(self._next_request()), timeout_s, reached=Status.HOMED, without=Status.HOMING)
 
     def arm(self, timeout_s: float) -> None:
-        """Let the motor follow commands; the device's watchdog expects one every 200 ms from now on."""
+        """Let the motor follow commands; from now on the device's watchdog expects one every 200 ms."""
         self._ask(
             protocol.Arm(self._next_request()), timeout_s, reached=Status.ARMED, without=Status.WATCHDOG
         )
@@ -123,7 +123,7 @@ class CartpoleRobot(Robot):
         return self._states.popleft()
 
     def send_command(self, command: JointCommand) -> JointCommand:
-        """Send a position target; velocity target and feed-forward effort are not on this wire.
+        """Send a position target; this wire has no velocity target and no feed-forward effort.
 
         Raises:
             SafetyError: A value is not finite.
@@ -137,7 +137,7 @@ class CartpoleRobot(Robot):
     def passive(self) -> None:
         """Switch the motor off; sent once, never waits, works on a port that another process was using.
 
-        States that were received before are forgotten, so that none of them passes for a confirmation.
+        States received before are discarded, so that none of them counts as a confirmation.
         """
         self._states.clear()
         self._torn = True
@@ -155,7 +155,7 @@ class CartpoleRobot(Robot):
 
     @property
     def fault(self) -> str:
-        """What was heard that forbids going on."""
+        """A received fault that forbids to continue; "" for none."""
         return self._link.fault
 
     def fileno(self) -> int:
@@ -208,7 +208,7 @@ class CartpoleRobot(Robot):
                 self._take(found, message.stamp_ns)
             elif isinstance(found, protocol.Info):
                 info = found
-                # The device forgot earlier commands; what it said before that hello is of no interest.
+                # The device forgot earlier commands; messages from before that hello are discarded.
                 self._sequence, self._next_state, self._gaps = -1, None, 0
                 self._link.errors = 0
                 self._states.clear()
@@ -264,7 +264,8 @@ class CartpoleRobot(Robot):
         if isinstance(message, protocol.State):
             if self._next_state is not None:
                 missing = (message.sequence - self._next_state) & _U32
-                # A number that goes back is a device that restarted: one error, not four thousand million.
+                # A number that goes back means that the device restarted: one error, not four thousand
+                # million.
                 self._gaps += missing if missing < _I32 else 1
             self._next_state = (message.sequence + 1) & _U32
             state = to_robot_state(message, stamp_ns)
@@ -275,7 +276,7 @@ class CartpoleRobot(Robot):
             self._ack = message
 
     def _send(self, frame: bytes) -> None:
-        # A write that was cut short must not let the torn frame swallow this one.
+        # After a partial write, the resync bytes separate the torn frame from this one.
         data = self._link.resync + frame if self._torn else frame
         message = Message("", data, self._clock.now_ns())
         self._torn = True

@@ -1,6 +1,6 @@
-"""A Go2 without mechanics that speaks the wire's bytes: for tests of whatever drives one, in virtual time.
+"""A Go2 without mechanics that sends and takes the wire's bytes, in virtual time, for tests of a driver.
 
-Its joints never move by themselves. The wire can be tampered with, and others can speak on it.
+Its joints never move by themselves. A test can change messages, and add other participants.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from deal_hw.types import FloatArray
 RESTING: Final = np.array(DRIVER.rest_position)
 STANDING: Final = np.array(DRIVER.default_position)
 STANDING_EFFORT: Final = efforts_under(STANDING, np.array([[0.0, 0.0, WEIGHT_N / 4]] * 4))
-"""What the motors of a standing robot give [N·m]."""
+"""Motor efforts of a standing robot [N·m]."""
 ANSWER_NS: Final = 3_000_000
 STIFF: Final = LowCommandEncoder().encode(
     LowCommand(STANDING, np.zeros(12), np.full(12, 60.0), np.full(12, 5.0), np.zeros(12))
 )
-"""What sport mode commands."""
+"""Command of sport mode."""
 
 
 class FakeGo2:
@@ -50,18 +50,18 @@ class FakeGo2:
         pose: Positions that it reports, (12,) [rad].
         velocity: Velocities that it reports, (12,) [rad/s].
         tick_ms: The clock in its states.
-        tick_step: By how much that advances with each state; 0: it stands still.
-        remote: What the operator holds; None: nothing is heard.
-        changes: Fields of the state that are otherwise, by name.
-        on_stand: Whether its body is on a stand, so that its legs carry nothing where they stand.
+        tick_step: Advance of that clock with each state; 0: it stands still.
+        remote: State of the remote; None: no remote is in reach.
+        changes: Fields of the state to replace, by name.
+        on_stand: Whether its body is on a stand, so that its legs carry no weight.
         talks: Whether it sends states.
         hears: Whether commands reach the motors.
         deaf: Services that do not answer.
-        stubborn: Whether modes stay as they are, whatever it is asked.
-        codes: Errors that a service answers with, one after the other, by service and function.
+        stubborn: Whether requests leave its mode unchanged.
+        codes: Errors that a service answers with, in order, by service and function.
         command: The command in force.
-        heard: Device time and command, of all so far.
-        requests: Service and request, of all so far.
+        heard: Device time and command of each received command.
+        requests: Service and request of each received request.
 
     Args:
         mode: The active mode at the beginning.
@@ -138,7 +138,7 @@ class FakeGo2:
         return out
 
     def effort(self) -> FloatArray:
-        """Return what the motors do with the command in force, (12,) [N·m]."""
+        """Return the motors' efforts under the command in force, (12,) [N·m]."""
         if (c := self.command) is None:
             stands = not self.on_stand and np.array_equal(self.pose, STANDING)
             return STANDING_EFFORT if stands else np.zeros(12)
@@ -147,7 +147,7 @@ class FakeGo2:
         )
 
     def state(self) -> LowState:
-        """Return the state now."""
+        """Return the present state."""
         values: dict[str, Any] = {
             "position": self.pose,
             "velocity": self.velocity,
@@ -179,11 +179,11 @@ class FakeGo2:
 
 
 class FakeTopics(VirtualTopics):
-    """A virtual wire with other participants, on which things go wrong.
+    """A virtual wire with other participants and faults.
 
     Attributes:
         others: Writers that discovery knows, by topic.
-        tamper: Returns what arrives of a message of the device, from topic and bytes.
+        tamper: Returns the bytes that arrive, from topic and bytes of a message of the device.
 
     Args:
         device: The device.

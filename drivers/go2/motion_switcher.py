@@ -1,7 +1,7 @@
-"""Who moves the robot: asks its services to let go of it, and to take it back.
+"""Asks the robot's services to release the robot, and to take it back.
 
-The robot comes with a controller of its own (sport mode), which sends commands to the same motors. Whoever
-wants to command them releases it first. Functions, names and error texts: unitree_sdk2 @ 21d0a3b,
+The robot's own controller (sport mode) sends commands to the same motors. Release it before you command
+them. Functions, names and error texts: unitree_sdk2 @ 21d0a3b,
 unitree_sdk2_python @ 37116c5.
 """
 
@@ -44,9 +44,9 @@ ERRORS: Final[Mapping[int, str]] = {
 """Codes of responses in words."""
 
 _ASK_S: Final = 0.5
-"""A first request may get lost while the network's discovery is under way, so it is repeated [s]."""
+"""Time between repeated requests: a first one may be lost during the network's discovery [s]."""
 _PATIENCE_S: Final = 3.0
-"""A switcher that is silent for this long is not there: older firmware [s]."""
+"""A switcher that is silent for this long does not exist, as in older firmware [s]."""
 _ACT_S: Final = 5.0
 """As long as the vendor's SDK waits for an answer [s]."""
 
@@ -74,8 +74,8 @@ class ServiceClient:
 
     Args:
         send: Sends a payload on a topic.
-        pump: Receives one message, waiting at most so long [s], and hands it to whom it concerns; raises
-            TransportTimeoutError where none comes.
+        pump: Receives one message, waiting at most this long [s], and passes it to its reader; raises
+            TransportTimeoutError if none arrives.
         clock: For waiting and for numbering.
     """
 
@@ -88,7 +88,7 @@ class ServiceClient:
         self._response: Response | None = None
 
     def take(self, message: Message) -> None:
-        """Take a message of a response topic; answers to other programs pass by."""
+        """Take a message of a response topic; answers to other programs are skipped."""
         if message.channel != self._waiting:
             return
         try:
@@ -99,13 +99,13 @@ class ServiceClient:
             self._response = response
 
     def ask(self, service: str, api: int, parameter: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        """Ask and return the answer's data.
+        """Send a request and return the answer's data.
 
         Raises:
             TransportTimeoutError: No answer in time.
             RefusedError: The answer is an error.
         """
-        # Other programs use the clock as number, too: on this computer the same clock.
+        # Other programs use the clock as number, too, and on this computer it is the same clock.
         self._identity = max(self._identity + 1, self._clock.now_ns())
         self._waiting, self._response = topics.response(service), None
         self._send(
@@ -128,11 +128,11 @@ class ServiceClient:
 
 
 class MotionSwitcher:
-    """Releases the robot's own controller and gives the robot back to it.
+    """Releases the robot's own controller, and returns the robot to it.
 
     Attributes:
         released: Name of the mode that was released; "" for none.
-        old: Whether the firmware is so old that only the service list can switch the controller off.
+        old: Whether the firmware is old, so that only the service list can switch the controller off.
 
     Args:
         services: The robot's services.
@@ -147,7 +147,7 @@ class MotionSwitcher:
         self._answered = False
 
     def active(self, timeout_s: float) -> str:
-        """Return the name of the mode that moves the robot; "" where none does.
+        """Return the name of the active mode; "" for none.
 
         Raises:
             TransportTimeoutError: No answer in time.
@@ -179,14 +179,14 @@ class MotionSwitcher:
         return OLD_SERVICE
 
     def lie_down(self, timeout_s: float) -> None:
-        """Ask the active mode to lay the robot down; one that cannot is left as it is."""
+        """Ask the active mode to lay the robot down; a refusal or a missing answer is ignored."""
         try:
             self._services.ask(SPORT, STAND_DOWN, {}, min(timeout_s, _ACT_S))
         except (TransportTimeoutError, RefusedError):
             return
 
     def release(self, name: str, timeout_s: float) -> None:
-        """Ask the active mode to let go; whether it did, :meth:`active` says.
+        """Ask the active mode to release the robot; :meth:`active` returns the result.
 
         Raises:
             TransportTimeoutError: No answer in time.
@@ -210,10 +210,10 @@ class MotionSwitcher:
         self._old_active = False
 
     def select(self, name: str, timeout_s: float) -> None:
-        """Give the robot to a mode, which stands it up, and wait until it has it.
+        """Give the robot to a mode, which stands it up, and wait until it is active.
 
         Raises:
-            TransportTimeoutError: It does not have it in time.
+            TransportTimeoutError: It is not active in time.
             RefusedError: The answer is an error.
         """
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)

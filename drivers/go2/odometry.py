@@ -1,4 +1,4 @@
-"""Where a Go2 walked, from its joints, its motors' efforts and its IMU; closed form, no simulator.
+"""Path of a walking Go2 from its joints, its motors' efforts and its IMU; closed form, no simulator.
 
 A foot that bears weight stands: it rolls about the point where it touches the floor.
 """
@@ -23,9 +23,9 @@ FOOT_RADIUS_M: Final = 0.022
 
 
 def walked(trajectory: Trajectory) -> Track | None:
-    """Return where the robot walked, by its own sensors; None where nothing of the body was recorded.
+    """Return the robot's path by its own sensors; None if no body data were recorded.
 
-    Place begins at the origin and drifts; heading is the IMU's.
+    The position starts at the origin and drifts; the heading is the IMU's.
     """
     body = trajectory.body
     if body is None:
@@ -51,7 +51,7 @@ def walked(trajectory: Trajectory) -> Track | None:
 def _answers(
     orientation: FloatArray, gyro: FloatArray, position: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return the velocity of the base in the world by each foot, were it to stand, (T, 4, 3) [m/s]."""
+    """Return the velocity of the base in the world, from each foot as if it stood, (T, 4, 3) [m/s]."""
     T = len(position)
     joints, hip = velocity.reshape(T, 4, 3), position.reshape(T, 4, 3)[..., 0]
     moved = np.einsum("tlij,tlj->tli", foot_jacobians(position), joints)

@@ -1,14 +1,14 @@
-"""What carries a Go2: the floor, or a stand that holds its body in the air.
+"""Decides what carries a Go2: the floor, or a stand that holds its body in the air.
 
-The two are different robots to deal-hw (``go2``, ``go2_on_stand``), and commands for one are dangerous to the
-other. No sensor tells which it is. Two quantities do: how far the feet reach below the base, along gravity,
-and the force that the legs carry, by the motors' estimated efforts.
+deal-hw has a robot for each (``go2``, ``go2_on_stand``), and commands for one are dangerous to the other. No
+sensor measures the support. Two quantities decide: the distance of the feet below the base, along gravity,
+and the force that the legs carry, from the motors' estimated efforts.
 
 - Legs that carry half of the weight stand on the floor.
-- Folded legs are those of a robot that lies. Legs that were folded when the robot was lifted look the same.
-- Feet that reach below the belly and carry nothing are those of a body that something else holds.
+- A robot with folded legs lies. Legs that were folded when the robot was lifted look the same.
+- A robot whose feet reach below the belly and carry nothing is held by something else.
 
-Whatever is between is undecided. The foot force sensors count only against "held": on robots of this family
+Anything between is undecided. The foot force sensors count only against "held": on robots of this family
 they drift, and some report 0 (unitree_legged_sdk, issues 34, 50 and 86).
 """
 
@@ -32,18 +32,18 @@ from deal_hw.types import FloatArray
 
 GRAVITY_M_S2: Final = 9.81
 _PATIENCE_S: Final = 3.0
-"""How long a robot may take to be still [s]."""
+"""Longest wait until the robot is still [s]."""
 
 
 class Support(enum.Enum):
-    """What carries the robot."""
+    """The robot's support."""
 
     FLOOR = "floor"
     """It stands or lies on the floor."""
     HELD = "held"
     """Something holds its body; its feet are free."""
     UNDECIDED = "undecided"
-    """The states do not tell."""
+    """The states do not decide."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,25 +51,25 @@ class SupportConfig:
     """Limits between floor and stand. They come from the emulator; no real robot was measured."""
 
     window_s: float = 0.3
-    """States of this time are judged by their median [s]."""
+    """The median of the states in this time is judged [s]."""
 
     least_states: int = 50
-    """Fewer states in that time say nothing."""
+    """Least number of states in that time."""
 
     level_rad: float = HELD_TILT_RAD
-    """A body that leans more is neither well laid down nor well hung up [rad]."""
+    """Largest tilt of a body that is well laid down or well hung up [rad]."""
 
     joint_rad_s: float = 0.5
     """A faster joint moves; the noise of a real one at rest is a tenth of that [rad/s]."""
 
     body_rad_s: float = 0.5
-    """A body that turns faster swings; forces say nothing then [rad/s]."""
+    """A body that turns faster swings, and its forces are not used [rad/s]."""
 
     force_m_s2: float = 1.0
-    """The specific force may differ from gravity by this [m/s²]."""
+    """Largest difference of specific force and gravity [m/s²]."""
 
     sensors_rad: float = 0.2
-    """Orientation and specific force may differ by this about where down is [rad]."""
+    """Largest angle between the directions of gravity by orientation and by specific force [rad]."""
 
     held_reach_m: float = 0.16
     """Three feet of a hanging robot reach further below the base than this. At 0.35 rad of tilt the trunk's
@@ -79,11 +79,11 @@ class SupportConfig:
     """The feet of a lying robot reach no further on average; 0.10 m in the vendor's rest pose [m]."""
 
     unloaded: float = 0.25
-    """Legs that carry less than this share of the weight carry nothing; 1 N·m of friction in each knee looks
-    like 0.2 of it."""
+    """Legs that carry less than this share of the weight count as unloaded; 1 N·m of friction in each knee
+    looks like a share of 0.2."""
 
     loaded: float = 0.5
-    """Legs that carry more than this share of the weight stand on something."""
+    """Legs that carry more than this share of the weight count as standing."""
 
     foot_pressed: float = 60.0
     """A foot sensor above this is pressed, whatever its offset: free ones may show 30 [sensor units]."""
@@ -98,12 +98,12 @@ class SupportConfig:
 
 @dataclass(frozen=True, slots=True)
 class SupportReading:
-    """What some states tell.
+    """The support by some states.
 
     Attributes:
         support: What carries the robot.
-        seen: What was seen, in words.
-        remedy: What to do about states that do not tell; "" for those that do.
+        seen: The observation, in words.
+        remedy: What to do if the states do not decide; "" if they do.
     """
 
     support: Support
@@ -114,7 +114,7 @@ class SupportReading:
 def read_support(
     states: Sequence[LowState | LowStateFrame], config: SupportConfig | None = None
 ) -> SupportReading:
-    """Return what carries the robot, by the states of a short while.
+    """Return what carries the robot, by the states of a short time.
 
     Args:
         states: In order of time.
@@ -144,7 +144,7 @@ def read_support(
 
 def _judge(reach: FloatArray, load: float, feet: FloatArray, config: SupportConfig) -> SupportReading:
     """Judge feet that reach so far below the base (4,) [m], a load [N] and foot sensors (4,)."""
-    # Second to last, not least: one leg may have been left folded.
+    # The second smallest, not the smallest: one leg may be folded.
     third, mean = float(np.sort(reach)[1]), float(reach.mean())
     carried = f"its legs carry {load:.0f} N of its {WEIGHT_N:.0f} N"
     if load > config.loaded * WEIGHT_N:
@@ -173,7 +173,7 @@ def _judge(reach: FloatArray, load: float, feet: FloatArray, config: SupportConf
 def _unsteady(
     orientation: FloatArray, force: FloatArray, joint_speed: float, body_speed: float, config: SupportConfig
 ) -> SupportReading | None:
-    """Return why forces and geometry say nothing; None where the robot is level and still."""
+    """Return why forces and geometry cannot be used; None if the robot is level and still."""
     size = float(np.linalg.norm(force))
     if (
         joint_speed > config.joint_rad_s
@@ -209,13 +209,13 @@ def _up(orientation: FloatArray) -> FloatArray:
 
 
 class SupportGuard:
-    """Refuses a robot that is carried by something else than its description says.
+    """Refuses a robot whose support is not that of its description.
 
     Args:
         name: The robot's name in deal-hw.
         expected: FLOOR or HELD.
         clock: For waiting.
-        pump: Receives one message, waiting at most so long [s]; TransportTimeoutError where none comes.
+        pump: Receives one message, waiting at most this long [s]; TransportTimeoutError if none arrives.
         config: Where the lines are drawn; None: nothing is checked.
     """
 
@@ -232,15 +232,15 @@ class SupportGuard:
         self._states: list[LowStateFrame] | None = None
 
     def take(self, state: LowStateFrame) -> None:
-        """Take a new state; it counts while states are being judged."""
+        """Take a new state; it is used while states are being judged."""
         if self._states is not None:
             self._states.append(state)
 
     def before_release(self) -> None:
-        """Refuse what must not be released from its own controller.
+        """Refuse a robot that must not be released from its own controller.
 
-        On a stand that needs certainty: a robot that stands on the floor would fall. A robot for the floor is
-        laid down first, so only one that surely hangs is refused.
+        On a stand this needs certainty, because a robot that stands on the floor would fall. A robot for the
+        floor is laid down first, so it is refused only if it surely hangs.
 
         Raises:
             SafetyError: The robot is carried by something else, or, for a stand, it is not sure.
@@ -251,10 +251,10 @@ class SupportGuard:
             raise SafetyError(self._refusal(found))
 
     def require(self) -> None:
-        """Return once the robot is still and carried by what is expected.
+        """Return once the robot is still and has the expected support.
 
         Raises:
-            SafetyError: It is carried by something else, or for 3 s it was not sure by what.
+            SafetyError: It has another support, or its support was uncertain for 3 s.
         """
         if self._config is None:
             return

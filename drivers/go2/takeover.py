@@ -1,4 +1,4 @@
-"""Taking the motors over: the robot's own controller lets go, and nobody else commands them."""
+"""Takes the motors over: the robot's own controller releases them, and no other program commands them."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray
 
 LISTEN_S: Final = 0.5
-"""How long nobody else may have commanded the motors before the robot is armed [s]."""
+"""Before arming, no other program may have commanded the motors for this long [s]."""
 RELEASE_PAUSE_S: Final = 1.0
-"""The vendor's example waits as long between releasing a mode and looking again [s]."""
+"""Wait between releasing a mode and checking again, as in the vendor's example [s]."""
 LIE_DOWN_S: Final = 4.0
 """Longest wait for a robot that was told to lie down to come to rest [s]."""
 STILL_S: Final = 0.5
 _STILL_RAD_S: Final = 0.3
 _LYING_RAD: Final = 0.5
-"""A robot whose joints are this close to its rest pose needs not be laid down."""
+"""A robot whose joints are this close to its rest pose counts as lying."""
 
 
 class Takeover:
-    """Releases sport mode, gives the robot back to it, and listens for others who command the motors.
+    """Releases sport mode, returns the robot to it, and listens for other programs that command the motors.
 
     Args:
         transport: Topics of the robot.
         clock: For waiting.
         send: Sends a payload on a topic.
-        pump: Receives one message, waiting at most so long [s], and hands it to whom it concerns; raises
-            TransportTimeoutError where none comes.
+        pump: Receives one message, waiting at most this long [s], and passes it to its reader; raises
+            TransportTimeoutError if none arrives.
         motion: Returns positions and velocities of the joints in the newest state, (J,) each.
         rest: The pose of a lying robot, (J,) [rad]; None for one whose base is held, which cannot fall.
-        services: Whether it has services, and with them a controller of its own that must let go.
+        services: Whether it has services, and with them a controller of its own to release.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Takeover:
         self._foreign, self._foreign_ns = 0, -1
 
     def take(self, message: Message) -> None:
-        """Take a message that is no state: somebody's command, or a service's answer."""
+        """Take a message that is no state: another program's command, or a service's answer."""
         if message.channel == topics.LOW_COMMAND:
             self._foreign += 1
             self._foreign_ns = message.stamp_ns
@@ -68,10 +68,10 @@ class Takeover:
             self._services.take(message)
 
     def run(self, timeout_s: float) -> None:
-        """Release the active mode, lying, and return once nobody else has commanded the motors for a while.
+        """Lay the robot down, release its active mode, and wait until no other program commands the motors.
 
         Raises:
-            TransportTimeoutError: The robot's services do not answer, or do not let go in time.
+            TransportTimeoutError: The robot's services do not answer, or do not release it in time.
             SafetyError: The robot does not lie down, a service refuses, or another program commands the
                 motors; the text names it.
         """
@@ -88,7 +88,7 @@ class Takeover:
         self._await_silence(deadline_ns)
 
     def hand_back(self, timeout_s: float) -> None:
-        """Return the robot to the mode that was released; nothing where none was.
+        """Return the robot to the released mode; do nothing if none was released.
 
         Raises:
             TransportTimeoutError: The mode does not have the robot in time.
@@ -104,11 +104,11 @@ class Takeover:
 
     @property
     def contested(self) -> bool:
-        """Whether somebody else has commanded the motors just now."""
+        """Whether another program has commanded the motors just now."""
         return self._foreign > 0 and self._clock.now_ns() - self._foreign_ns < round(LISTEN_S * 1e9)
 
     def complaint(self) -> str:
-        """Return in words that somebody else commands the motors, and who it may be."""
+        """Return the text that another program commands the motors, and which one it may be."""
         writers = self._transport.writers(topics.LOW_COMMAND)
         who = f" It is one of: {'; '.join(writers)}." if writers else ""
         return (
@@ -120,7 +120,7 @@ class Takeover:
         return self._switcher.active(self._left_s(deadline_ns)) if self._has_services else ""
 
     def _lie_down(self, name: str, deadline_ns: int) -> None:
-        """Lay the robot down where it does not lie: released while it stands, it falls."""
+        """Lay the robot down if it does not lie: a robot released while it stands falls."""
         if self._lies():
             return
         self._switcher.lie_down(self._left_s(deadline_ns))
@@ -135,7 +135,7 @@ class Takeover:
         return self._rest is None or bool(np.abs(self._motion()[0] - self._rest).max() < _LYING_RAD)
 
     def _await_stillness(self, deadline_ns: int) -> None:
-        """Wait until the robot lies and its joints have stopped, but not for ever."""
+        """Wait until the robot lies and its joints have stopped, up to a limit."""
         until_ns = min(self._clock.now_ns() + round(LIE_DOWN_S * 1e9), deadline_ns)
         still_since_ns = self._clock.now_ns()
         while (now_ns := self._clock.now_ns()) < until_ns:
@@ -147,7 +147,7 @@ class Takeover:
                 return
 
     def _await_silence(self, deadline_ns: int) -> None:
-        """Listen; a writer that is known but silent does not count: the robot keeps some of its own."""
+        """Listen for commands; silent writers do not count, because the robot has some of its own."""
         listen_ns = round(LISTEN_S * 1e9)
         begin_ns = self._clock.now_ns()
         until_ns = max(deadline_ns, begin_ns + listen_ns)

@@ -1,8 +1,8 @@
-"""The vendor's simulator unitree_mujoco in the place of a Go2: what its states lack, what is checked instead.
+"""The vendor's simulator unitree_mujoco in the place of a Go2, and the checks for its states.
 
-It speaks the Go2's topics, and fills less of them (:mod:`deal_hw.drivers.go2.emulator.unitree_mujoco` has the
-facts). Nobody gets here unasked: the option names the simulator, and a state with a head or a battery, which
-a real robot sends, is refused.
+It uses the Go2's topics, and fills less of them (:mod:`deal_hw.drivers.go2.emulator.unitree_mujoco` has the
+facts). An option must name the simulator. A state with a head or a battery is from a real robot, and is
+refused.
 
 | missing | what is checked instead |
 |---|---|
@@ -10,10 +10,10 @@ a real robot sends, is refused.
 | tick | a state is new where it differs from the one before, and is as old as its reception |
 | checksum | length and header; the checksums of UDP or TCP stand for the rest |
 | battery | nothing: the limits of charge and voltage are 0 |
-| motion switcher | nothing is released; before arming nobody may have commanded the motors, as on the robot |
+| motion switcher | nothing is released; before arming no other program may command the motors |
 
-It turns a command into torques once, and holds these. So the command in force is sent again with each state
-while the robot is passive, and it counts as passive only once its joints are slow.
+It computes torques once for each command, and holds them. So the driver sends the passive command again with
+each state. The robot counts as passive only once its joints are slow.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from deal_hw.transport import Message, TopicTransport
 
 @dataclass(frozen=True, kw_only=True)
 class UnitreeMujocoConfig:
-    """Where the lines are drawn."""
+    """Limits of the checks."""
 
     still_rad_s: float = 0.1
-    """Passive is a simulator whose joints are slower [rad/s]: with the passive damping of 5 N·m·s/rad it
-    holds at most 0.5 N·m afterwards. A limp robot that lies was seen at 0.004 rad/s."""
+    """Joint speed below which the simulator counts as passive [rad/s]: with the passive damping of 5
+    N·m·s/rad it holds at most 0.5 N·m afterwards. A limp robot that lies was seen at 0.004 rad/s."""
 
     def __post_init__(self) -> None:
         if not self.still_rad_s > 0:
@@ -52,10 +52,10 @@ class UnitreeMujocoConfig:
 
 
 class SimulatorStream(StateStream):
-    """Judges states without a tick: new is what differs, and its time is that of its reception.
+    """Judges states without a tick: a state that differs is new, and its time is that of its reception.
 
-    The simulator publishes faster than its physics steps, so a state that comes again is no error; it is not
-    taken, and the limit of a state's age holds. Lost states leave no trace.
+    The simulator publishes faster than its physics steps, so a repeated state is no error. It is skipped, and
+    the limit of a state's age holds. Lost states cannot be detected.
     """
 
     def reset(self) -> None:
@@ -65,12 +65,12 @@ class SimulatorStream(StateStream):
 
     @property
     def doubled(self) -> bool:
-        """False: repeated states are the rule here. Two simulators are found by DDS's discovery."""
+        """False, because states repeat here. DDS's discovery finds a second simulator."""
         return False
 
     @property
     def standstill(self) -> str:
-        """What stands still in states that are not new, in words."""
+        """The constant part of states that are not new, in words."""
         return "nothing in them changes"
 
     def take(self, message: Message) -> LowStateFrame | None:
@@ -121,7 +121,7 @@ class UnitreeMujocoRobot(Go2Robot):
         clock: The clock of the transport's stamps.
         stop_buttons: As the Go2's; the simulator has them where a gamepad is plugged in.
         support_check: As the Go2's.
-        config: Where the lines are drawn.
+        config: Limits of the checks.
     """
 
     description: ClassVar[RobotDescription] = without_battery(DRIVER)
@@ -155,7 +155,7 @@ class UnitreeMujocoRobot(Go2Robot):
     def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:
         super()._take_frame(frame, receive_ns)
         if not self._armed:
-            # Its damping is a torque that was right once. Sent every 20 ms it shakes the legs.
+            # Its damping is a torque that holds until the next command. Sent every 20 ms it shakes the legs.
             self.repeat()
 
     def _is_passive(self, frame: LowStateFrame) -> bool:

@@ -1,6 +1,6 @@
 """Facts about dm_control's humanoid: a free torso and 21 joints with torque motors, as in DEAL's Table 11.
 
-:data:`DESCRIPTION` is made when it is first asked for: it needs the model of the installed dm_control.
+:data:`DESCRIPTION` is made on first access, because it needs the model of the installed dm_control.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ TABLE_11: Final[Mapping[str, tuple[float, float, float, float]]] = {
 """DEAL, Table 11: dry friction [N·m], damping [N·m·s/rad], armature [kg·m²], stiffness [N·m/rad]."""
 FRICTION: Final = 1.0
 RESTITUTION: Final = 0.04
-"""Table 11 has 0.01, which nothing tells from 0.002 (see ``drivers.ant.description.paper_space``)."""
+"""Table 11 has 0.01; motion does not distinguish 0.002 (``drivers.ant.description.paper_space``)."""
 PAPER_RESTITUTION: Final = 0.01
 KINDS: Final = {
     "frictionloss": ("dof_frictionloss", "N·m"),
@@ -62,7 +62,7 @@ def description() -> RobotDescription:
     """Return the facts about the humanoid.
 
     Raises:
-        MissingExtraError: dm_control, which carries the model, is not installed.
+        MissingExtraError: dm_control, which has the model, is not installed.
     """
     count = len(JOINTS)
     gear = tuple(GEAR_NM[joint_type(name)] for name in JOINTS)

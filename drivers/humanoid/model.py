@@ -1,7 +1,7 @@
-"""The humanoid's MJCF, prepared from the file that the installed dm_control carries; nothing is copied here.
+"""The humanoid's MJCF, prepared from the file of the installed dm_control; no copy of it is kept here.
 
-What is changed: textures, sites, sensors and cameras go (textures make every copy of the model 12 MB); the
-values of the parameter preset are written; feet alone rule their contacts, and bodies touch the floor only.
+Changes: textures, sites, sensors and cameras are removed (textures make every copy of the model 12 MB). The
+values of the parameter preset are written. The feet alone define their contacts. Bodies touch the floor only.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from deal_hw.drivers.prepared import prepare as prepare_model
 
 STEP_S: Final = 0.005
 HOME_HEIGHT_M: Final = 1.29
-"""Of the torso where the feet just touch the floor [m]."""
+"""Height of the torso at which the feet just touch the floor [m]."""
 SIDES: Final = ("right", "left")
 ABDOMEN: Final = ("abdomen_z", "abdomen_y", "abdomen_x")
 LEG: Final = ("hip_x", "hip_z", "hip_y", "knee", "ankle_y", "ankle_x")
@@ -39,20 +39,20 @@ def source_path() -> Path:
 
 
 def prepare(text: str, values: Mapping[str, float]) -> str:
-    """Return dm_control's MJCF without what is only looked at, with the preset's values.
+    """Return dm_control's MJCF without purely visual parts, with the preset's values.
 
     Args:
         text: Content of humanoid.xml.
         values: Parameter name -> value, as in ``drivers.humanoid.description``.
 
     Raises:
-        ConfigurationError: The file is not the one this was written for.
+        ConfigurationError: The file is not the expected one.
     """
     return prepare_model(text, _prepare, values, "humanoid.xml of dm_control 1.0")
 
 
 def joint_type(joint: str) -> str:
-    """Return what a joint is called on both sides."""
+    """Return the name of a joint without its side."""
     return joint.removeprefix("right_").removeprefix("left_")
 
 

@@ -105,9 +105,9 @@ def parameter_space() -> ParameterSpace:
     """Return 30 parameters: servo stiffness, damping, frictionloss, armature and encoder bias of each joint.
 
     Frictionloss, damping and armature are the published model's, which call themselves guesses. At
-    shoulder_pan and wrist_roll no gravity acts, so that these and the stiffness scale almost together there:
-    only their ratios are known, but for the small share of the links' own inertia. The bias is that of the
-    calibrated zero (middle of the travel) against the model's.
+    shoulder_pan and wrist_roll no gravity acts. There only the ratios of these and the stiffness are well
+    determined; the links' own inertia adds little. The bias is the calibrated zero (middle of the travel)
+    minus the model's.
     """
     return ParameterSpace(
         [

@@ -30,8 +30,8 @@ _READ_SIZE = 4096
 class SerialTransport(Transport):
     """A serial port, opened exclusively; the channel of its messages is "".
 
-    pyserial opens and sets up the port. Reading and writing go straight to the file descriptor: that is
-    faster, and a child process can go on with a descriptor that it inherited (:meth:`from_fd`). The lock
+    pyserial opens and sets up the port. Reading and writing use the file descriptor directly. This is
+    faster, and a child process can use a descriptor that it inherited (:meth:`from_fd`). The lock
     belongs to the open file, so it holds until the last process closes it.
 
     Args:
@@ -55,20 +55,20 @@ class SerialTransport(Transport):
     ) -> SerialTransport:
         """Return a transport over a port that a parent process opened; it closes ``fd`` when closed.
 
-        It is made for the process with the deadlines, so it reads ahead in a thread.
+        It is for the process with deadlines, so it reads ahead in a thread.
 
         Args:
             fd: The descriptor.
             clock: Gives the stamps.
             port: Path of the port, for :meth:`reopen`; "": it cannot be opened again.
-            baud_rate: For :meth:`reopen`; the descriptor's stays as it is.
+            baud_rate: For :meth:`reopen`; the descriptor keeps its own.
         """
         transport = cls(port or f"inherited descriptor {fd}", baud_rate, clock)
         transport._adopted = fd
         return transport
 
     def open(self) -> None:
-        """Open the port and forget what it had received before."""
+        """Open the port and discard bytes received before."""
         if self._fd >= 0:
             return
         if self._adopted is None:
@@ -93,10 +93,10 @@ class SerialTransport(Transport):
                 os.close(fd)
 
     def reopen(self) -> None:
-        """Open the port by its path where the device vanished, as after a cable was pulled and put back.
+        """Open the port by its path if the device vanished, such as after a cable was pulled and put back.
 
-        The new port is open before the dead one is closed: a try that fails loses nothing. A port that still
-        works is left alone: its lock is this program's own.
+        The new port is opened before the dead one is closed, so a failed try loses nothing. A port that still
+        works is kept, because its lock is this program's own.
         """
         if self._fd >= 0 and not _hung_up(self._fd):
             return
@@ -111,7 +111,7 @@ class SerialTransport(Transport):
             self._ahead = ReadAhead(self._fd, self._clock)
 
     def send(self, message: Message) -> None:
-        """Write at once; what the port does not take is an error, never a wait."""
+        """Write without waiting; bytes that the port does not take are an error."""
         fd = self.fileno()
         try:
             written = os.write(fd, message.payload)
@@ -126,12 +126,11 @@ class SerialTransport(Transport):
             )
 
     def receive(self, timeout_s: float) -> Message:
-        """Return all bytes at hand, waiting up to ``timeout_s`` for the first."""
+        """Return all received bytes, waiting up to ``timeout_s`` for the first."""
         fd = self.fileno()
         if self._ahead is not None:
             return self._receive_ahead(self._ahead, timeout_s)
-        # select, not poll: poll rounds its timeout up to whole milliseconds, and every cycle would start that
-        # late.
+        # select, not poll: poll rounds its timeout up to whole milliseconds, so every cycle would start late.
         if not select.select([fd], [], [], max(0.0, timeout_s))[0]:
             raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s")
         try:
@@ -168,7 +167,7 @@ class SerialTransport(Transport):
             raise self._open_error(error) from error
         except ValueError as error:
             raise ConfigurationError(f"{self.port}: {error}") from error
-        # FTDI adapters hold bytes back for up to 16 ms without this; ptys and many drivers do not know it.
+        # FTDI adapters hold bytes back for up to 16 ms without this; ptys and many drivers lack this call.
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             port.set_low_latency_mode(True)
         _read_nothing_means_gone(port.fileno())
@@ -200,7 +199,7 @@ class SerialTransport(Transport):
         if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
             return PortNotFoundError(f"there is no serial port {self.port!r}; ports at hand: {_ports()}")
         if "configure port" in text or code == errno.ENOTTY:
-            # What the kernel says, "inappropriate ioctl for device", tells nobody that it is no port at all.
+            # The kernel's text, "inappropriate ioctl for device", does not say that it is no port.
             return PortNotFoundError(
                 f"{self.port} cannot be opened as a serial port: it is a file or another device; ports at "
                 f"hand: {_ports()}"

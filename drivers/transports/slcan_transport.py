@@ -1,8 +1,9 @@
 """CAN frames over a serial adapter that speaks slcan (Lawicel): CANable, CANtact, USBtin, Arduino bridges.
 
-python-can has an slcan bus, too. It reads byte by byte, hides the adapter's refusals, never reads again after
-one byte above 0x7F, may wait in a write, and neither locks the port nor takes one that a parent process
-opened. In a process with deadlines all five matter, so the ASCII lines are read here, over our serial port.
+python-can has an slcan bus, too. It reads byte by byte, hides the adapter's refusals, and never reads again
+after one byte above 0x7F. It may wait in a write. It neither locks the port nor takes one that a parent
+process opened. In a process with deadlines all this matters, so this module reads the ASCII lines itself,
+over our serial port.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ BITRATES: Final = {
     1_000_000: b"S8",
 }
 TTY_BAUD_RATE: Final = 1_000_000
-"""Of adapters behind a real UART; over USB it is a formality."""
+"""Baud rate of adapters behind a real UART; over USB it has no effect."""
 END: Final = b"\r"
 REFUSED: Final = b"\a"
 LONGEST_LINE: Final = 40
-"""An extended frame of 8 bytes with a time stamp has 31 characters; what is longer is garbage."""
+"""An extended frame of 8 bytes with a time stamp has 31 characters; longer lines are invalid."""
 USB_ADAPTERS: Final = {
     (0xAD50, 0x60C4): "CANable or CANtact (slcan)",
     (0x16D0, 0x117E): "CANable 2 (slcan)",
@@ -45,9 +46,9 @@ USB_ADAPTERS: Final = {
 }
 """USB vendor and product of adapters that speak slcan."""
 TX_FULL, WARNING, PASSIVE, BUS_ERROR = 0x02, 0x04, 0x20, 0x80
-"""Bits of the adapter's answer to F that matter here."""
+"""Used bits of the adapter's answer to F."""
 _SILENCE_NS = 100_000_000
-"""After such a silence another process may have left half a line in the adapter: it is ended first [ns]."""
+"""After this silence another process may have left half a line in the adapter, so it is ended first [ns]."""
 _LINE = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _FLAGS = re.compile(rb"F([0-9A-Fa-f]{2})")
 
@@ -59,7 +60,7 @@ def serial_adapters() -> list[tuple[str, str]]:
 
 
 def encode_line(channel: str, payload: bytes) -> bytes:
-    """Return a data frame as the adapter takes it.
+    """Return a data frame as a line for the adapter.
 
     Args:
         channel: The id as hex digits.
@@ -69,10 +70,10 @@ def encode_line(channel: str, payload: bytes) -> bytes:
 
 
 def decode_line(line: bytes) -> tuple[int, bytes] | None:
-    """Return id and data of a line without its end; None where it is no whole data frame with an 11-bit id.
+    """Return id and data of a line without its end; None if it is no whole data frame with an 11-bit id.
 
-    Two bytes more than the length says are the adapter's time stamp, which is not used: it counts whole
-    milliseconds, and the time of reading is no worse.
+    Two bytes beyond the length are the adapter's time stamp. It is not used: it counts whole milliseconds,
+    and the time of reading is as good.
     """
     if (match := _LINE.fullmatch(line)) is None:
         return None
@@ -81,7 +82,7 @@ def decode_line(line: bytes) -> tuple[int, bytes] | None:
 
 
 class LineReader:
-    """Cuts the adapter's characters into lines, and survives whatever else is in them.
+    """Cuts the adapter's characters into lines, and skips invalid characters.
 
     Attributes:
         errors: Overlong lines so far.
@@ -93,7 +94,7 @@ class LineReader:
         self._overrun = False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take characters; return the lines they complete, without their ends. A refusal is a line, too."""
+        """Take characters; return completed lines, without their ends. A refusal is a line, too."""
         *lines, rest = (self._rest + data).replace(REFUSED, REFUSED + END).split(END)
         if lines and self._overrun:
             self._overrun = False
@@ -106,7 +107,7 @@ class LineReader:
 
 
 class SerialPort(Protocol):
-    """What is needed of a serial port: a :class:`~deal_hw.transport.Transport` with a descriptor."""
+    """The required methods of a serial port: a :class:`~deal_hw.transport.Transport` with a descriptor."""
 
     def open(self) -> None:
         """Open the port."""
@@ -117,7 +118,7 @@ class SerialPort(Protocol):
         ...
 
     def reopen(self) -> None:
-        """Open the port again where it was lost."""
+        """Open the port again if it was lost."""
         ...
 
     def send(self, message: Message) -> None:
@@ -125,7 +126,7 @@ class SerialPort(Protocol):
         ...
 
     def receive(self, timeout_s: float) -> Message:
-        """Return the bytes at hand."""
+        """Return the received bytes."""
         ...
 
     def fileno(self) -> int:
@@ -136,12 +137,12 @@ class SerialPort(Protocol):
 class SlcanTransport(CanTransport):
     """A serial CAN adapter.
 
-    The adapter filters nothing: foreign frames are dropped here by their id, before their data is read.
-    Frames are stamped when they are read. After a refusal the adapter is asked for its error flags.
+    The adapter filters nothing, so this class drops foreign frames by their id, before it reads their data.
+    Frames are stamped when they are read. After a refusal the adapter's error flags are requested.
 
     Attributes:
-        refused: Frames that the adapter refused to send.
-        garbled: Lines that were no whole frame, from the first whole line on.
+        refused: Number of frames that the adapter refused to send.
+        garbled: Number of lines that were no whole frame, from the first whole line on.
 
     Args:
         port: Such as ``slcan:/dev/ttyACM0``.
@@ -201,7 +202,7 @@ class SlcanTransport(CanTransport):
         self._serial.close()
 
     def reopen(self) -> None:
-        """Open the port again where the adapter vanished; where it is bus-off, close and open its bus."""
+        """Open the port again if the adapter vanished; if it is bus-off, close and open its bus."""
         before = self._serial.fileno() if self._is_open else -1
         self._serial.reopen()
         if self._off or self._serial.fileno() != before:
@@ -218,7 +219,7 @@ class SlcanTransport(CanTransport):
         self._write(encode_line(message.channel, message.payload))
 
     def receive(self, timeout_s: float) -> Message:
-        """Return the next frame that is wanted."""
+        """Return the next accepted frame."""
         deadline_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
         while not self._frames:
             self._check_bus()

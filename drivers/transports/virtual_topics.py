@@ -1,4 +1,4 @@
-"""A device core that speaks in topics, on a virtual wire: real messages, faster than real time."""
+"""A device core with topics on a virtual wire: real messages, faster than real time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deal_hw.transport import Message, TopicTransport
 
 
 class TopicCore(TickingCore, Protocol):
-    """What a virtual wire needs of a device: messages in, messages out, in device time."""
+    """The required methods of a device with topics: messages in, messages out, in device time."""
 
     def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
         """Take a message from the host."""
@@ -34,12 +34,12 @@ class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
         self._subscribe: frozenset[str] = frozenset()
 
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        """Say which topics will be used."""
+        """Declare the topics to use."""
         self._publish |= frozenset(publish)
         self._subscribe |= frozenset(subscribe)
 
     def writers(self, topic: str) -> tuple[str, ...]:
-        """Return nothing: who else is on the wire is not known."""
+        """Return nothing: other writers are unknown."""
         return ()
 
     def send(self, message: Message) -> None:

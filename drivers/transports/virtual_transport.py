@@ -10,7 +10,7 @@ from deal_hw.transport import Message
 
 
 class DeviceCore(TickingCore, Protocol):
-    """What a virtual wire needs of a device: bytes in, bytes out, in device time."""
+    """The required methods of a device: bytes in, bytes out, in device time."""
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host."""

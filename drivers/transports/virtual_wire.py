@@ -1,4 +1,4 @@
-"""What virtual wires share: a device and a clock that stay together."""
+"""Common part of virtual wires: couples a device to a virtual clock."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ CoreT = TypeVar("CoreT", bound=TickingCore)
 class VirtualWire(Transport, Generic[CoreT]):
     """Couples a device core to a virtual clock.
 
-    The device lives on while nobody looks: whatever moves the clock, the next call lets the device catch up.
-    Waiting in :meth:`receive` moves the clock, one device tick after the other, until a message comes out or
-    the time has passed. Messages carry the time at which the device sent them.
+    The device runs on between calls: after any change of the clock, the next call runs the missing ticks.
+    Waiting in :meth:`receive` moves the clock, one device tick after the other, until a message arrives or
+    the time has passed. A message's stamp is the time at which the device sent it.
 
     Args:
         device: The device; its time 0 is the clock's time now.
         clock: The clock that everybody shares.
-        queue_size: Messages kept for a host that does not read; the oldest go first, as in a full buffer.
+        queue_size: Most messages kept for a host that does not read; the oldest are dropped.
     """
 
     def __init__(self, device: CoreT, clock: VirtualClock, queue_size: int = 4096) -> None:
@@ -44,7 +44,7 @@ class VirtualWire(Transport, Generic[CoreT]):
         self._is_open = self._unplugged = False
 
     def open(self) -> None:
-        """Open the wire and forget what the device had sent before."""
+        """Open the wire and discard messages sent before."""
         if self._unplugged:
             raise TransportLostError("virtual wire: the device was unplugged")
         if not self._is_open:
@@ -53,15 +53,15 @@ class VirtualWire(Transport, Generic[CoreT]):
             self._is_open = True
 
     def close(self) -> None:
-        """Close the wire; the device lives on."""
+        """Close the wire; the device runs on."""
         self._is_open = False
 
     def unplug(self) -> None:
-        """Pull the cable: every later call fails as if the device had vanished."""
+        """Unplug the wire: every later call fails as if the device had vanished."""
         self._unplugged = True
 
     def plug_in(self) -> None:
-        """Put the cable back: the wire can be opened again."""
+        """Plug the wire in: it can be opened again."""
         self._unplugged = False
 
     def receive(self, timeout_s: float) -> Message:

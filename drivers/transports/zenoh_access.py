@@ -1,4 +1,4 @@
-"""Who may do what at a Zenoh end point, by the name in the certificate that TLS has verified."""
+"""Access rules of a Zenoh end point, by the name in the certificate that TLS has verified."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deal_hw.errors import ConfigurationError
 def access_settings(
     controllers: Sequence[str], observers: Sequence[str], *, write: Sequence[str], read: Sequence[str]
 ) -> dict[str, Any]:
-    """Return settings of a session that listens: whoever is not named may do nothing.
+    """Return settings of a session that listens; a name that is not listed may do nothing.
 
     Args:
         controllers: Common names of certificates that may write and read.
@@ -20,7 +20,7 @@ def access_settings(
         read: Keys that both may read.
 
     Raises:
-        ConfigurationError: A name stands in both lists, is empty, or nobody may write.
+        ConfigurationError: A name is in both lists or empty, or there is no controller.
     """
     if twice := set(controllers) & set(observers):
         raise ConfigurationError(
@@ -32,7 +32,7 @@ def access_settings(
             "by the common name in its certificate (`deal-hw keys show DIR` lists them)"
         )
     rules = [
-        # Both flows of the declarations: each side must hear whom its messages interest.
+        # Declarations in both directions, because each side must receive the other's subscriptions.
         _rule("read", ["put", "delete"], ["egress"], read),
         _rule("hear", ["declare_subscriber"], ["ingress", "egress"], [*read, *write]),
         _rule("write", ["put"], ["ingress"], write),

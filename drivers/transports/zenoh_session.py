@@ -1,4 +1,4 @@
-"""What a Zenoh session is asked for: end points, who may connect, no discovery, short queues."""
+"""Settings of a Zenoh session: end points, access, no discovery, short queues."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from deal_hw.errors import ConfigurationError, PortNotFoundError, TransportTimeo
 from deal_hw.transport import WireOptions
 
 OPEN_TIMEOUT_S: Final = 3.0
-"""How long to wait for a session with the end points [s]."""
+"""Longest wait for a session with the end points [s]."""
 PROBE_TIMEOUT_S: Final = 2.0
 _PROTOCOLS: Final = ("tcp", "udp", "tls")
 _FORM: Final = re.compile(r"(\w+)/(\[[0-9a-fA-F:.%\w]+\]|[^\s\[\]:/?#]+):(\d{1,5})")
@@ -26,7 +26,7 @@ _RETRY_MS: Final = (100, 1000)
 _NOT_YET_VALID, _EXPIRED = 9, 10
 """Codes of OpenSSL (X509_V_ERR_...)."""
 _FLIGHTS: Final = 4
-"""Messages to and fro that a handshake needs at most."""
+"""Most messages in both directions of a handshake."""
 _ALERTS: Final = {
     "CERTIFICATE_REQUIRED": "it wants a certificate of ours: give --certificate and --key",
     "CERTIFICATE_EXPIRED": (
@@ -37,12 +37,12 @@ _ALERTS: Final = {
         "it does not know the authority that signed our certificate: both sides need the same ca.pem"
     ),
 }
-"""Parts of OpenSSL's names for what a peer says of our certificate -> what it means."""
+"""Parts of OpenSSL's names for a peer's refusal of our certificate -> meaning."""
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a session listens or goes to.
+    """An end point at which a session listens, or to which it connects.
 
     Attributes:
         protocol: "tcp", "udp" or "tls".
@@ -60,7 +60,7 @@ class Endpoint:
 
     @property
     def loopback(self) -> bool:
-        """Whether it stays on this machine; a name is believed for "localhost" only."""
+        """Whether it is on this machine; of names only "localhost" counts."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -89,11 +89,11 @@ def _parse(text: str) -> Endpoint:
 
 
 def check_security(endpoints: Sequence[Endpoint], options: WireOptions) -> None:
-    """Refuse what would let strangers command the robot.
+    """Refuse settings that would let strangers command the robot.
 
     Raises:
         ConfigurationError: Plain text would leave this machine, files for TLS are missing or unusable, or a
-            client was told to listen.
+            client is set to listen.
     """
     if options.listen and options.session_mode == "client":
         raise ConfigurationError("a Zenoh client cannot listen: use mode peer, or do not listen")
@@ -123,9 +123,10 @@ def _check_files(options: WireOptions) -> None:
 
 
 def own_certificate_trouble(options: WireOptions) -> tuple[int, str]:
-    """Return OpenSSL's code and words for what is wrong with our certificate; 0 and "" where nothing is.
+    """Return OpenSSL's code and words for the fault of our certificate; 0 and "" for none.
 
-    It is shown to ourselves, in memory: the peer's judgement would come as a closed connection.
+    The check is a handshake with ourselves, in memory, because a peer's refusal would only close the
+    connection.
     """
     if options.certificate is None or options.ca is None:
         return 0, ""
@@ -148,7 +149,7 @@ def own_certificate_trouble(options: WireOptions) -> tuple[int, str]:
 
 
 def tls_context(options: WireOptions) -> ssl.SSLContext:
-    """Return a context from the files, which proves that they can be read and fit together.
+    """Return a context from the files, which checks that they can be read and fit together.
 
     Raises:
         ConfigurationError: They cannot, or do not.
@@ -163,7 +164,7 @@ def tls_context(options: WireOptions) -> ssl.SSLContext:
         raise ConfigurationError(f"{options.ca} holds no certificate in PEM form ({error})") from error
     if options.certificate is not None and options.key is not None:
         try:
-            # Without a password function OpenSSL would ask the terminal.
+            # Without a password function OpenSSL would prompt at the terminal.
             context.load_cert_chain(options.certificate, options.key, password=lambda: "")
         except (ssl.SSLError, OSError) as error:
             raise ConfigurationError(
@@ -206,8 +207,8 @@ def settings(endpoints: Sequence[Endpoint], options: WireOptions) -> dict[str, A
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
     for protocol in ("tcp", "tls"):
-        # The kernel would buffer seconds of commands for a peer that hangs, which then obeys them all, oldest
-        # first, when it wakes up.
+        # The kernel would buffer seconds of commands for a peer that hangs. It would then follow them all,
+        # oldest first, when it wakes up.
         chosen[f"transport/link/{protocol}/so_sndbuf"] = _BUFFER_BYTES
         chosen[f"transport/link/{protocol}/so_rcvbuf"] = _BUFFER_BYTES
     if any(endpoint.protocol == "tls" for endpoint in endpoints):
@@ -232,9 +233,9 @@ def _tls_settings(options: WireOptions) -> dict[str, Any]:
 def answering(
     endpoints: Sequence[Endpoint], options: WireOptions, timeout_s: float = PROBE_TIMEOUT_S
 ) -> tuple[Endpoint, ...]:
-    """Return the end points, those that take a connection first: Zenoh itself cannot say why one does not.
+    """Return the end points, reachable ones first. Zenoh itself cannot report why one is not reachable.
 
-    A client needs one of them, a peer needs all. Each is waited for so long at most [s].
+    A client needs one of them, a peer needs all. ``timeout_s`` is the longest wait for each [s].
 
     Raises:
         PortNotFoundError: Nothing listens there, or there is no such host.
@@ -270,7 +271,7 @@ def _probe(endpoint: Endpoint, timeout_s: float) -> PortNotFoundError | Transpor
 
 
 def why_no_session(endpoints: Sequence[Endpoint], options: WireOptions) -> str:
-    """Return in words why end points that take connections give no session."""
+    """Return in words why reachable end points give no session."""
     for endpoint in endpoints:
         if endpoint.protocol == "tls":
             return _tls_trouble(endpoint, options)
@@ -286,7 +287,7 @@ def _tls_trouble(endpoint: Endpoint, options: WireOptions) -> str:
             socket.create_connection((endpoint.host, endpoint.port), PROBE_TIMEOUT_S) as plain,
             tls_context(options).wrap_socket(plain, server_hostname=endpoint.host) as secure,
         ):
-            # A server that wants no part of us says so after the handshake only.
+            # A server refuses our certificate only after the handshake.
             secure.settimeout(0.5)
             secure.recv(1)
     except ssl.SSLCertVerificationError as error:

@@ -1,9 +1,9 @@
-"""What travels beside a Zenoh message, so that its age is known without a clock that both sides share.
+"""Attachments of Zenoh messages that give their age without a common clock.
 
-The robot's side stamps what it sends with its own clock. A client returns the newest stamp that it has heard
-with each message of its own, and numbers them. The robot's side then knows, by its own clock alone, how old
-the state was that the client acted on, the way there and back included: wall clocks play no part. TCP's
-timestamps work alike (RFC 7323). Page 'Go2 messages' of the documentation has the bytes for other languages.
+The robot's side stamps its messages with its own clock. A client returns the newest received stamp with each
+message of its own, and numbers its messages. So the robot's side knows, by its own clock alone, the age of
+the state that the client acted on, with both ways included. No wall clock is used. TCP's timestamps work
+alike (RFC 7323). Page 'Go2 messages' of the documentation has the bytes for other languages.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _ECHO_BYTES: Final = struct.Struct("<HHIQQQQ")
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """What the robot's side writes.
+    """Attachment from the robot's side.
 
     Attributes:
-        session: Random number of its session; another one after a restart.
-        time_ns: Its clock [ns]; only differences mean anything.
+        session: Random number of its session; a new one after a restart.
+        time_ns: Its clock [ns]; only differences have a meaning.
     """
 
     session: int
@@ -40,12 +40,12 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True)
 class Echo:
-    """What a client writes.
+    """Attachment from a client.
 
     Attributes:
-        stream: Random number of its session; another one after each opening.
+        stream: Random number of its session; a new one after each opening.
         sequence: Number of the message in the stream, rising; numbers may be left out.
-        heard: The newest stamp that it has heard; zeros before the first.
+        heard: The newest received stamp; zeros before the first.
     """
 
     stream: int
@@ -60,7 +60,7 @@ class Echo:
 
 
 def read_stamp(attachment: bytes) -> Stamp | None:
-    """Return the stamp in an attachment; None where it is something else."""
+    """Return the stamp in an attachment; None if it is something else."""
     if len(attachment) != _STAMP_BYTES.size:
         return None
     version, kind, _, session, time_ns = _STAMP_BYTES.unpack(attachment)
@@ -68,7 +68,7 @@ def read_stamp(attachment: bytes) -> Stamp | None:
 
 
 def read_echo(attachment: bytes) -> Echo:
-    """Return what a client wrote.
+    """Return the echo in a client's attachment.
 
     Raises:
         FrameError: It is something else, or nothing.
@@ -100,7 +100,7 @@ class Echoes:
         self._heard = Stamp(0, 0)
 
     def hear(self, attachment: bytes) -> None:
-        """Take the attachment of a message that came, whoever sent it."""
+        """Take the attachment of a received message from any sender."""
         self._heard = read_stamp(attachment) or self._heard
 
     def next(self) -> bytes:

@@ -31,31 +31,31 @@ T = TypeVar("T")
 
 _TOPIC: Final = re.compile(r"[^/*$?#\s]+(/[^/*$?#\s]+)*")
 _AT_HAND: Final = 256
-"""Messages kept for a reader that does not come: half a second of states. The oldest are dropped."""
+"""Most messages kept for a reader: half a second of states. The oldest are dropped."""
 _JOIN_S: Final = 1.0
 _REOPEN_PROBE_S: Final = 0.2
 _SILENT_NS: Final = 2_000_000_000
-"""Nothing heard for so long, and who asks for a new session gets one [ns]: as long as a peer's lease."""
+"""After this silence :meth:`reopen` makes a new session [ns]: as long as a peer's lease."""
 
 
 class ZenohTransport(TopicTransport):
-    """A Zenoh session with named end points, no discovery, and nothing that waits.
+    """A Zenoh session with named end points and no discovery. No call waits for a peer.
 
-    Sending never waits: what a stalled peer cannot take is dropped. A thread per subscribed topic stamps
-    messages as they arrive; it has the scheduling of the thread that calls :meth:`open`, and so have Zenoh's
-    own threads with the first session of a process. A process with deadlines therefore calls ``open`` after
-    it has become a real-time process.
+    Sending never waits: messages that a stalled peer cannot take are dropped. A thread for each subscribed
+    topic stamps messages as they arrive. It has the scheduling of the thread that calls :meth:`open`; so do
+    Zenoh's own threads, from the first session of a process on. A process with deadlines therefore calls
+    ``open`` after it has become a real-time process.
 
-    The side that listens has no peer in particular, so silence is all it notices. The side that went to an
-    end point knows when its link is gone: then ``send`` and ``receive`` raise
-    :class:`~deal_hw.errors.TransportLostError`, ``receive`` only after it has handed out what was at hand.
-    Zenoh goes on trying to reach the end point, and once it is back both work again. That side also numbers
-    its messages and returns the newest stamp of the other with each (:mod:`zenoh_stamps`), unless a message
-    brings an attachment of its own.
+    The side that listens has no fixed peer, so it notices a lost link only by silence. Zenoh
+    reports it to the side that connected to an end point. Then ``send`` and ``receive`` raise
+    :class:`~deal_hw.errors.TransportLostError`; ``receive`` first returns the messages already received.
+    Zenoh keeps trying to connect, and afterwards both work again. That side also numbers its messages, and
+    returns the newest stamp of the other side with each (:mod:`zenoh_stamps`). A message with an attachment
+    of its own keeps that.
 
     Args:
-        port: End points, comma separated: "tcp/127.0.0.1:7447". A peer goes to all of them, a client to the
-            first that answers.
+        port: End points, comma separated: "tcp/127.0.0.1:7447". A peer connects to all of them, a client to
+            the first that answers.
         clock: Gives the stamps.
         options: Whether to listen there, the mode, and who may connect.
         settings: Further settings of the session, by their paths in Zenoh's configuration.
@@ -87,7 +87,7 @@ class ZenohTransport(TopicTransport):
         self._sending = threading.RLock()
 
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        """Say which topics will be used, from the next ``open`` on.
+        """Declare the topics to use, from the next ``open`` on.
 
         Raises:
             ConfigurationError: A name is no topic, such as one with a wildcard.
@@ -102,12 +102,12 @@ class ZenohTransport(TopicTransport):
         self._subscribe |= set(subscribe)
 
     def open(self) -> None:
-        """Listen at the end points, or go to them and wait for the session.
+        """Listen at the end points, or connect to them and wait for the session.
 
         Raises:
             ConfigurationError: The end points cannot be used as they are.
             PortNotFoundError: Nothing listens there, or it is no Zenoh, or there is no such address here.
-            PortBusyError: Somebody else listens there.
+            PortBusyError: Another process listens there.
             TransportTimeoutError: The host does not answer.
         """
         if self._session is not None:
@@ -116,7 +116,7 @@ class ZenohTransport(TopicTransport):
         self._echoes = None if self._options.listen else Echoes()
         self._heard_ns = self._clock.now_ns()
         self._session = self._open_session()
-        # A process that dies of an exception must not stay behind, alive for its peers.
+        # A process that ends by an exception must not stay alive for its peers.
         atexit.register(self.close)
         try:
             self._declare_all(self._session)
@@ -125,7 +125,7 @@ class ZenohTransport(TopicTransport):
             raise
 
     def close(self) -> None:
-        """Close the session; what came and was not received is lost."""
+        """Close the session; messages that were not received are lost."""
         session, self._session = self._session, None
         with self._sending:
             self._publishers = {}
@@ -134,16 +134,16 @@ class ZenohTransport(TopicTransport):
         atexit.unregister(self.close)
         with contextlib.suppress(Exception):
             session.close()  # type: ignore[no-untyped-call]
-        # Their channels are closed now, so they end; one that hangs is a daemon and keeps nobody.
+        # Their channels are closed now, so they end; one that hangs is a daemon and blocks no exit.
         threads, self._threads = self._threads, []
         for thread in threads:
             thread.join(_JOIN_S)
 
     def reopen(self) -> None:
-        """Make a new session where the link is gone or silent, and the end point answers.
+        """Make a new session if the link is gone or silent, and the end point answers.
 
-        Zenoh tries by itself, too. But of a link over TLS whose cable was out for some seconds it never told
-        that it is gone, nor did it make a new one (measured: 24 s, with an interface of a namespace).
+        Zenoh tries by itself, too. But after a cable was out for some seconds, it neither reported a lost TLS
+        link nor made a new one (measured: 24 s, with an interface of a namespace).
 
         Raises:
             TransportError: The end points do not answer, or there is no session with them.
@@ -151,13 +151,13 @@ class ZenohTransport(TopicTransport):
         silent = self._clock.now_ns() - self._heard_ns > _SILENT_NS
         if self._session is not None and (self._options.listen or not (self._lost or silent)):
             return
-        # Only asked shortly: who repeats a command meanwhile must not wait for a host that is gone.
+        # A short check only: a caller that repeats a command must not wait for a host that is gone.
         zenoh_session.answering(zenoh_session.parse_endpoints(self.port), self._options, _REOPEN_PROBE_S)
         self.close()
         self.open()
 
     def send(self, message: Message) -> None:
-        """Put a message on the wire, or drop it where a peer takes no more.
+        """Put a message on the wire, or drop it if a peer takes no more.
 
         Raises:
             ConfigurationError: The topic was not declared for publishing.
@@ -195,12 +195,12 @@ class ZenohTransport(TopicTransport):
         return self.receive(timeout_s)
 
     def writers(self, topic: str) -> tuple[str, ...]:
-        """Return nothing: Zenoh does not tell who writes."""
+        """Return nothing: Zenoh does not report writers."""
         return ()
 
     @property
     def stream(self) -> int | None:
-        """Number of the stream of our messages, which a bridge knows us by; None where there is none."""
+        """Number of the stream of our messages, by which a bridge identifies us; None if there is none."""
         return None if self._echoes is None else self._echoes.stream
 
     def _open_session(self) -> zenoh.Session:
@@ -239,11 +239,11 @@ class ZenohTransport(TopicTransport):
 
         if not self._options.listen:
             events = session.info.declare_transport_events_listener(_ring(), history=True)
-            # The link may be gone again already, and then there is no history of it.
+            # The link may be gone again already, and then it has no history.
             self._lost = not session.info.transports()
             self._start(self._follow_links, "zenoh links", events, self._arrived)
         for topic in sorted(self._subscribe):
-            # Handlers, never callbacks: a callback has a thread that keeps the interpreter from ending.
+            # Handlers, never callbacks: a callback's thread prevents the interpreter's end.
             subscriber = session.declare_subscriber(topic, _ring(), allowed_origin=zenoh.Locality.REMOTE)
             self._start(self._read, f"zenoh {topic}", topic, subscriber, self._arrived)
         for topic in sorted(self._publish):
@@ -291,7 +291,7 @@ class ZenohTransport(TopicTransport):
                 links.discard(str(event.transport.zid))
             self._lost = not links
             if self._lost:
-                # Whoever waits shall hear it now.
+                # Wake a waiting reader.
                 arrived.put(None)
 
     def _opened(self) -> None:
@@ -312,7 +312,7 @@ def _ring() -> RingChannel[Any]:
 
 
 def _until_closed(receive: Callable[[], T]) -> Iterator[T]:
-    """Yield what comes until the session is closed."""
+    """Yield messages until the session is closed."""
     with contextlib.suppress(Exception):
         while True:
             yield receive()

@@ -220,7 +220,7 @@ def test_every_panel_names_recording_unit_and_lines() -> None:
     )
     text = Tags(html).text()
     assert "fit.csv, 0 to 2 s fitted; restarts every 0.2 s" in text
-    assert "000003.mcap held out: the search never saw it; restarts every 0.2 s" in text
+    assert "000003.mcap held out: not used in the fit; restarts every 0.2 s" in text
     assert "Held out: 000003.mcap; 2 s." in text
     assert text.index("real robot nominal model calibrated model") < text.index("fit.csv, 0 to 2 s")
     panels = html.split('<figure class="panel ')[1:]
@@ -437,7 +437,7 @@ def test_overlays_restart_as_often_as_held_out_predictions(
     drawn = gather(robot, found, [episodes[0], short], episodes[1:], window_s=1.0, threads=1).overlays
     assert [shown.window_s for shown in drawn] == pytest.approx([1.0, 1.0, 0.45], abs=0.06)
     text = Tags(render(ReportInputs(robot="r", result=found, overlays=drawn))).text()
-    assert text.count("fitted; restarts every 1 s") == 1 and "never saw it; restarts every 1 s" in text
+    assert text.count("fitted; restarts every 1 s") == 1 and "not used in the fit; restarts every 1 s" in text
 
 
 def test_recordings_are_called_by_their_files(

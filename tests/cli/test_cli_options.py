@@ -309,3 +309,20 @@ def test_every_help_page_has_an_example(name: str, capsys: pytest.CaptureFixture
     assert f"deal-hw {VERBS[name].example}" in " ".join(
         help_page(name, capsys).partition("options")[0].split()
     )
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("train --steps abc", "Error parsing --steps: 'abc' is no whole number"),
+        ("train --steps 1.5", "Error parsing --steps: '1.5' is no whole number"),
+        ("train --seed x", "Error parsing --seed: 'x' is no whole number"),
+        ("inspect e.mcap --at soon", "Error parsing --at: 'soon' is no number"),
+    ],
+)
+def test_a_wrong_number_is_one_error(line: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser's own rule adds a second one to an optional number, for the value None."""
+    with pytest.raises(SystemExit):
+        main(line.split())
+    said = capsys.readouterr().err
+    assert words in said and "NoneType" not in said and "Got errors" not in said

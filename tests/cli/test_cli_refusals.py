@@ -292,7 +292,9 @@ def test_a_folder_with_one_episode_stands_for_it(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     for folder in ("run", "run/dataset"):
-        refused(f"inspect {folder}", "there is no desktop to open a window on; use --web and a browser")
+        refused(
+            f"inspect {folder}", "so no window can open. Add --web (a browser on this machine), --save FILE"
+        )
 
 
 def test_a_policy_of_another_robot_is_refused_in_short(

@@ -65,6 +65,9 @@ def test_of_many_joints_the_widest_is_shown() -> None:
     facts = {"joint_names": ["a", "b", "c"], "position_units": ["rad"] * 3}
     assert _position_ranges(episode, facts) == "0.90 rad (b)"
     assert _position_ranges(dataclasses.replace(episode, excitation=None), facts) == ""
+    two = dataclasses.replace(episode, excitation={"position_range": [0.1, 0.9]})
+    assert _position_ranges(two, facts) == "0.10, 0.90 rad"
+    assert _position_ranges(two, {**facts, "position_units": ["m", "rad"]}) == "0.10 m, 0.90 rad"
 
 
 def test_info_as_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,10 +84,11 @@ def test_info_of_an_episode_shows_checks(
     dataset: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each check has its row, and the clocks theirs."""
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "80")
     assert data(InfoSettings(path=dataset / "episodes" / "000000.mcap")) == 0
     printed = capsys.readouterr().out
-    for words in ("clamped_by_us", "host minus device", "excitation: position_range"):
+    assert max(map(len, printed.splitlines())) <= 80
+    for words in ("clamped_by_us", "host minus device", "position_range"):
         assert words in printed
 
 

@@ -25,7 +25,9 @@ STEPS = 1_200
 """Enough for a few updates."""
 
 
-def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(tmp_path: Path) -> None:
+def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The policy lies in the run folder, fits the robot and names the distribution; so does the record."""
     space = k9_space()
     distribution = ParameterDistribution(
@@ -33,7 +35,13 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(tmp_path: Path)
     )
     file = tmp_path / "distribution.json"
     file.write_text(json.dumps(distribution.to_json() | {"verdict": "amber"}), encoding="utf-8")
-    train(Train(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True))
+    training = train(Train(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True))
+    assert training.status is not None and training.first_return is not None
+    now, first = training.status.mean_return, training.first_return
+    assert (
+        first < 0 and first != now and f"return: {now:.1f}, at first {first:.1f} (" in capsys.readouterr().out
+    )
+    assert f"{first:.4g}" in training.table()
     policy = OnnxPolicy(tmp_path / "policies" / "policy.onnx")
     policy.spec.check_fits(DESCRIPTION)
     assert policy.spec.trained_under == distribution.digest()
@@ -104,6 +112,7 @@ def test_a_go2_is_trained_stopped_and_resumed(
     assert list((policies / "policy_tensorboard").iterdir())
     policy = train(dataclasses.replace(config, resume=True)).policy
     assert [status.steps for status in seen] == [96, 192]
+    assert "return: " not in capsys.readouterr().out  # No episode has ended.
     whole = json.loads((policies / "policy.json").read_text(encoding="utf-8"))
     assert whole["resumed"] and whole["cpu_seconds"] > record["cpu_seconds"]
     tuned = dataclasses.replace(

@@ -165,6 +165,7 @@ REFUSED: list[tuple[str, str]] = [
         "collect cartpole --port p --truth-seed 1 --out r",
         "--truth-seed would have no effect: only with --simulated",
     ),
+    ("collect nosuch --out r", "unknown robot 'nosuch'; known: "),
     ("collect cartpole --out r", "no port is given: name the robot's port"),
     (
         "replay {made}/run/dataset/episodes/000000.mcap --port p",

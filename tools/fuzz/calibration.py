@@ -1,4 +1,4 @@
-"""Recordings of others, models, parameters, column maps, and what a calibration writes."""
+"""Inputs: foreign recordings, models, parameters, column maps, and the files of a calibration."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _signals() -> dict[str, Any]:
 
 
 def make_npz(folder: Path) -> list[bytes]:
-    """Return archives, compressed and not, with names and with other things in them."""
+    """Return archives, compressed and not, with names and with other content."""
     found = []
     for save in (np.savez, np.savez_compressed):
         buffer = io.BytesIO()
@@ -113,7 +113,7 @@ def make_npz(folder: Path) -> list[bytes]:
 
 
 def damage_npz(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
-    """Put an archive together anew whose headers lie: shapes, kinds and orders that are not there."""
+    """Rebuild an archive with wrong headers: false shapes, kinds and orders."""
     shape = rng.choice(
         ("(60,)", "(2**62,)", "(1<<60,)", "(4611686018427387904, 2)", "(-1,)", "(0,)", "()", "(1, " * 70)
     )
@@ -143,7 +143,7 @@ def make_csv(folder: Path) -> list[bytes]:
 
 
 def damage_cells(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
-    """Replace one to four cells, a header's among them."""
+    """Replace one to four cells, also of the header."""
     text = data.decode()
     mark = max(",;\t", key=text.splitlines()[0].count)
     rows = [line.split(mark) for line in text.splitlines()]
@@ -280,7 +280,7 @@ def make_result(folder: Path) -> list[bytes]:
 
 
 def make_distribution(folder: Path) -> list[bytes]:
-    """Return what is known about parameters."""
+    """Return a parameter distribution."""
     result = CalibrationResult.from_json(json.loads(make_result(folder)[0]))
     return [json.dumps(result.distribution().to_json()).encode()]
 
@@ -309,8 +309,8 @@ def damage_attributes(rng: random.Random, data: bytes, others: Sequence[bytes]) 
 
 
 def read_model(path: Path) -> None:
-    """Compile and step a model as the process that tries it does."""
-    # In this process, so that a hang or a crash is seen as such.
+    """Compile and step a model, as the product's trial process does."""
+    # In this process, so that a hang or a crash is detected.
     if problem := problem_of(str(path)):
         raise ConfigurationError(f"model {path} {problem}")
 

@@ -10,19 +10,19 @@ from pathlib import Path
 from deal_hw.errors import DealHwError
 
 Mutation = Callable[[random.Random, bytes, Sequence[bytes]], bytes]
-"""Returns a damaged copy of some bytes; the other good inputs are there to splice from."""
+"""Returns a damaged copy of some bytes; it may take parts of the other good inputs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileKind:
-    """A file that a user may give us.
+    """A file that a user may name.
 
     Attributes:
         make: Returns good files as bytes, given an empty folder to work in.
         read: Reads the file at a path as the product does.
-        name: What the file is called while it is read; may hold folders ("episodes/000000.mcap").
-        mutations: How it is damaged; one is drawn for each input.
-        refusals: What a reader may raise: an error of ours, in one line.
+        name: Name of the file while it is read; may contain folders ("episodes/000000.mcap").
+        mutations: Ways to damage it; one is drawn for each input.
+        refusals: Errors that a reader may raise: ours, in one line.
     """
 
     make: Callable[[Path], Sequence[bytes]]
@@ -39,8 +39,8 @@ class WireKind:
     Attributes:
         make: Returns good messages.
         read: Decodes the bytes as the product does.
-        mutations: How they are damaged; one is drawn for each input.
-        refusals: What a decoder may raise.
+        mutations: Ways to damage them; one is drawn for each input.
+        refusals: Errors that a decoder may raise.
     """
 
     make: Callable[[], Sequence[bytes]]

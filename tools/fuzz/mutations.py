@@ -19,7 +19,7 @@ def flip(rng: random.Random, data: bytearray, others: Sequence[bytes]) -> None:
 
 
 def overwrite(rng: random.Random, data: bytearray, others: Sequence[bytes]) -> None:
-    """Write an integer that readers trip over."""
+    """Write an integer at a limit of its type."""
     layout = rng.choice(("<B", "<H", "<I", "<Q"))
     size = struct.calcsize(layout)
     at = rng.randrange(len(data))
@@ -44,7 +44,7 @@ def delete(rng: random.Random, data: bytearray, others: Sequence[bytes]) -> None
 
 
 def duplicate(rng: random.Random, data: bytearray, others: Sequence[bytes]) -> None:
-    """Repeat a part, elsewhere or right behind itself."""
+    """Repeat a part, elsewhere or directly behind itself."""
     at, size = _part(rng, data)
     to = rng.choice((at + size, rng.randrange(len(data) + 1)))
     data[to:to] = data[at : at + size]
@@ -58,7 +58,7 @@ def insert(rng: random.Random, data: bytearray, others: Sequence[bytes]) -> None
 
 
 def splice(rng: random.Random, data: bytearray, others: Sequence[bytes]) -> None:
-    """Go on with the end of another input."""
+    """Continue with the end of another input."""
     other = rng.choice(others)
     data[rng.randrange(len(data)) :] = other[rng.randrange(len(other) + 1) :]
 
@@ -114,12 +114,12 @@ def damage_json(rng: random.Random, data: bytes, others: Sequence[bytes]) -> byt
     values = json.loads(data)
     for _ in range(rng.choice((1, 1, 2, 3))):
         values = damage_values(rng, values)
-    # A few times only: repeated a hundred times twice over, the input itself would have 2 GB.
+    # A few times only: a hundred repetitions of a hundred would make an input of 2 GB.
     return json.dumps(values).replace(f'"{_DEEP}"', "[" * 100_000 + "]" * 100_000, 20).encode()
 
 
 def damage_values(rng: random.Random, values: Any) -> Any:
-    """Return plain values of which one, anywhere inside, is another; the given ones are changed in place."""
+    """Replace one value anywhere inside plain values, in place, and return them."""
     holder, key = _somewhere(rng, values)
     if holder is None:
         return copy.deepcopy(rng.choice(_ODD_VALUES))
@@ -161,7 +161,7 @@ def _retyped(value: Any) -> Any:
 
 
 def mended(damage: Callable[..., bytes], mend: Callable[[bytes], bytes]) -> Callable[..., bytes]:
-    """Return a mutation whose result carries a right checksum, so that it gets past it."""
+    """Return a mutation whose result has a correct checksum, so that it passes the check."""
 
     def mutate(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
         return mend(damage(rng, data, others))

@@ -39,7 +39,7 @@ _EPISODE = "000001.mcap"
 
 
 def make_cycle(number: int, body: bool = False) -> CycleRecord:
-    """Return a cycle of a cart-pole; ``body`` adds what a robot with legs senses."""
+    """Return a cycle of a cart-pole; ``body`` adds the sensors of a robot with legs."""
     start_ns = 7_000_000_000_000 + number * _CYCLE_NS
 
     def values(size: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -112,7 +112,7 @@ def make_episodes(folder: Path) -> list[bytes]:
 
 @cache
 def _known_samples() -> frozenset[tuple[int, bytes]]:
-    """Return every message that the episodes above hold, over all channels."""
+    """Return every message in the episodes above, over all channels."""
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -126,7 +126,7 @@ def _known_samples() -> frozenset[tuple[int, bytes]]:
 
 
 def read_damaged(path: Path) -> None:
-    """Read, verify, repair, read; no sample may come out that did not go in."""
+    """Read, verify, repair, read; every sample read must have been recorded."""
     with contextlib.suppress(DatasetError):
         read_episode(path)
     _one_line(verify(path).describe())
@@ -145,7 +145,7 @@ def read_damaged(path: Path) -> None:
 
 
 def read_hostile(path: Path) -> None:
-    """Verify, repair, read; what is inside is anybody's."""
+    """Verify, repair, read; any content is allowed."""
     _one_line(verify(path).describe())
     _one_line(repair(path).describe())
     summarize(path, "episodes/000001.mcap")
@@ -169,7 +169,7 @@ def _one_line(text: str) -> None:
 
 
 def forge(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
-    """Change what is inside chunks and metadata, and mend checksums and lengths: a file made to harm."""
+    """Change the content of chunks and metadata, and correct checksums and lengths: a malicious file."""
     out = bytearray(data[:8])
     at, struck = 8, rng.randrange(8)
     while at + 9 <= len(data):
@@ -220,7 +220,7 @@ def make_indexes(folder: Path) -> list[bytes]:
 
 
 def _mend_digest(data: bytes) -> bytes:
-    """Return an index whose digest fits its description, where it can be told."""
+    """Return an index whose digest fits its description, if it can be computed."""
     with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
         values = json.loads(data)
         values["digest"] = digest_of(values["description"])
@@ -229,7 +229,7 @@ def _mend_digest(data: bytes) -> bytes:
 
 
 def read_index(path: Path) -> None:
-    """Open a dataset for reading and for collecting, and tell about it as `deal-hw data info` does."""
+    """Open a dataset for reading and for collecting, and describe it as `deal-hw data info` does."""
     from deal_hw.cli.data import InfoSettings, data
 
     with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), encoding="utf-8")):
@@ -248,7 +248,7 @@ def make_run(folder: Path) -> list[bytes]:
 
 
 def read_run(path: Path) -> None:
-    """Read a run's record and write it again, as a run that goes on does."""
+    """Read a run's record and write it again, as a continued run does."""
     json.dumps(RunFolder(path.parent).read(), ensure_ascii=False).encode()
 
 

@@ -1,4 +1,4 @@
-"""Runs inputs through a reader in a child process: a hang, a crash or a gigabyte costs that child alone."""
+"""Runs inputs through a reader in a child process, so that a hang or a crash ends only the child."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _HARD_BYTES = 6 << 30
 
 
 _PATIENCE = 12
-"""An input may take so many times its processor time by the clock: other programs run, too."""
+"""Limit of an input's wall-clock time over its processor time, because other programs run, too."""
 
 
 class _HangError(BaseException):
-    """The time of one input is up; no reader catches it."""
+    """The time limit of one input passed; no reader catches this."""
 
 
 def run(kind: Kind, count: int, seed: int, limit_s: float, limit_bytes: int) -> Counter[str]:
-    """Return how many inputs were read, refused, and failed how; input n depends on seed and n alone."""
+    """Return the number of inputs read, refused and failed; input n depends on seed and n only."""
     found: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         seeds = list(kind.make(_made(Path(folder) / "make")) if isinstance(kind, FileKind) else kind.make())
@@ -93,7 +93,7 @@ def _child(
         for number in numbers:
             _STEP.pack_into(shared, 0, number, read, refused)
             data = make_input(kind, seeds, seed, number)
-            # A hang inside C code never gets to the signal's handler: then the process ends.
+            # A hang inside C code never reaches the signal's handler, so the process is ended.
             faulthandler.dump_traceback_later(2 * _PATIENCE * limit_s, exit=True)
             outcome = _outcome(kind, data, Path(folder) / "read", limit_s)
             faulthandler.cancel_dump_traceback_later()
@@ -124,7 +124,7 @@ def _guard() -> None:
 def _forget_peak() -> int:
     """Return the memory in use, above which the peak is counted from now on [B].
 
-    What the parent left as garbage stays: collected here, it would make room that no input is seen to fill.
+    The parent's garbage is not collected, because an input could fill the freed memory without being noticed.
     """
     gc.freeze()
     with contextlib.suppress(OSError):
@@ -137,7 +137,7 @@ def _peak() -> int:
 
 
 def _outcome(kind: Kind, data: bytes, folder: Path, limit_s: float) -> str:
-    """Return "read", "refused", or in the first line what went wrong and below it the traceback."""
+    """Return "read", "refused", or the failure in the first line and its traceback below."""
     source: Path | bytes = data
     if isinstance(kind, FileKind):
         _clear(folder)
@@ -182,7 +182,7 @@ def _judged(message: str) -> str:
 
 
 def _clear(folder: Path) -> None:
-    """Remove what the last input left; few files, so plain calls are the quickest."""
+    """Remove the last input's files."""
     for path, folders, files in os.walk(folder, topdown=False):
         for name in files:
             os.unlink(os.path.join(path, name))

@@ -1,4 +1,4 @@
-"""What arrives from devices and from other processes."""
+"""Inputs: messages from devices and from other processes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MESSAGES = (ROBOT, STATE, COMMAND, CYCLE, EVENT, BODY, WIRE)
 
 
 def _serial_stream() -> list[bytes]:
-    """Return a stretch of what a cart-pole and its host send."""
+    """Return a part of the traffic of a cart-pole and its host."""
     frames = [
         serial.encode(message)
         for message in (
@@ -77,7 +77,7 @@ def _reframed(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes
 
 
 def _mend_words(image_of: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """Return what gives a Go2 message of any length the checksum that its bytes have."""
+    """Return a function that writes the correct checksum into a Go2 message of any length."""
 
     def mend(data: bytes) -> bytes:
         image = image_of(data)
@@ -116,7 +116,7 @@ def _read_response(data: bytes) -> None:
 
 
 def _odd_response(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
-    """Return a sound response whose data are not what they should be."""
+    """Return a valid response with wrong data."""
     text = damage_json(rng, b'{"form": "0", "name": "ai", "more": [1, {"a": 2}]}', others)
     return encode_response(Response(7, 1001, 0, text.decode()))
 
@@ -157,7 +157,7 @@ def _mend_record(data: bytes) -> bytes:
 
 
 def _messages() -> list[bytes]:
-    """Return one message of each type in a recording; the first byte says of which."""
+    """Return one message of each type in a recording; the first byte names the type."""
     values = np.linspace(0.0, 1.0, 3)
     bodies = (
         ROBOT.encode("{}", ("cart", "pole"), ("cart",)),

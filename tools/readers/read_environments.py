@@ -1,4 +1,4 @@
-"""Checks the registered tasks with the checkers of Gymnasium and stable-baselines3; a kept model goes on."""
+"""Checks the registered tasks with Gymnasium's and stable-baselines3's checkers; trains a kept model on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compares our standard messages with what Foxglove's SDK and mcap_ros2 know of them."""
+"""Compares our standard messages with the definitions in Foxglove's SDK and mcap_ros2."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def known_fields(kind: Any) -> dict[str, set[str]]:
 
 
 def said_fields(schema: Any) -> dict[str, set[str]]:
-    """Return the fields of Foxglove's messages as a schema in the file has them."""
+    """Return the fields of Foxglove's messages in a schema of the file."""
     first, *rest = schema.data.decode().split("=" * 80 + "\nMSG: ")
     parts = [f"{schema.name}\n{first}", *rest]
     split = (part.split("\n", 1) for part in parts if part.startswith("foxglove_msgs"))

@@ -1,4 +1,4 @@
-"""Loads a calibrated model with plain MuJoCo, steps it and reads what is marked in it."""
+"""Loads a calibrated model with plain MuJoCo, steps it and reads its marks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def main(path: Path) -> None:
-    """Step for a second; print latency and what has no value."""
+    """Step for a second; print latency and parameters without a value."""
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     for _ in range(round(1.0 / model.opt.timestep)):

@@ -45,6 +45,13 @@ class Channels:
     part: str = ""
     notes: tuple[str, ...] = ()
 
+    def listed(self) -> str:
+        """Return the names of the channels for a message, with the number of columns of an array."""
+        names = [
+            name if values.ndim == 1 else f"{name}[{values.shape[1]}]" for name, values in self.arrays.items()
+        ]
+        return ", ".join([*names[:24], *(["..."] if len(names) > 24 else [])]) or "none"
+
     def column(self, name: str) -> FloatArray:
         """Return one channel, (T,).
 

@@ -63,9 +63,9 @@ def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> Co
         joints: Names of the model's joints; None: the file's names.
 
     Raises:
-        DatasetError: No time or no joint can be found; the message shows how to write a column map.
+        DatasetError: No time or no joint can be found; the message names the channels.
     """
-    time = _guess_time(channels, channels.arrays, ("",))
+    time = guess_time(channels)
     if time is None:
         raise unguessed(channels, "which channel is the time")
     guesses = [_read_name(name, joints or ()) for name in channels.arrays]
@@ -277,6 +277,11 @@ def _joint(name: str, roles: dict[str, _Guess]) -> JointColumns:
     )
 
 
+def guess_time(channels: Channels) -> TimeColumn | None:
+    """Return the channel of time; None if no name is known."""
+    return _guess_time(channels, channels.arrays, ("",))
+
+
 def _guess_time(channels: Channels, names: Iterable[str], prefixes: tuple[str, ...]) -> TimeColumn | None:
     """Return the time channel under one of the prefixes, with its unit by its name, else by its steps."""
     by_lower = {name.lower(): name for name in names if channels.arrays[name].ndim == 1}
@@ -328,11 +333,7 @@ def is_target(name: str) -> bool:
 
 def unguessed(channels: Channels, what: str) -> DatasetError:
     """Return the error that names what cannot be guessed, and the channels."""
-    names = [
-        name if values.ndim == 1 else f"{name}[{values.shape[1]}]" for name, values in channels.arrays.items()
-    ]
-    shown = ", ".join(names[:24]) + (", ..." if len(names) > 24 else "")
     return DatasetError(
-        f"{channels.path}: cannot tell {what}; write it into a column map (page 'Use your recordings' of the "
-        f"documentation). Channels: {shown or 'none'}"
+        f"{channels.path}: cannot tell {what} (channels: {channels.listed()}); write it into a column map, "
+        "and add --columns columns.yaml"
     )

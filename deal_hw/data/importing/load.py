@@ -18,6 +18,7 @@ from deal_hw.data.importing.guess_topics import guess_topics
 from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
+from deal_hw.data.importing.starting_map import starting_map
 from deal_hw.data.importing.table import Table, build_table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
@@ -106,7 +107,7 @@ def tables_of(
     """Interpret channels, as :func:`load_tables` does for a file."""
     tables = []
     for number, channels in enumerate(recordings):
-        used = columns or guess_topics(channels, joints) or guess_columns(channels, joints)
+        used = columns or _guess(channels, joints, say)
         if say is not None:
             _tell(say, channels, used, joints, columns is None and number == 0)
         tables.append(build_table(channels, used, joints))
@@ -183,6 +184,24 @@ def is_episode(path: Path) -> bool:
     return False
 
 
+def _guess(channels: Channels, joints: Sequence[str] | None, say: Say | None) -> ColumnMap:
+    topics = guess_topics(channels, joints)
+    if topics is not None:
+        return topics
+    try:
+        return guess_columns(channels, joints)
+    except DatasetError:
+        if say is not None:
+            _say_map(say, channels, joints, None)
+        raise
+
+
+def _say_map(say: Say, channels: Channels, joints: Sequence[str] | None, guessed: ColumnMap | None) -> None:
+    say(f"{channels.path.name}: a column map to start from; save it as columns.yaml, and replace COLUMN:")
+    for line in starting_map(channels, joints, guessed):
+        say(f"  {line}")
+
+
 def _tell(
     say: Say, channels: Channels, columns: ColumnMap, joints: Sequence[str] | None, guessed: bool
 ) -> None:
@@ -197,4 +216,5 @@ def _tell(
             say("  no commanded positions found")
         missing = [joint for joint in joints or () if joint not in {known.name for known in columns.joints}]
         if missing:
-            say(f"  not in the file: {', '.join(missing)}")
+            say(f"  not in the file: {', '.join(missing)}; its channels: {channels.listed()}")
+            _say_map(say, channels, joints, columns)

@@ -13,6 +13,7 @@ from deal_hw.control.safety import Safety
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.record import CycleRecord
+from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.version import __version__
@@ -82,6 +83,7 @@ def require_driver(robot: str, port: str) -> None:
     """Check that a robot has a driver and a port.
 
     Raises:
+        UnknownNameError: There is no such robot.
         ConfigurationError: It is a user's robot, without a driver, or no port was given.
     """
     if is_user_robot(robot):
@@ -89,6 +91,8 @@ def require_driver(robot: str, port: str) -> None:
             f"{robot}: deal-hw has no driver for this robot; record its simulation with --simulated, or "
             "import recordings of it: deal-hw data import"
         )
+    # An unknown name is reported before a missing port.
+    driver_description(robot)
     if not port:
         raise ConfigurationError("no port is given: name the robot's port, such as --port /dev/ttyUSB0")
 

@@ -18,7 +18,7 @@ RAD_S_PER_COUNT: Final = 0.229 * 2 * math.pi / 60
 """Unit of velocities: 0.229 rev/min."""
 WATCHDOG_UNIT_S: Final = 0.02
 WATCHDOG_TRIPPED: Final = 0xFF
-"""What Bus Watchdog reads once it has stopped the servo: -1."""
+"""Value of Bus Watchdog after it has stopped the servo: -1."""
 TICK_PERIOD_MS: Final = 32768
 """Realtime Tick counts milliseconds from 0 and starts again here."""
 RETURN_DELAY_UNIT_S: Final = 2e-6
@@ -81,11 +81,11 @@ NEEDED: Final = (
     PRESENT_VELOCITY,
     PRESENT_POSITION,
 )
-"""A model without one of these, at these addresses, is none that the driver can use."""
+"""Registers that the driver needs, at these addresses; a model without one of them is refused."""
 
 
 class OperatingMode(enum.IntEnum):
-    """Values of Operating Mode that turn more than once round."""
+    """Values of Operating Mode with more than one turn."""
 
     EXTENDED_POSITION = 4
     CURRENT_BASED_POSITION = 5
@@ -97,11 +97,11 @@ BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000
 HARDWARE_ERRORS: Final = {
     0: ("input voltage out of its limits", "check the supply under load; XL330: 3.7 to 6.0 V"),
     2: ("overheated", "let it cool, then look for friction, a jammed belt or too high a load"),
-    3: ("motor encoder fault", "switch it off and on; if it comes back the servo is broken"),
+    3: ("motor encoder fault", "switch it off and on; if the error returns, the servo is broken"),
     4: ("electrical shock, or too little power for the motor", "check supply and wires"),
     5: ("overload", "look for a jammed cart or belt; lower the effort limit"),
 }
-"""Bits of Hardware Error Status: what each means, and what to do (e-Manual)."""
+"""Bits of Hardware Error Status: meaning and remedy of each (e-Manual)."""
 
 
 def explain_hardware_error(value: int) -> str:
@@ -120,7 +120,7 @@ _BLOCK: Final = struct.Struct("<BB4xB9xHHH12xBxhh4xIIiHxBxxhii")
 class Block:
     """Torque Enable (64) to Present Position (135), read from a servo with every sample.
 
-    What a servo was told is in it, too: a lost command or a servo that restarted shows with the next sample.
+    It includes the servo's present goals. So the next sample shows a lost command or a restarted servo.
     """
 
     torque_enable: int

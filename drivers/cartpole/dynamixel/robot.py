@@ -1,4 +1,4 @@
-"""The cart-pole on two Dynamixel servos: the belt's follows targets, the pole's is an encoder."""
+"""The cart-pole on two Dynamixel servos: the belt servo follows targets, the pole servo is an encoder."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from deal_hw.types import JointCommand, RobotState, Status
 
 _QUEUE = 4096
 _MISSES = 3
-"""Samples in a row without answer before the servos are asked one by one, and before one is absent."""
+"""Samples in a row without answer before the servos are asked one by one, and before one counts as absent."""
 _MARGIN = 1.25
-"""What is kept free for an answer, over the usual time that one takes."""
+"""Time reserved for an answer, as a multiple of its usual time."""
 _SLACK_NS = 500_000
-"""The last question of a control period goes out so much earlier: periods begin a little late at times."""
+"""The last request of a control period is sent this much earlier, because periods may begin late."""
 _COMMANDS = 64
 _FIRST_ROUND_TRIP_NS = 2_000_000
 _CLEAR_NS = 500_000_000
@@ -53,7 +53,7 @@ def _hardware_error(servo: int, block: Block) -> str:
 
 
 class _Sent(NamedTuple):
-    """A command that went out; when the belt servo got it by its own clock, -1 where it did not say [ns]."""
+    """A sent command, and its reception by the belt servo's clock [ns]; -1 if the servo did not report it."""
 
     sequence: int
     sent_ns: int
@@ -64,18 +64,18 @@ class _Sent(NamedTuple):
 class DynamixelCartpole(Robot):
     """A cart-pole on two X-series servos.
 
-    Servos say nothing unless asked, so :meth:`read_state` asks them, ``state_rate_hz`` times a second, the
-    last time so that the answer is there when the caller's time is over: question, answer and command do not
-    meet on the half-duplex wire, and the policy gets a fresh state. A state needs both servos. What the belt
-    servo was told comes back with every sample: a command counts as in force once the servo shows it. When it
-    got it is asked for with the command itself: this computer's own times are off by what its scheduler and
-    the adapter do, which a calibration takes for another motion.
+    Servos send only answers, so :meth:`read_state` requests a state ``state_rate_hz`` times a second. The
+    last request is timed so that its answer arrives when the caller's time is over. So request, answer and
+    command do not collide on the half-duplex wire, and the policy gets a fresh state. A state needs both
+    servos. Every sample holds the belt servo's goals: a command counts as in force once the servo shows it.
+    The command's message also requests the servo's clock. This computer's own times have errors of scheduler
+    and adapter, which a calibration would take for motion.
 
-    There are two watchdogs: the belt servo's own (Bus Watchdog) stops it when this computer falls silent, and
-    the driver switches the torque off when states are read but commands stay away.
+    There are two watchdogs. The belt servo's own (Bus Watchdog) stops it when this computer falls silent. The
+    driver switches the torque off when states are read but no commands are sent.
 
     Attributes:
-        info: What was found on the bus; None before ``connect``.
+        info: The servos found on the bus; None before ``connect``.
 
     Args:
         transport: A byte stream at the servos' baud rate.
@@ -126,7 +126,7 @@ class DynamixelCartpole(Robot):
         self._lost_commands, self._errors_before = 0, self._bus.errors
 
     def connect(self) -> None:
-        """Open the transport, find both servos, check how they are set up, and switch their torque off."""
+        """Open the transport, find both servos, check their settings, and switch their torque off."""
         if self.info is not None:
             return
         if not self._transport.can_send:
@@ -158,7 +158,7 @@ class DynamixelCartpole(Robot):
     def home(self, timeout_s: float) -> None:
         """Find the middle of the rail, move the cart there, then wait until a hand has set the pole upright.
 
-        The pole servo's LED is lit while the hand is waited for. The torque is off afterwards.
+        The pole servo's LED is lit while this waits for the hand. The torque is off afterwards.
 
         Raises:
             TransportTimeoutError: The pole was not set, or the servos fell silent.
@@ -177,7 +177,7 @@ class DynamixelCartpole(Robot):
         self._homed = True
 
     def arm(self, timeout_s: float) -> None:
-        """Switch the belt servo's torque on, without gains until the first command; watchdogs run from now.
+        """Switch the belt servo's torque on, with zero gains until the first command; the watchdogs start.
 
         Raises:
             SafetyError: It was never homed, or a servo reports an error.
@@ -203,7 +203,7 @@ class DynamixelCartpole(Robot):
         return max(0, deadline_ns - self._clock.now_ns()) / 1e9
 
     def _clear_faults(self) -> None:
-        """Begin anew after a fault, where the servos report none now."""
+        """Clear a fault if the servos report none now."""
         deadline_ns = self._clock.now_ns() + _CLEAR_NS
         for servo, block in zip(self._servos, self.servos.read(deadline_ns), strict=True):
             if block.hardware_error:
@@ -214,10 +214,10 @@ class DynamixelCartpole(Robot):
         self._grid.begin()
 
     def read_state(self, timeout_s: float) -> RobotState:
-        """Return the next state; ask for it where one is due and the answer fits the time.
+        """Return the next state; request it if one is due and the answer fits the time.
 
         Args:
-            timeout_s: How long to wait [s]; 0 takes what has come and asks nothing.
+            timeout_s: Longest wait [s]; 0 takes received answers and requests nothing.
         """
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         if self._sent and not self._anchored and timeout_s > 0:
@@ -241,7 +241,7 @@ class DynamixelCartpole(Robot):
         return self._states.popleft()
 
     def _anchor(self, deadline_ns: int) -> None:
-        """Lay the questions of a run so that the last of each control period is answered in time."""
+        """Time the requests so that the last one of each control period is answered in time."""
         self._anchored = True
         self._needed_ns = self._round_trip_ns
         left_ns = deadline_ns - self._needed_ns - _SLACK_NS - self._clock.now_ns()
@@ -251,7 +251,7 @@ class DynamixelCartpole(Robot):
     def _ask(self) -> None:
         now_ns = self._clock.now_ns()
         if self._armed and now_ns - self._alive_ns > round(self.watchdog_s * 1e9):
-            # Our own questions keep the servo's watchdog quiet: who only reads states must not keep it going.
+            # Our own requests feed the servo's watchdog, so this check stops a caller that only reads states.
             self.passive()
             self._watchdog = True
         self._asked = self._servos
@@ -263,7 +263,7 @@ class DynamixelCartpole(Robot):
         self._next_ns += (1 + late) * self._period_ns
 
     def _take_stamp(self, deadline_ns: int) -> None:
-        """Take the belt servo's clock at its newest command."""
+        """Receive the belt servo's clock at its newest command."""
         try:
             tick_ms = self.servos.take_tick(deadline_ns)
         except (TransportTimeoutError, FrameError):
@@ -273,7 +273,7 @@ class DynamixelCartpole(Robot):
             return
         self._stamping, sent = False, self._sent[-1]
         time_ms = self._ticks[self._servos[0]].read(tick_ms, sent.sent_ns)
-        # Ticks are whole milliseconds: it came within this one.
+        # Ticks are whole milliseconds: the command arrived within this one.
         self._sent[-1] = sent._replace(received_ns=time_ms * 1_000_000 + 500_000)
 
     def _take(self, deadline_ns: int) -> None:
@@ -299,7 +299,7 @@ class DynamixelCartpole(Robot):
         if len(asked) == 2:
             self._pair_misses += 1
             if self._pair_misses == _MISSES:
-                # Until each has answered alone, none is known to be there.
+                # Until each has answered alone, neither is known to be present.
                 self._misses = dict.fromkeys(self._servos, 1)
                 self._turns = dict.fromkeys(self._servos, 0)
             return
@@ -327,7 +327,7 @@ class DynamixelCartpole(Robot):
         cart_m_s = cart.present_velocity * s.metres_s_per_count * s.cart_direction
         cart_m = (cart.present_position - self._zero) * s.metres_per_pulse + cart_m_s * shift_ms * 1e-3
         pole = blocks.get(self._servos[1])
-        # Only a robot that was made passive gets here without its pole: what counts then is the torque.
+        # Only a passive robot gets here without its pole servo: then only the torque matters.
         pole_rad = pole_rad_s = math.nan
         if pole is not None:
             pole_rad_s = pole.present_velocity * RAD_S_PER_COUNT * s.pole_direction
@@ -351,7 +351,7 @@ class DynamixelCartpole(Robot):
         )
 
     def _judge(self, blocks: Mapping[int, Block]) -> None:
-        """Latch what a servo reports or did."""
+        """Latch a servo's reported error, restart or lost torque."""
         for servo, block in blocks.items():
             if block.hardware_error:
                 self._latch(_hardware_error(servo, block))
@@ -371,7 +371,7 @@ class DynamixelCartpole(Robot):
         self._latch(fault)
 
     def _follow(self, cart: Block, sampled_ns: int, device_ns: int) -> None:
-        """Find the command that the belt servo follows, and when it got it on its own clock."""
+        """Find the command that the belt servo follows, and its reception time on the servo's clock."""
         goal = self.settings.read_goal(cart)
         asked = [sent for sent in self._sent if sent.sent_ns <= self._asked_ns]
         if not asked:
@@ -387,7 +387,7 @@ class DynamixelCartpole(Robot):
         if received_ns < 0:
             received_ns = min(sampled_ns - (self._asked_ns - found.sent_ns), device_ns)
         if received_ns > device_ns:
-            # The sample was moved back to its point on the grid, where the command was not there yet.
+            # The sample was moved back to its point on the grid, before the command arrived.
             return
         self._in_force = (found.sequence, received_ns)
         while self._sent[0] is not found:
@@ -411,7 +411,7 @@ class DynamixelCartpole(Robot):
         return status
 
     def send_command(self, command: JointCommand) -> JointCommand:
-        """Send a position target; velocity target and feed-forward effort are not in the registers.
+        """Send a position target; no register takes a velocity target or a feed-forward effort.
 
         Raises:
             SafetyError: A value is not finite.
@@ -427,7 +427,7 @@ class DynamixelCartpole(Robot):
     def passive(self) -> None:
         """Switch the torque of both servos off; sent once, never waits.
 
-        States that were received before are forgotten, and so is an answer that is still under way.
+        States received before are discarded, and so is an answer that is still expected.
         """
         self._states.clear()
         self._armed, self._stopped = False, True
@@ -438,7 +438,7 @@ class DynamixelCartpole(Robot):
 
     @property
     def fault(self) -> str:
-        """What a servo reported or did that forbids going on; "" for nothing. Latched until armed again."""
+        """A servo's fault that forbids to continue; "" for none. Latched until armed again."""
         return self._fault
 
     @property
@@ -448,7 +448,7 @@ class DynamixelCartpole(Robot):
 
     @property
     def transport_errors(self) -> int:
-        """Answers that were corrupt or stayed away, and commands that the servo did not show, so far."""
+        """Number of corrupt or missing answers, and of commands that the servo did not show."""
         return self._bus.errors - self._errors_before + self._lost_commands
 
     def fileno(self) -> int:

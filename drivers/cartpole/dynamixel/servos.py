@@ -1,4 +1,4 @@
-"""The two servos as the driver uses them: both blocks of registers read at once, goals and torque written."""
+"""Reads the register blocks of both servos in one request, and writes goals and torque."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.errors import FrameError, TransportTimeoutError
 
 WATCHDOG_S = 0.2
-"""The belt servo stops itself when it hears nothing for this long [s]."""
+"""The belt servo stops itself if it receives nothing for this long [s]."""
 _WATCHDOG = round(WATCHDOG_S / WATCHDOG_UNIT_S)
 
 
@@ -41,8 +41,8 @@ class Servos:
 
     Args:
         bus: The bus.
-        clock: For the waiting.
-        settings: Who is who.
+        clock: For waiting.
+        settings: Ids and modes of the servos.
     """
 
     def __init__(self, bus: Bus, clock: Clock, settings: DynamixelSettings) -> None:
@@ -56,19 +56,19 @@ class Servos:
         return self._bus.stamp_ns
 
     def ask(self, servos: Sequence[int]) -> int:
-        """Ask for the blocks of some servos; return when [ns]."""
+        """Request the blocks of some servos; return the time of the request [ns]."""
         return self._bus.ask(servos, BLOCK_ADDRESS, BLOCK_BYTES, fast=self.fast and len(servos) > 1)
 
     def take(self, deadline_ns: int) -> dict[int, Block] | None:
-        """Return the blocks that were asked for, by id; as :meth:`Bus.take`."""
+        """Return the requested blocks, by id; as :meth:`Bus.take`."""
         found = self._bus.take(deadline_ns)
         return None if found is None else {servo: Block.unpack(data) for servo, data in found.items()}
 
     def read(self, deadline_ns: int) -> tuple[Block, Block]:
-        """Return the blocks of belt and pole servo, asked until they come.
+        """Return the blocks of belt and pole servo; repeat the request until they arrive.
 
         Raises:
-            TransportTimeoutError: They did not come until the deadline.
+            TransportTimeoutError: They did not arrive before the deadline.
         """
         pair = (self._settings.cart_id, self._settings.pole_id)
         while True:
@@ -85,20 +85,20 @@ class Servos:
                 raise TransportTimeoutError("cartpole: the servos' answer did not come in time")
 
     def take_tick(self, deadline_ns: int) -> int | None:
-        """Return the belt servo's clock when it got a goal [ms]; as :meth:`Bus.take`."""
+        """Return the belt servo's clock at the reception of a goal [ms]; as :meth:`Bus.take`."""
         found = self._bus.take(deadline_ns)
         return None if found is None else int.from_bytes(found[self._settings.cart_id], "little")
 
     def send(
         self, goal: Goal, before: Goal | None = None, *, stamped: bool = False, behind: bool = False
     ) -> int:
-        """Write a goal, of gains and effort limit what differs from the goal before; return when [ns].
+        """Write a goal, with changed gains and effort limit only; return the time of sending [ns].
 
         Args:
-            goal: What the belt servo gets.
-            before: What it has.
-            stamped: Ask in the same message for the servo's clock; :meth:`take_tick` has the answer.
-            behind: That answer comes after one that is still under way.
+            goal: The new goal of the belt servo.
+            before: Its present goal.
+            stamped: Request the servo's clock in the same message; :meth:`take_tick` returns the answer.
+            behind: That answer comes after another expected one.
         """
         cart = self._settings.cart_id
         writes = []
@@ -117,7 +117,7 @@ class Servos:
         """Give the belt servo a goal, then torque, with its watchdog running.
 
         Raises:
-            TransportTimeoutError: It does not show them until the deadline.
+            TransportTimeoutError: It does not show them before the deadline.
             ProtocolError: It refuses.
         """
         cart = self._settings.cart_id
@@ -151,10 +151,10 @@ class Servos:
 
 
 class PoleAngle:
-    """Counts the pole's turns: the servo's own count may begin anew.
+    """Counts the pole's turns, because the servo's own count may restart.
 
     Args:
-        settings: Where upright is.
+        settings: The pole servo's zero and sign.
     """
 
     def __init__(self, settings: DynamixelSettings) -> None:

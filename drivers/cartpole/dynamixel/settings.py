@@ -1,4 +1,4 @@
-"""How the servos are wired and geared, and what their registers mean in SI units."""
+"""Wiring and gearing of the servos, and the SI units of their registers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_CURRENT = 32767
 
 
 class Goal(NamedTuple):
-    """What one command writes into the belt servo's registers."""
+    """The belt servo's registers for one command."""
 
     d_gain: int
     p_gain: int
@@ -39,9 +39,9 @@ class DynamixelSettings:
     """Wiring and gearing of the two servos.
 
     The three factors of gains and effort are nominal: the e-Manual gives the gains' divisors (128 and 16),
-    not the unit behind them. Here they follow from 1 mA an output unit, a 1 ms control period, and an
-    XL330-M077 at 5 V (0.215 N·m at 1.47 A) on a pulley of 0.16 m a revolution. The true ones are what
-    ``calibrate`` finds.
+    not the unit behind them. Here they follow from 1 mA for an output unit and a 1 ms control period.
+    The servo is an XL330-M077 at 5 V (0.215 N·m at 1.47 A), the pulley has 0.16 m for a revolution.
+    ``calibrate`` finds the true factors.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
@@ -51,26 +51,25 @@ class DynamixelSettings:
     pole_id: int = 2
     """Id of the servo that reads the pole; its torque stays off."""
     baud_rate: int = 1_000_000
-    """Bits per second that both servos are set to."""
+    """Baud rate of both servos [bit/s]."""
     mode: Literal["current", "extended"] = "current"
     """Operating mode of the belt servo: current-based position (5) or, for servos without a current sensor,
-    extended position (4), where the effort limit is one of PWM."""
+    extended position (4), where the effort limit is a PWM limit."""
     metres_per_revolution: float = 0.16
-    """Way of the belt in one revolution of the pulley: teeth times pitch [m]; 80 teeth GT2."""
+    """Travel of the belt in one revolution of the pulley: teeth times pitch [m]; default: 80 teeth of GT2."""
     cart_direction: Literal[1, -1] = 1
     """1: a growing position of the belt servo moves the cart towards +x; -1: towards -x."""
     pole_direction: Literal[1, -1] = 1
     """1: a growing position of the pole servo leans the pole towards +x; -1: towards -x."""
     pole_zero: int = 2048
-    """Position that the pole servo reads while the pole is upright, 0 to 4095."""
+    """Reading of the pole servo while the pole is upright, 0 to 4095."""
     cart_zero: int | None = None
-    """Position that the belt servo reads, within a revolution, while the cart is in the middle; the cart is
-    then put within half a revolution of it before homing. None: homing finds both end stops and takes the
-    middle."""
+    """Reading of the belt servo, within a revolution, while the cart is in the middle. Put the cart within
+    half a revolution of it before homing. None: homing finds both end stops and takes the middle."""
     rail_m: float = 0.8
-    """Way of the cart from stop to stop [m]."""
+    """Travel of the cart from stop to stop [m]."""
     rail_tolerance_m: float = 0.02
-    """How far the way that homing finds may differ from that [m]."""
+    """Largest difference between that and the travel that homing finds [m]."""
     homing_speed_m_s: float = 0.4
     """Speed of the cart while homing [m/s]."""
     homing_effort_n: float = 4.0
@@ -80,7 +79,7 @@ class DynamixelSettings:
     upright_rad: float = 0.1
     """The pole counts as upright within this angle [rad]."""
     still_s: float = 0.3
-    """The hand has set the pole once it was upright and still for this long [s]."""
+    """Homing ends once the pole was upright and still for this long [s]."""
     stiffness_per_gain: float = 1.148
     """Stiffness of one unit of Position P Gain [N/m]: 1/128 mA a pulse, 25600 pulses/m, 0.00574 N/mA."""
     damping_per_gain: float = 0.00918
@@ -91,8 +90,8 @@ class DynamixelSettings:
     effort_per_pwm: float = 0.00954
     """Effort of one unit of Goal PWM at standstill [N]; for the mode "extended"."""
     answer_s: float = 0.003
-    """What an answer may take beyond its bytes' time on the wire [s]: USB, the adapter, return delay. A servo
-    that is absent costs this much a sample, not the SDK's 34 ms."""
+    """Longest delay of an answer beyond its bytes' time on the wire [s]: USB, adapter, return delay. An
+    absent servo costs this time for each sample; the SDK waits 34 ms."""
 
     def __post_init__(self) -> None:
         for name in ("cart_id", "pole_id"):
@@ -129,7 +128,7 @@ class DynamixelSettings:
 
     @property
     def operating_mode(self) -> OperatingMode:
-        """What Operating Mode of the belt servo must be."""
+        """Required Operating Mode of the belt servo."""
         return (
             OperatingMode.CURRENT_BASED_POSITION
             if self.mode == "current"
@@ -138,7 +137,7 @@ class DynamixelSettings:
 
     @property
     def metres_per_pulse(self) -> float:
-        """Way of the belt in one pulse, negative where the servo is mounted the other way round [m]."""
+        """Travel of the belt in one pulse [m]; negative if the servo is mounted the other way round."""
         return self.cart_direction * self.metres_per_revolution / PULSES
 
     @property
@@ -152,17 +151,17 @@ class DynamixelSettings:
         return RAD_S_PER_COUNT * self.metres_per_revolution / (2 * math.pi)
 
     def to_goal(self, command: JointCommand, zero: int, most_effort: int = _MOST_CURRENT) -> Goal:
-        """Round a command to the registers; what exceeds one is clipped to it.
+        """Round a command to the registers, and clip it to their ranges.
 
         Args:
             command: The command.
-            zero: Position that the belt servo reads in the middle of the rail.
+            zero: Reading of the belt servo in the middle of the rail.
             most_effort: The servo's own Current Limit or PWM Limit.
 
         Raises:
             SafetyError: A value is not finite.
         """
-        # A profile velocity of 0 means no limit at all: the slowest that is one is 1.
+        # A profile velocity of 0 means no limit: the slowest limit is 1.
         return Goal(
             _integer(command.damping, self.damping_per_gain, 0, _MOST_GAIN, "damping"),
             _integer(command.stiffness, self.stiffness_per_gain, 0, _MOST_GAIN, "stiffness"),
@@ -179,7 +178,7 @@ class DynamixelSettings:
         )
 
     def from_goal(self, goal: Goal, zero: int) -> JointCommand:
-        """Return the command that the registers stand for; what they do not carry is 0."""
+        """Return the command that the registers mean; quantities without a register are 0."""
         return JointCommand(
             position_target=np.array([(goal.position - zero) * self.metres_per_pulse]),
             velocity_target=np.zeros(1),
@@ -191,7 +190,7 @@ class DynamixelSettings:
         )
 
     def read_goal(self, block: Block) -> Goal:
-        """Return what the belt servo says it was told."""
+        """Return the goals that the belt servo reports."""
         effort = block.goal_current if self.mode == "current" else block.goal_pwm
         return Goal(block.d_gain, block.p_gain, effort, block.profile_velocity, block.goal_position)
 

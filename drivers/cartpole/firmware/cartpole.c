@@ -1,7 +1,7 @@
 #include "cartpole.h"
 
 #define TICKS_PER_STATE (CARTPOLE_CONTROL_HZ / CARTPOLE_STATE_HZ)
-#define MOST_AGE_TICKS 4294968UL /* Above that the age in us exceeds its field. */
+#define MOST_AGE_TICKS 4294968UL /* A larger age in us exceeds its field. */
 
 static uint8_t *put(uint8_t *at, uint32_t value, uint8_t bytes)
 {
@@ -184,7 +184,7 @@ uint8_t cartpole_report(cartpole *device, const cartpole_reading *reading, uint8
 {
     uint8_t payload[41], status = 0, *at = payload;
     uint64_t device_us = device->device_us - 1000000UL / CARTPOLE_CONTROL_HZ;
-    uint32_t age = device->command_age - 1; /* Counted on by the tick that is reported. */
+    uint32_t age = device->command_age - 1; /* The reported tick has already incremented it. */
     bool clamped;
     int16_t effort_mn = cartpole_servo_estimate(&device->servo, reading, &clamped);
     if (device->mode == CARTPOLE_ARMED) {

@@ -1,8 +1,8 @@
-/* Firmware of the cart-pole, the part that every chip shares: C99, integers only, no heap, no library calls.
+/* Firmware of the cart-pole, the part that all chips share: C99, integers only, no heap, no library calls.
  *
- * docs/reference/protocol-cartpole-serial.md is what it speaks, docs/how-to/firmware.md says how it is used. A port calls, every
- * millisecond: cartpole_receive() for each byte that came, cartpole_control(), and cartpole_report() where that
- * says so. Everything is in one struct, so that a host may run several.
+ * Protocol: docs/reference/protocol-cartpole-serial.md. Use: docs/how-to/firmware.md. Every millisecond a port calls
+ * cartpole_receive() for each received byte, cartpole_control(), and, if that returns true, cartpole_report(). All
+ * state is in one struct, so that a host may run several.
  */
 #ifndef CARTPOLE_H
 #define CARTPOLE_H
@@ -55,8 +55,8 @@ enum cartpole_status {
     CARTPOLE_STATUS_FAULT = 128
 };
 
-/* What one cart-pole is; kept in EEPROM. Trims are factors times CARTPOLE_ONE, from what is commanded to what the
- * motor must be told so that it really happens. A delay makes the device late on purpose, for tests. */
+/* Settings of one cart-pole, in EEPROM. Trims are factors times CARTPOLE_ONE, from commanded gains to the motor's
+ * input that realises them. A delay makes the device late, for tests. */
 typedef struct {
     uint32_t stiffness_trim, damping_trim, effort_trim, speed_trim;
     uint32_t unique_id;
@@ -69,7 +69,7 @@ typedef struct {
     int32_t velocity_um_s;
 } cartpole_motor;
 
-/* What a state frame says, the set-point of that moment, and what is wrong now. */
+/* Values of a state frame, the set-point of that moment, and present faults. */
 typedef struct {
     int32_t cart_um, cart_um_s, pole_urad, pole_urad_s;
     int32_t setpoint_nm;
@@ -96,14 +96,14 @@ typedef struct {
 
 typedef struct {
     uint8_t block[CARTPOLE_MAX_BLOCK];
-    uint8_t length; /* CARTPOLE_MAX_BLOCK + 1: too long, garbage up to the next delimiter. */
+    uint8_t length; /* CARTPOLE_MAX_BLOCK + 1: too long, invalid up to the next delimiter. */
     bool synchronised;
     uint32_t errors;
 } cartpole_decoder;
 
 typedef struct {
     cartpole_settings settings;
-    uint16_t (*draw_delay)(void); /* Replaces the settings' delay where it is not null. */
+    uint16_t (*draw_delay)(void); /* Replaces the settings' delay if it is not null. */
     cartpole_decoder decoder;
     cartpole_servo servo;
     cartpole_target queue[CARTPOLE_QUEUE];
@@ -135,7 +135,7 @@ int32_t cartpole_millinewton(int64_t force_pn);
 
 /* cartpole.c: messages, modes, watchdog. */
 void cartpole_init(cartpole *device, const cartpole_settings *settings);
-/* Do what a payload (version, type, body) asks for; return the length of the answer's payload, or 0. */
+/* Execute a payload (version, type, body); return the length of the answer's payload, or 0. */
 uint8_t cartpole_handle(cartpole *device, const uint8_t *payload, uint8_t length, const cartpole_motor *motor,
                         uint8_t *answer);
 /* Take a byte from the host; return the length of the frame to answer with (at most CARTPOLE_MAX_FRAME), or 0. */

@@ -2,9 +2,9 @@
 
 #ifdef __AVR__
 #include <util/crc16.h>
-#define add_byte _crc_xmodem_update /* The same step in assembly: shifts of 16 bits cost an AVR 4000 cycles a frame. */
+#define add_byte _crc_xmodem_update /* The same step in assembly: 16-bit shifts cost an AVR 4000 cycles for each frame. */
 #else
-/* A byte into a CRC of polynomial 0x1021, without a table. */
+/* Add a byte to a CRC of polynomial 0x1021, without a table. */
 static uint16_t add_byte(uint16_t crc, uint8_t byte)
 {
     crc = (uint16_t)((crc >> 8) | (crc << 8));
@@ -26,7 +26,7 @@ uint16_t cartpole_crc(const uint8_t *data, uint8_t length)
 
 uint8_t cartpole_frame(const uint8_t *payload, uint8_t length, uint8_t *frame)
 {
-    /* At most 63 bytes are framed, so no COBS code ever reaches 0xFF. */
+    /* A frame has at most 63 bytes, so no COBS code reaches 0xFF. */
     uint16_t crc = cartpole_crc(payload, length);
     uint8_t code = 0, end = 1, i;
     for (i = 0; i < length + 2; i++) {
@@ -76,7 +76,7 @@ uint8_t cartpole_decode(cartpole_decoder *decoder, uint8_t byte)
     }
     if (length <= CARTPOLE_MAX_BLOCK)
         payload = unwrap(decoder->block, length);
-    /* Bytes before the first delimiter are the end of a frame that began before we listened. */
+    /* Bytes before the first delimiter are the end of an earlier frame. */
     if (payload == 0 && length > 0 && decoder->synchronised)
         decoder->errors++;
     decoder->synchronised = true;

@@ -68,14 +68,14 @@ static void fail(rig *rig)
     enter(rig, RIG_REST);
 }
 
-/* Left until the switch closes, back to the middle, then wait until somebody has set the pole upright. */
+/* Left until the switch closes, back to the middle, then wait until the pole is set upright by hand. */
 static int64_t home(rig *rig)
 {
     int32_t turned;
     if (rig->device.homings != rig->homings) {
         rig->homings = rig->device.homings;
         rig->fault = false;
-        shift(rig, -rig->cart_counts); /* The middle is not known: begin at 0, so that 0.9 m to go fit. */
+        shift(rig, -rig->cart_counts); /* The middle is unknown: begin at 0, so that 0.9 m of travel fit. */
         cartpole_servo_reset(&rig->homing, 0);
         enter(rig, RIG_SEEK);
     }
@@ -106,7 +106,7 @@ static int64_t home(rig *rig)
         }
         if (rig->phase_ticks > RIG_HOMING_TICKS)
             fail(rig);
-        /* Dry friction holds the cart short of its target: move the target on until it comes. */
+        /* Dry friction stops the cart before its target: move the target on until the cart arrives. */
         if (rig->homing.setpoint_nm == rig->homing.target_nm) {
             rig->homing.target_nm -= rig->motor.position_nm / 256;
             if (magnitude(rig->homing.target_nm) > 200000000L)

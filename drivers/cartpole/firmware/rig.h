@@ -1,6 +1,7 @@
-/* What a port does beside the wire: encoder counts to positions, homing against a switch, end stops, the motor.
+/* The part of a port beside the wire: encoder counts to positions, homing against a switch, end stops, the motor.
  *
- * A port calls rig_receive() for each byte, and every millisecond rig_tick(), then rig_report() where that says so.
+ * A port calls rig_receive() for each byte. Every millisecond it calls rig_tick(), and, if that returns true,
+ * rig_report().
  */
 #ifndef RIG_H
 #define RIG_H
@@ -15,7 +16,7 @@
 #define RIG_VELOCITY_REPORTS 4        /* state frames difference over 20 ms. */
 #define RIG_PWM_TOP 799L              /* Motor fully on. */
 
-/* Homing: speed and force of the cart, how near to the middle is near enough, how upright is upright. */
+/* Homing: speed and force of the cart, tolerances of the middle and of upright. */
 #define RIG_HOMING_UM_S 250000UL
 #define RIG_HOMING_MN 3000U
 #define RIG_HOMING_MN_M 80000UL

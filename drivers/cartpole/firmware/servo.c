@@ -66,7 +66,7 @@ int64_t cartpole_servo_update(cartpole_servo *servo, const cartpole_motor *motor
     return force_pn < -servo->real.limit_pn ? -servo->real.limit_pn : force_pn;
 }
 
-/* pN to mN by a product and shifts: a division of 64 bits would take an AVR longer than all the rest. */
+/* pN to mN by a product and shifts: a 64-bit division would take an AVR longer than the rest of the step. */
 int32_t cartpole_millinewton(int64_t force_pn)
 {
     int64_t micro = (force_pn + (1L << 19)) >> 20; /* 2^20 pN, some uN. */

@@ -1,7 +1,7 @@
-"""The Go2 as its driver has it: the facts of the floor robot, with its wire's rates and the limits for legs.
+"""The driver's description of a Go2: the floor robot, with the rates of its wire and limits for legs.
 
-Simulation keeps ``floor.DESCRIPTION``, which has one state a control step, and from which the shipped
-policies were trained; name, joints, poses, gains and control rate are the same here.
+Simulation uses ``floor.DESCRIPTION``, which has one state for each control step. The shipped policies were
+trained with it. Name, joints, poses, gains and control rate are the same here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TRIP_MARGIN_RAD: Final = 0.15
 EFFORT_NM: Final = 23.5
 TARGET_STEP_RAD: Final = 0.6
 HELD_TILT_RAD: Final = 0.35
-"""A body on a stand leans by less: here a third of a leg's weight pulls it aside [rad]."""
+"""Largest tilt of a body on a stand; there a third of a leg's weight pulls it aside [rad]."""
 FLAIL_RAD_S: Final[Mapping[str, float]] = {"hip": 20.0, "thigh": 20.0, "calf": 10.5}
 
 LEG_LIMITS: Final = LegLimits(
@@ -63,11 +63,11 @@ LEG_SOURCES: Final[Mapping[str, str]] = {
 
 
 def driver_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyLimits:
-    """Return limits with those for legs, and with room for a robot that lies on its stops.
+    """Return limits with those for legs, and with a margin for a robot that lies on its stops.
 
     The calves of a lying robot were seen at -2.81 rad, 0.09 beyond the mechanical range of the models. The
-    wire carries no effort limit, so none is asked for below the motors' own: the predicted effort is limited
-    instead.
+    wire has no effort limit, so no limit below the motors' own is requested: the filter limits the predicted
+    effort instead.
     """
     trip = tuple((low - TRIP_MARGIN_RAD, high + TRIP_MARGIN_RAD) for low, high in limits.trip_position)
     return dataclasses.replace(

@@ -104,8 +104,8 @@ DESCRIPTION: Final = RobotDescription(
 def parameter_space(stiffness: float = STIFFNESS_NM_RAD, damping: float = DAMPING_NMS_RAD) -> ParameterSpace:
     """Return the 24 parameters of DEAL's Table 9: stiffness and damping of each joint's motor.
 
-    They are what the motors do when sent the description's default gains. The joints' own viscous friction
-    (0.6 N·m·s/rad) adds to the motor's damping and stays as it is: no motion tells the two apart.
+    They are the true gains at the description's default gains. The joints' own viscous friction
+    (0.6 N·m·s/rad) adds to the motor's damping and stays fixed: motion determines only their sum.
     """
     return ParameterSpace(
         [
@@ -134,9 +134,9 @@ FLOOR_FRICTION: Final = 0.8
 
 
 def walk_space() -> ParameterSpace:
-    """Return what a walk tells of: the 24 gains, the trunk and its load, friction of joints and floor.
+    """Return the parameters for a walk: the 24 gains, the trunk and its load, friction of joints and floor.
 
-    The joints' dry friction is one number for the hips, the thighs and the calves each.
+    Dry friction is one number for all hips, one for all thighs and one for all calves.
     """
     more = [
         Parameter.around("base.mass", "body_mass", ("base",), "kg", TRUNK_KG, ratio=1.5),

@@ -1,4 +1,4 @@
-"""Where a Go2's feet are, and what its legs carry by its motors' efforts; closed form, no simulator.
+"""Positions of a Go2's feet, and the loads of its legs from its motors' efforts; closed form, no simulator.
 
 Lengths as in ``assets/go2.xml``. Arrays follow model order (legs FL, FR, RL, RR; hip, thigh, calf); vectors
 are in the base's frame: x ahead, y left, z up.
@@ -16,7 +16,7 @@ from deal_hw.types import FloatArray
 LINK_M: Final = 0.213
 """Length of a thigh, and of a calf up to the foot's centre [m]."""
 SIDE_M: Final = 0.0955
-"""From the axis of a hip joint to its leg's plane [m]."""
+"""Distance from the axis of a hip joint to its leg's plane [m]."""
 WEIGHT_N: Final = 149.0
 """15.2 kg, the mass of ``go2.xml`` [N]."""
 _LEFT: Final = np.array([1.0 if leg.endswith("L") else -1.0 for leg in LEGS])
@@ -45,7 +45,7 @@ def foot_positions(position: FloatArray) -> FloatArray:
 
 
 def foot_jacobians(position: FloatArray) -> FloatArray:
-    """Return how each foot moves with its leg's joints, (..., 4, 3, 3) [m/rad]; columns are joints.
+    """Return the Jacobian of each foot, (..., 4, 3, 3) [m/rad]; columns are its leg's joints.
 
     Args:
         position: Joint positions, (..., 12) [rad].
@@ -67,8 +67,8 @@ def foot_jacobians(position: FloatArray) -> FloatArray:
 def foot_loads(position: FloatArray, effort: FloatArray) -> FloatArray:
     """Return the force of the floor on each foot that balances the motors' efforts, (..., 4, 3) [N].
 
-    The legs' own weight is left out: in the air, a leg that is held shows it as a small negative load. The
-    calves' range keeps the equations regular.
+    The legs' own weight is neglected: in the air a leg shows it as a small negative load. The calves' range
+    keeps the equations regular.
 
     Args:
         position: Joint positions, (..., 12) [rad].
@@ -79,7 +79,7 @@ def foot_loads(position: FloatArray, effort: FloatArray) -> FloatArray:
 
 
 def efforts_under(position: FloatArray, loads: FloatArray) -> FloatArray:
-    """Return the efforts that hold the legs where the floor presses the feet, (12,) [N·m].
+    """Return the efforts that balance the floor's forces on the feet, (12,) [N·m].
 
     Args:
         position: Joint positions, (12,) [rad].

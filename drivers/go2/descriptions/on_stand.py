@@ -1,7 +1,7 @@
 """The real Go2 with its base on a stand: targets at 50 Hz, states at 500 Hz, no floor.
 
-The stand must hold the base level and still: the model's base does not move. The 200 Hz recording of
-iit-DLSLab is ``go2_suspended``.
+The stand must hold the base level and still, because the model's base does not move. ``go2_suspended`` is
+the 200 Hz recording of iit-DLSLab.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 
 MOTOR_HZ: Final = 1000.0
 LEAST_SHARE: Final = 0.1
-"""Of the damping that acts on the stand, so much at least is the motor's."""
+"""Least share of the motor in the damping on the stand."""
 WIDEST: Final = 10.0
-"""Draws of what was found on the stand are not cut off within this factor of the model's own values."""
+"""Draws of the stand's result are not cut off within this factor of the model's own values."""
 REACH_RAD: Final[Mapping[str, float]] = {"hip": 0.3, "thigh": 0.4, "calf": 0.5}
-"""Excitations keep so near the standing pose; the legs then stay 3 cm apart whatever the others do."""
+"""Largest distance of excitations from the standing pose; all legs then stay 3 cm apart."""
 
 
 def _reach() -> tuple[tuple[float, float], ...]:
-    """Return where excitations may take each joint [rad]."""
+    """Return the range of excitations for each joint [rad]."""
     pose, reach = per_joint(STANDING_RAD), per_joint(REACH_RAD)
     return tuple((middle - way, middle + way) for middle, way in zip(pose, reach, strict=True))
 
@@ -62,13 +62,13 @@ SPACES: Final = on_stand_recording.SPACES
 
 
 def on_floor(found: ParameterDistribution) -> ParameterDistribution:
-    """Return what a recording on the stand says of the robot on the floor, whose policies send other gains.
+    """Convert a result on the stand to the robot on the floor, whose policies send other gains.
 
-    What a motor makes of a gain is a factor on it. On the stand the damping that acts is the motor's and the
-    joint's together; the joint's own is taken to be the model's, as no motion tells the two apart.
+    A motor multiplies the gain that it is sent by a factor. On the stand the damping is the sum of the
+    motor's and the joint's. Motion determines only this sum, so the joint's share is taken from the model.
 
     Args:
-        found: Over the parameter set ``default`` of this robot.
+        found: Distribution over the parameter set ``default`` of this robot.
     """
     gains = {
         "stiffness": (floor.STIFFNESS_NM_RAD / on_stand_recording.STIFFNESS_NM_RAD, 0.0),
@@ -80,9 +80,9 @@ def on_floor(found: ParameterDistribution) -> ParameterDistribution:
     parameters, mean, spread = [], found.mean.copy(), np.ones(len(found.space))
     for k, p in enumerate(found.space):
         factor, offset = gains.get(p.name.rpartition(".")[2], (1.0, 0.0))
-        # Damping below the joint's own would leave nothing for the motor.
+        # Damping below the joint's own would leave no share for the motor.
         mean[k] = factor * max(found.mean[k] - offset, LEAST_SHARE * found.mean[k])
-        # On a log scale the same absolute uncertainty is a larger share of what is left.
+        # On a log scale the same absolute uncertainty is a larger share of the remaining damping.
         spread[k] = factor * found.mean[k] / mean[k]
         nominal = factor * (p.nominal - offset)
         parameters.append(Parameter.around(p.name, p.kind, p.elements, p.unit, nominal, ratio=WIDEST))

@@ -21,9 +21,9 @@ FRICTIONLOSS_NM: Final = 0.2
 ARMATURE_KGM2: Final = 0.01
 ENCODER_BIAS_RAD: Final = 0.1
 LINE_FRICTIONLOSS_N: Final = 5.0
-"""Of a knee's rod or strap."""
+"""Largest friction of a knee's rod or strap [N]."""
 KNEE_FRICTIONLOSS_NM: Final = (0.02, 4.0)
-"""Range of the calves' friction where the rods have some of their own."""
+"""Range of the calves' friction if the rods have friction of their own."""
 
 DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
     floor.DESCRIPTION,
@@ -81,8 +81,8 @@ _EACH: Final = tuple((joint, (joint,)) for joint in floor.JOINTS)
 def parameter_space() -> ParameterSpace:
     """Return 48 parameters: stiffness, damping, frictionloss and armature of each joint.
 
-    Damping is what acts at the joint when the motor is sent kd = 1.5: the motor's own and the joint's viscous
-    friction (0.6 in the source's model) together, as no recording can tell them apart. Delay and armature are
+    Damping is the damping at the joint for kd = 1.5: the sum of the motor's and of the joint's viscous
+    friction (0.6 in the source's model). No recording determines the two alone. Delay and armature are
     confounded in this recording: read both with the report's correlation.
     """
     return _space(_EACH, bias=False)
@@ -102,8 +102,8 @@ def shared_space() -> ParameterSpace:
 def linkage_space() -> ParameterSpace:
     """Return the 48 parameters, calf friction up to 4 N·m, and that of the knees' rods and straps, 56 in all.
 
-    A rod's friction makes that of its knee grow as it flexes, a strap's to both ends of the travel; in the
-    model both are 0.
+    A rod's friction makes its knee's friction grow as the knee flexes; a strap's grows to both ends of the
+    travel. In the model both are 0.
     """
     low, high = KNEE_FRICTIONLOSS_NM
     parameters = [

@@ -1,4 +1,4 @@
-"""What an emulated Go2 was told and when: so that a test can state the time from a fault to damping."""
+"""Commands that an emulated Go2 received, with times: a test computes the time from a fault to damping."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MOST_CHANGES: Final = 2000
 
 
 def kind_of(command: LowCommand) -> str:
-    """Return what a command does: ``stiff`` (gain or feed-forward), ``damping`` (kd alone) or ``off``."""
+    """Return the kind of a command: ``stiff`` (gain or feed-forward), ``damping`` (kd alone) or ``off``."""
     if not command.mode.any():
         return OFF
     if command.stiffness.any() or command.effort.any():
@@ -22,11 +22,11 @@ def kind_of(command: LowCommand) -> str:
 
 @dataclass(slots=True)
 class FaultRecord:
-    """One fault and how the user answered.
+    """One fault, and the user's commands after it.
 
     Attributes:
         name: The fault.
-        begin_ms: When it began [device ms].
+        begin_ms: Its beginning [device ms].
         begin_host_ns: Host clock then [ns]; in virtual time the device clock.
         last_stiff_ms: Last stiff command since, as received [device ms].
         first_damping_ms: First command since whose kp are all 0, as received [device ms].
@@ -40,19 +40,19 @@ class FaultRecord:
 
 
 class CommandLog:
-    """Follows the user's commands; the sport mode's own are not among them.
+    """Logs the user's commands, without those of sport mode.
 
     Attributes:
-        accepted: Commands that were taken.
-        refused: Commands that were not: corrupt, wrong level, not finite.
-        last_refusal: Why, of the last one.
+        accepted: Number of accepted commands.
+        refused: Number of refused commands: corrupt, wrong level, not finite.
+        last_refusal: Reason of the last refusal.
         first_stiff_ms: First stiff command [device ms].
         last_stiff_ms: Last stiff command [device ms].
         last_ms: Last command of any kind [device ms].
         largest_gap_ms: Longest time without a command while stiff [ms].
-        faults: What went wrong on purpose.
-        changes: When the kind of command changed: device ms, host ns, kind; the first 2000.
-        requests: When the robot's services were asked: device ms, host ns, service; the first 2000.
+        faults: The faults that were made.
+        changes: Changes of the kind of command: device ms, host ns, kind; the first 2000.
+        requests: Requests to the robot's services: device ms, host ns, service; the first 2000.
     """
 
     def __init__(self) -> None:
@@ -73,12 +73,12 @@ class CommandLog:
             self.requests.append((now_ms, host_ns, service))
 
     def refuse(self, reason: str) -> None:
-        """Note a command that was not taken."""
+        """Note a refused command."""
         self.refused += 1
         self.last_refusal = reason
 
     def accept(self, command: LowCommand, now_ms: int, host_ns: int) -> None:
-        """Note a command that was taken."""
+        """Note an accepted command."""
         kind = kind_of(command)
         if self._kind == STIFF and self.last_ms is not None:
             self.largest_gap_ms = max(self.largest_gap_ms, now_ms - self.last_ms)

@@ -38,28 +38,29 @@ TICK_NS: Final = 1_000_000
 STATE_MS: Final = 2
 SLOW_MS: Final = 50
 SPORT_STATE_PHASES: Final = (0, 3, 6)
-"""Ticks of ten that bring a SportModeState: 300 Hz, the rate seen on a robot."""
+"""Ticks of ten that send a SportModeState: 300 Hz, the rate seen on a robot."""
 WIRELESS_MS: Final = 10
 PUSH_MS: Final = 100
 SETTLE_TICKS: Final = 1500
 STOP_COMBINATION: Final = "L2+B"
 LEGS_DOWN: Final = np.tile((0.0, 0.34, -0.85), 4)
-"""Where limp legs come to rest in the air, but for the hips: the calf's weight opens the knee to its stop."""
+"""Pose of limp legs in the air, without the hips: the calf's weight opens the knee to its stop."""
 
 Outgoing = tuple[str, bytes]
 
 
 class Go2Device:
-    """Everything of an emulated Go2 but time and wire.
+    """An emulated Go2 without real time and wire.
 
-    Tick k, at device time k ms: what was received is handled and commands that are due reach the motors; the
-    motors find their torques from the state at the start of the tick; at even ticks a LowState reports that
-    state; one physics step of 1 ms follows. What comes at k ms sharp is handled in tick k + 1.
+    Tick k, at device time k ms, has these steps. Received messages are handled, and commands that are due
+    reach the motors. The motors compute their torques from the state at the start of the tick. At even ticks
+    a LowState reports that state. One physics step of 1 ms follows. A message that arrives at exactly k ms is
+    handled in tick k + 1.
 
     Attributes:
-        log: What the user commanded and when.
+        log: The user's commands, with times.
         sport_on_wire: Whether sport mode's own commands are published.
-        host_origin_ns: Host clock at device time 0, for the log [ns]; whoever runs the device keeps it right.
+        host_origin_ns: Host clock at device time 0, for the log [ns]; the caller keeps it correct.
 
     Args:
         truth: Hidden parameters, profile, seed.
@@ -67,8 +68,8 @@ class Go2Device:
         start: Limp, lying or with its legs hanging down, or standing with sport mode in control.
         sport: Name of the sport mode that is active at power-up; "" for none.
         sport_on_wire: Whether sport mode's own commands are seen on ``rt/lowcmd``.
-        plan: What goes wrong.
-        remote: What the operator does with the remote, in order of time; None: no remote is heard.
+        plan: Faults to make.
+        remote: The remote's states, in order of time; None: no remote is in reach.
         tick_ms: The robot's clock at the beginning.
     """
 
@@ -133,28 +134,28 @@ class Go2Device:
 
     @property
     def true_position(self) -> FloatArray:
-        """True joint positions, (12,) [rad]; never on the wire."""
+        """True joint positions, (12,) [rad]; not reported."""
         return self._sim.position()
 
     @property
     def base_position(self) -> FloatArray:
-        """True position of the base in the world, (3,) [m]; never on the wire."""
+        """True position of the base in the world, (3,) [m]; not reported."""
         return self._sim.base_position()
 
     @property
     def base_height(self) -> float:
-        """Height of the base over the floor [m]; never on the wire."""
+        """Height of the base over the floor [m]; not reported."""
         return float(self.base_position[2])
 
     @property
     def heading(self) -> float:
-        """Angle of the base's x axis about the vertical, from the world's x axis [rad]; never on the wire."""
+        """Angle of the base's x axis about the vertical, from the world's x axis [rad]; not reported."""
         w, x, y, z = self._sim.orientation()
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
     @property
     def tilt(self) -> float:
-        """Angle between the base's z axis and the vertical [rad]; never on the wire."""
+        """Angle between the base's z axis and the vertical [rad]; not reported."""
         _, x, y, _ = self._sim.orientation()
         return math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
 
@@ -167,7 +168,7 @@ class Go2Device:
         """Take a message; the next tick handles it.
 
         Args:
-            topic: Where it came from.
+            topic: Its topic.
             payload: CDR with its header.
             stamp_ns: Host clock at reception, for the log [ns].
         """
@@ -175,7 +176,7 @@ class Go2Device:
             self._inbox.append((topic, payload, stamp_ns))
 
     def advance_to(self, device_ns: int) -> list[Outgoing]:
-        """Run every tick up to and including ``device_ns``; return what was sent meanwhile."""
+        """Run every tick up to and including ``device_ns``; return the messages sent meanwhile."""
         out: list[Outgoing] = []
         while self._tick * TICK_NS <= device_ns:
             out += self.tick()
@@ -205,7 +206,7 @@ class Go2Device:
         return out
 
     def report(self) -> dict[str, Any]:
-        """Return what happened, as plain JSON values: truth, messages, commands, faults, the robot's end."""
+        """Return a report as plain JSON values: truth, messages, commands, faults, final state."""
         return {
             **self._truth.to_json(),
             "parameters_at_kp20_kd1.5": self._truth.parameters(20.0, 1.5),
@@ -221,10 +222,10 @@ class Go2Device:
             "largest_tilt_rad": self._largest_tilt,
         }
 
-    # Faults, at any moment; a plan calls the same.
+    # Faults, at any time; a plan calls the same function.
 
     def begin_fault(self, name: str) -> None:
-        """Let something go wrong from now on.
+        """Begin a fault.
 
         Args:
             name: One of ``deal_hw.drivers.go2.emulator.faults.MOMENTS``.
@@ -259,10 +260,10 @@ class Go2Device:
                 raise ValueError(f"no such fault: {name!r}")
         self.log.begin(name, self._tick, self.host_origin_ns + self._tick * TICK_NS)
 
-    # What happens in a tick.
+    # The steps of a tick.
 
     def _begin(self, start: str, limp: FloatArray) -> None:
-        """Settle in the start posture; device time does not move."""
+        """Settle in the start posture; device time does not advance."""
         sim, motors, controller = self._sim, self._motors, self._sport.controller
         sim.set_pose(STANDING if start == "standing" else limp, 0.34 if start == "standing" else 0.13)
         if start == "standing":
@@ -276,7 +277,7 @@ class Go2Device:
             self._motors = self._sensing.motors = Motors(self._truth, self._profile)
 
     def _move(self, velocity: FloatArray) -> None:
-        """Run a physics step with the motors as they are, from these velocities (12,)."""
+        """Run a physics step with the present motor efforts, from these velocities (12,)."""
         if self._profile.stribeck_ratio:
             slow = np.exp(-np.square(velocity / self._profile.stribeck_rad_s))
             self._sim.set_frictionloss(self._friction * (1.0 + self._profile.stribeck_ratio * slow))
@@ -341,7 +342,7 @@ class Go2Device:
         beat = now % PERIOD_MS == 0
         if not beat and not self._sport_waits:
             return []
-        # Sport mode and the user take turns: neither is drowned by the other, and the robot shakes.
+        # Commands of sport mode and of the user alternate, so the robot shakes.
         if beat and user is not None and not self._sport_waits:
             self._sport_waits = True
             return []

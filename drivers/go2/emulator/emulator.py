@@ -11,10 +11,10 @@ from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 
 STALL_NS: Final = 50_000_000
-"""Behind by more than this, the device's time stands still instead of catching up."""
+"""If the process is behind by more than this, device time stands still instead of catching up."""
 LATE_NS: Final = 1_000_000
 _MOST_MESSAGES: Final = 200
-"""Messages taken at a tick: a flood must not stop the robot's time."""
+"""Most messages taken at a tick: a flood must not stop the robot's time."""
 
 
 class Go2Emulator:
@@ -28,7 +28,7 @@ class Go2Emulator:
 
     Args:
         device: The device.
-        transport: Where it speaks; not opened yet.
+        transport: Its wire; not opened yet.
         clock: Real time.
     """
 
@@ -40,10 +40,10 @@ class Go2Emulator:
         self._origin_ns = 0
 
     def open(self) -> None:
-        """Join the wire and let device time begin.
+        """Open the wire and start device time.
 
         Raises:
-            TransportError: The wire cannot be joined.
+            TransportError: The wire cannot be opened.
         """
         published = PUBLISHED if self._device.sport_on_wire else PUBLISHED[:-1]
         self._transport.declare(publish=published, subscribe=SUBSCRIBED)
@@ -51,11 +51,11 @@ class Go2Emulator:
         self._origin_ns = self._device.host_origin_ns = self._clock.now_ns() - self._device.device_ns
 
     def close(self) -> None:
-        """Leave the wire."""
+        """Close the wire."""
         self._transport.close()
 
     def step(self) -> None:
-        """Sleep until the next tick is due, take what came, and run every tick that is due."""
+        """Sleep until the next tick is due, take received messages, and run every tick that is due."""
         due_ns = self._origin_ns + self._device.device_ns
         self._clock.sleep_until_ns(due_ns)
         self._take()
@@ -65,7 +65,7 @@ class Go2Emulator:
             self.late += 1
             self.latest_ns = max(self.latest_ns, late_ns)
         if late_ns > STALL_NS:
-            # Catching up would send a burst of states that no robot sends.
+            # If it caught up, it would send a burst of states, which no robot does.
             self._origin_ns += late_ns
             self._device.host_origin_ns = self._origin_ns
             self.slips += 1
@@ -77,7 +77,7 @@ class Go2Emulator:
                 self.unsent += 1
 
     def report(self) -> dict[str, Any]:
-        """Return the device's report and how time was kept, as plain JSON values."""
+        """Return the device's report and the timing, as plain JSON values."""
         return {
             **self._device.report(),
             "origin_host_ns": self._origin_ns,

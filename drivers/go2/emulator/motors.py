@@ -14,7 +14,7 @@ from deal_hw.types import FloatArray, IntArray
 
 AMBIENT_C: Final = 28.0
 _HEAT_K_PER_NM2: Final = 0.25
-"""Warming in the long run by the square of the torque."""
+"""Final warming for the square of the torque."""
 _WARMING_S: Final = 150.0
 
 
@@ -27,12 +27,12 @@ class Motors:
         mode: Mode of each motor as commanded last, (12,).
         lost: Commands that each motor missed, (12,).
         temperature: (12,) [°C].
-        effort: What they give at the start of a step, (12,) [N·m].
-        constant: The part of it that holds through the step, (12,) [N·m].
-        brake: The rest as damping, which fades as the joint slows down within the step, (12,) [N·m·s/rad].
+        effort: Efforts at the start of a step, (12,) [N·m].
+        constant: The part of the effort that is constant through the step, (12,) [N·m].
+        brake: The rest as damping, which falls as the joint slows down within the step, (12,) [N·m·s/rad].
 
     Args:
-        truth: Gains in truth over gains as told, encoder bias.
+        truth: True gains over commanded gains, encoder bias.
         profile: Torque-speed limit.
     """
 
@@ -52,7 +52,7 @@ class Motors:
     def accept(self, command: LowCommand) -> None:
         """Hold this command from now on."""
         on = command.mode == MODE_SERVO
-        # The vendor's stop values turn a loop off whatever its gain.
+        # The vendor's stop values switch a loop off at any gain.
         position_on = on & (np.abs(command.position) < POSITION_STOP / 2)
         velocity_on = on & (np.abs(command.velocity) < VELOCITY_STOP)
         self._kp = np.where(position_on, command.stiffness * self._stiffness_factor, 0.0)
@@ -63,15 +63,15 @@ class Motors:
         self.mode = command.mode
 
     def lose(self, joint: int) -> None:
-        """Cut a motor off: it gives nothing and misses every command from now on."""
+        """Disconnect a motor: it gives no torque and misses every command from now on."""
         self._alive[joint] = 0.0
         self._any_dead = True
 
     def update(self, position: FloatArray, velocity: FloatArray) -> None:
-        """Find the efforts for true positions and velocities, (12,).
+        """Compute the efforts for true positions and velocities, (12,).
 
-        The D gain is handed on as damping, to be integrated implicitly: held through a step of 1 ms, the high
-        gains that a real motor takes would shake the light joints apart.
+        The D gain becomes damping, which is integrated implicitly. If its torque were held through a step of
+        1 ms, high gains, which a real motor takes, would make the light joints unstable.
         """
         constant = self._kp * (self._q - position - self._bias) + self._kd * self._dq + self._tau
         wish = constant - self._kd * velocity
@@ -86,14 +86,14 @@ class Motors:
             self.effort, self.constant, self.brake = wish, constant, self._kd
             return
         self.effort = np.minimum(np.maximum(wish, -limit), limit) * self._alive
-        # Beyond the limit the effort is what it is, however the joint moves.
+        # Beyond the limit the effort does not depend on the joint's motion.
         self.constant = np.where(free, constant * self._alive, self.effort)
         self.brake = np.where(free, self._kd * self._alive, 0.0)
 
     def warm(self, seconds: float) -> None:
-        """Let the motors warm up by what they give, and count what dead ones miss."""
+        """Warm the motors by their efforts, and count the commands that dead ones miss."""
         steady = AMBIENT_C + _HEAT_K_PER_NM2 * self.effort * self.effort
         self.temperature += (seconds / _WARMING_S) * (steady - self.temperature)
         if self._any_dead:
-            # A new array: the states that were made of the old one keep it.
+            # A new array, because earlier states keep the old one.
             self.lost = self.lost + (self._alive == 0.0)

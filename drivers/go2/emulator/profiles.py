@@ -1,4 +1,4 @@
-"""What stands between an emulated Go2's mechanics and the wire, in three steps of realism."""
+"""Profiles of an emulated Go2: differences from ideal mechanics and sensors, in three steps of realism."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deal_hw.errors import UnknownNameError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Go2Profile:
-    """How an emulated robot differs from its equations. Noise is white, given as standard deviations.
+    """Differences of an emulated robot from its equations. Noise is white; values are standard deviations.
 
     Attributes:
         name: The profile's name, as on the command line.
@@ -25,7 +25,7 @@ class Go2Profile:
         orientation_noise: Of the estimated orientation, each axis [rad].
         gyro_noise: Of angular velocities [rad/s].
         specific_force_noise: Of the accelerometer [m/s²].
-        encoder_bias_rad: Hidden zero errors of the joints lie within plus and minus this [rad].
+        encoder_bias_rad: Largest hidden zero error of a joint, to both sides [rad].
         payload_kg: Lowest and highest hidden mass that is strapped to the trunk [kg].
         floor_friction: Lowest and highest hidden sliding friction of the floor.
         latency_ms: Lowest and highest hidden time between a command's reception and its use [ms].
@@ -34,7 +34,7 @@ class Go2Profile:
         stribeck_rad_s: Speed at which that excess has fallen to 1/e [rad/s].
         knee: Share of the no-load speed up to which a motor gives full torque; from there it falls linearly.
             1: full torque at any speed.
-        drop: Share of states that are never sent.
+        drop: Share of lost states.
     """
 
     name: str
@@ -83,7 +83,7 @@ PROFILES: Final = {
         **_SENSOR,
     ),
 }
-"""No figures of a real Go2's sensors are published that we know of: these are assumptions."""
+"""We know of no published figures of a real Go2's sensors: these are assumptions."""
 
 
 def profile(name: str) -> Go2Profile:

@@ -1,4 +1,4 @@
-"""What an operator does with an emulated Go2's remote, written down beforehand."""
+"""Script of an operator's actions on an emulated Go2's remote."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KEYS = ("at_s", "buttons", "left_x", "left_y", "right_x", "right_y", "absent")
 
 @dataclass(frozen=True, slots=True)
 class RemoteMoment:
-    """What the remote says from a moment on.
+    """State of the remote from a moment on.
 
     Attributes:
         at_ms: The moment [device ms].
@@ -30,7 +30,7 @@ def read_remote_script(path: Path) -> tuple[RemoteMoment, ...]:
     """Return the moments in a JSON file, in order of time.
 
     The file holds a list of objects such as ``{"at_s": 2.0, "buttons": "L2+B", "left_y": 0.5}``: buttons and
-    sticks that are not named are released and centred; ``"absent": true`` takes the remote away.
+    sticks that are not named are released and centred; ``"absent": true`` puts the remote out of reach.
 
     Raises:
         ConfigurationError: The file holds something else.

@@ -1,4 +1,4 @@
-"""What an emulated Go2 reports of itself: the mechanics through noise, bias and quantisation."""
+"""Sensors of an emulated Go2: the mechanics with noise, bias and quantisation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Battery:
 
     Attributes:
         charge: State of charge, 0 to 1.
-        current: Drawn now [A].
+        current: Present current [A].
     """
 
     def __init__(self) -> None:
@@ -47,14 +47,14 @@ class Battery:
         return CELLS * self.cell_mv * 1e-3 - _RESISTANCE_OHM * self.current
 
     def drain(self, effort: FloatArray, velocity: FloatArray, seconds: float) -> None:
-        """Deliver what the motors take, for a while [s]."""
+        """Deliver the motors' power for a time [s]."""
         watts = max(0.0, float(effort @ velocity)) + _LOSS_W_PER_NM2 * float(effort @ effort)
         self.current = _IDLE_A + watts / (CELLS * 3.7)
         self.charge = max(0.0, self.charge - self.current * seconds / _CAPACITY_AS)
 
 
 class Sensing:
-    """Makes LowStates of the mechanics, and what broken sensors make of them.
+    """Makes LowStates from the mechanics, with the faults of broken sensors.
 
     Attributes:
         battery: The battery.
@@ -100,15 +100,15 @@ class Sensing:
         self._cells = np.zeros(15, np.int64)
 
     def empty_battery(self) -> None:
-        """Leave 4 % in the battery."""
+        """Set the battery's charge to 4 %."""
         self.battery.charge = min(self.battery.charge, _LOW_CHARGE)
 
     def state(self, tick_ms: int, remote: bytes) -> LowState:
-        """Return the state of now.
+        """Return the present state.
 
         Args:
             tick_ms: The robot's clock.
-            remote: What the remote control sent, 40 bytes.
+            remote: The remote control's 40 bytes.
         """
         sim, motors, battery = self._sim, self.motors, self.battery
         noise = self._noise * self._rng.standard_normal(57)

@@ -1,7 +1,7 @@
-"""The vendor's sport mode, as far as an emulator needs it: it stands up, lies down, damps, and never lets go.
+"""The vendor's sport mode, as far as an emulator needs it: it stands up, lies down and damps.
 
-It commands the motors every 2 ms, whoever else does. It does not walk: a Move is answered, and the robot
-stays where it stands.
+It commands the motors every 2 ms until it is released, even while other programs do. It does not walk: it
+answers a Move, and the robot stays in place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _RELEASED: Final = np.full(12, RELEASED_DAMPING_NMS_RAD)
 
 
 class Posture(enum.Enum):
-    """What sport mode does; the value is SportModeState's ``mode``."""
+    """Posture of sport mode; the value is SportModeState's ``mode``."""
 
     STANDING = 6
     """Joints locked, as after StandUp."""
@@ -43,16 +43,16 @@ _WAYS: Final = {
     Posture.DOWN: ((1.5, LYING),),
     Posture.RECOVERING: ((1.0, LYING), (1.2, STANDING)),
 }
-"""Poses on the way, each with the time to get there [s]."""
+"""Poses of a movement, each with the time to reach it [s]."""
 _UPRIGHT: Final = (Posture.STANDING, Posture.BALANCING, Posture.RECOVERING)
 
 
 class SportController:
-    """A stand controller that moves along straight lines in joint space and holds where they end.
+    """A stand controller that moves along straight lines in joint space and holds their end.
 
     Attributes:
-        posture: What it does.
-        velocity: Walking speed that was asked for last: ahead, left, turn [m/s, rad/s]; never walked.
+        posture: Its present posture.
+        velocity: Walking speed requested last: ahead, left, turn [m/s, rad/s]; it never walks.
     """
 
     def __init__(self) -> None:
@@ -65,8 +65,8 @@ class SportController:
         """Go into a posture from measured positions, (12,) [rad]."""
         self.velocity = (0.0, 0.0, 0.0)
         if posture is self.posture:
-            # The vendor's example asks for StandDown every second until the mode is released: beginning anew
-            # each time would never end.
+            # The vendor's example requests StandDown every second until the mode is released. If each
+            # request started anew, the movement would never end.
             return
         stands = self.posture in _UPRIGHT and self.progress(now_ms) >= 1.0
         self.posture = posture
@@ -75,12 +75,12 @@ class SportController:
         self._begin_ms, self._from = now_ms, position.copy()
 
     def progress(self, now_ms: int) -> float:
-        """Return how far the way to the posture is done, 0 to 1."""
+        """Return the progress of the movement to the posture, 0 to 1."""
         total_s = sum(seconds for seconds, _ in _WAYS.get(self.posture, ()))
         return min(1.0, (now_ms - self._begin_ms) * 1e-3 / total_s) if total_s else 1.0
 
     def command(self, now_ms: int) -> LowCommand:
-        """Return what the motors get now."""
+        """Return the present command to the motors."""
         if self.posture is Posture.DAMPING:
             return LowCommand(_ZEROS, _ZEROS, _ZEROS, _RELEASED, _ZEROS)
         since_s = (now_ms - self._begin_ms) * 1e-3

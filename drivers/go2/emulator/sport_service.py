@@ -1,9 +1,9 @@
-"""The emulated Go2's services: who moves the robot, what sport mode shall do, what runs on the robot.
+"""The emulated Go2's services: motion switcher, sport mode and robot state.
 
 Names, numbers and answers: unitree_sdk2_python @ 37116c5 and unitree_sdk2 @ 21d0a3b (motion switcher, sport,
-robot state, RPC errors). Programs of others on real robots select a mode while another one is active, and
-wait for the robot to stand up. Not published, so assumed: a release takes 0.3 s, and waits for a movement
-under way; meanwhile the switcher is busy; released, the motors keep the last command.
+robot state, RPC errors). Other authors' programs for real robots select a mode while another one is active,
+and wait for the robot to stand up. These facts are not published, and are assumed: a release takes 0.3 s and
+waits for a present movement; meanwhile the switcher is busy; after it, the motors keep the last command.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ SWITCHER_BUSY: Final = 7002
 SWITCHER_NAME: Final = 7004
 API_VERSION: Final = 1
 _VERSION: Final = "1.0.0.1"
-"""As text without quotes, as the SDK's own server sends it: its client compares it as it comes."""
+"""Text without quotes, as the SDK's own server sends it: its client compares it unchanged."""
 _SWITCH_PROTECTED: Final = 5
 _OTHER_SERVICES: Final = ("motion_switcher", "robot_state")
 
 
 class SportMode:
-    """Whether sport mode is active, under which name, and its controller.
+    """State of sport mode: its name while active, and its controller.
 
     Attributes:
         name: Its name while active; "" once released.
-        controller: What it does with the robot.
+        controller: Its stand controller.
 
     Args:
         name: The mode at power-up; "" for none.
@@ -57,7 +57,7 @@ class SportMode:
 
     @property
     def releasing(self) -> bool:
-        """Whether it is letting go."""
+        """Whether a release is in progress."""
         return self._release_ms is not None
 
     def select(self, name: str, position: FloatArray, now_ms: int) -> None:
@@ -67,12 +67,12 @@ class SportMode:
         self.controller.take(Posture.STANDING, position, now_ms)
 
     def release(self, now_ms: int) -> None:
-        """Begin to let go."""
+        """Begin a release."""
         if self.name and self._release_ms is None:
             self._release_ms = now_ms + RELEASE_MS
 
     def update(self, now_ms: int) -> None:
-        """Let go when it is time."""
+        """Finish the release when it is time."""
         due = self._release_ms is not None and now_ms >= self._release_ms
         if due and self.controller.progress(now_ms) >= 1.0:
             self.name, self._release_ms = "", None
@@ -82,7 +82,7 @@ class ServiceServer:
     """Answers requests.
 
     Attributes:
-        answered: How many.
+        answered: Number of answered requests.
 
     Args:
         sport: Sport mode.
@@ -106,7 +106,7 @@ class ServiceServer:
         }
 
     def answer(self, service: str, payload: bytes, position: FloatArray, now_ms: int) -> bytes | None:
-        """Act on a request and return the response; None where none was asked for, or nobody is there.
+        """Act on a request and return the response; None if none was requested, or the service is gone.
 
         Args:
             service: The service's name.
@@ -119,7 +119,7 @@ class ServiceServer:
         """
         request = decode_request(payload)
         if service == "sport" and not self._sport.name:
-            # The process that would answer is gone: the caller runs into its time-out.
+            # The process that would answer is gone, so the caller's time-out passes.
             return None
         code, data = self._act(service, request, position, now_ms)
         self.answered += 1
@@ -198,7 +198,7 @@ class ServiceServer:
 
     def _list(self, asked: Any, position: FloatArray, now_ms: int) -> tuple[int, Any]:
         active = SERVICE_OF.get(self._sport.name)
-        # As the vendor's stand example reads it: 0 is active.
+        # As in the vendor's stand example: 0 is active.
         return 0, [
             {
                 "name": service,

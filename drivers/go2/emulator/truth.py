@@ -25,25 +25,25 @@ from deal_hw.reading import number, reading
 JOINT_DAMPING_NMS_RAD: Final = 0.6
 ARMATURE_KGM2: Final = 0.01
 DEFAULT_RANGE_RATIO: Final = 2.0
-"""Hidden quantities lie within this ratio of the nominal ones, unless told otherwise."""
+"""By default hidden quantities lie within this ratio of the nominal ones."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Go2Truth:
-    """What a calibrator has to find out; tuples follow the 12 joints in model order.
+    """Hidden parameters, which a calibrator has to find; tuples follow the 12 joints in model order.
 
     Attributes:
         profile: Name of the profile.
         seed: Seed of the draw, of noise and of jitter.
-        stiffness: What the motor does over what it is told, kp.
-        damping: The same, kd.
+        stiffness: True kp over commanded kp.
+        damping: The same for kd.
         joint_damping: Viscous friction [N·m·s/rad].
         frictionloss: Coulomb friction of the gears [N·m].
         armature: Inertia of the rotors at the joint [kg·m²].
         encoder_bias: Reported minus true position [rad]; a motor closes its loop on the reported one.
         payload_kg: Mass that is strapped to the trunk [kg]; the trunk's inertia grows in proportion.
         floor_friction: Sliding friction between feet and floor.
-        latency_ms: A command acts that long after it was received, jitter aside [ms].
+        latency_ms: Time from a command's reception to its effect, without jitter [ms].
     """
 
     profile: str
@@ -69,8 +69,8 @@ class Go2Truth:
         """Return the true values under the names in the parameter sets of the robot on a stand.
 
         Args:
-            stiffness: kp that the motors are sent [N·m/rad].
-            damping: kd that they are sent [N·m·s/rad]; the joint's own viscous friction adds to it.
+            stiffness: Commanded kp [N·m/rad].
+            damping: Commanded kd [N·m·s/rad]; the joint's own viscous friction adds to it.
         """
         motor = np.array(self.damping) * damping + self.joint_damping
         rows = {
@@ -89,8 +89,8 @@ class Go2Truth:
     def walk_parameters(self) -> dict[str, float]:
         """Return the true values under the names in the parameter sets of the robot on the floor.
 
-        There a joint's damping is the motor's alone beside the model's own viscous friction; friction that
-        joints share is their mean.
+        There a joint's damping is the motor's alone; the model has the viscous friction. A friction that
+        several joints share is their mean.
         """
         gains = self.parameters(STIFFNESS_NM_RAD, DAMPING_NMS_RAD)
         friction = np.array(self.frictionloss).reshape(-1, len(PARTS)).mean(axis=0)
@@ -119,7 +119,7 @@ class Go2Truth:
         """Return the truth that :meth:`to_json` wrote; other keys are ignored.
 
         Raises:
-            ConfigurationError: A value is missing or means nothing.
+            ConfigurationError: A value is missing or invalid.
         """
         with reading("the values", "the truth of a Go2", "--reveal-to writes one", error=ConfigurationError):
             arrays = {

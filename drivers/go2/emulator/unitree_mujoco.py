@@ -2,10 +2,10 @@
 
 Facts, read from unitree_mujoco @ 0304726 (simulate_python/unitree_sdk2py_bridge.py and the C++ bridge of that
 version): LowState carries q, dq and tau_est of twelve motors, quaternion, gyroscope and accelerometer, and
-zeros elsewhere: no head, no tick, no checksum, no battery, no temperatures. A LowCmd is turned into torques
-once, when it comes, with the positions and velocities of that moment; these torques hold until the next one.
-No service answers. States are published by a thread of their own, whether the physics went on or not. Later
-versions (@ 24b7a49) count a tick and find the torques anew every millisecond; the rest is the same.
+zeros elsewhere: no head, no tick, no checksum, no battery, no temperatures. A LowCmd becomes torques
+once, at its reception, with the positions and velocities of that moment; they hold until the next LowCmd.
+No service answers. A separate thread publishes states, even if the physics did not advance. Later
+versions (@ 24b7a49) count a tick and compute the torques every millisecond; the rest is the same.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ class UnitreeMujoco:
     """The simulator without time and wire, as :class:`~deal_hw.drivers.go2.emulator.device.Go2Device`.
 
     Attributes:
-        paused: Whether the physics stands still; states go on.
-        talks: Whether states go out.
-        torque: What the motors hold, (12,) [N·m].
+        paused: Whether the physics stands still; states are still sent.
+        talks: Whether states are sent.
+        torque: Present motor torques, (12,) [N·m].
         command: The newest command; None before the first.
-        commands: How many came.
+        commands: Number of received commands.
 
     Args:
-        pose: The joints at the beginning, (12,) [rad].
+        pose: Joint positions at the beginning, (12,) [rad].
         on_stand: Whether its body is held in the air.
         step_ms: Length of a physics step, and the time between two states [ms].
-        settle_s: How long it falls and comes to rest before time 0, without torques [s].
+        settle_s: Time before time 0 in which it falls and comes to rest, without torques [s].
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class UnitreeMujoco:
         return self._sim.velocity()
 
     def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
-        """Turn a command into torques, at once and once."""
+        """Compute the torques of a command, once."""
         if topic != topics.LOW_COMMAND:
             return
         self.command = c = decode_low_command(payload)
@@ -98,7 +98,7 @@ class UnitreeMujoco:
         return out
 
     def state(self) -> bytes:
-        """Return the LowState now, 1180 bytes."""
+        """Return the present LowState, 1180 bytes."""
         buffer = bytearray(layout.LOW_STATE_BYTES)
         buffer[:4] = CDR_HEADER
         record = np.frombuffer(buffer, layout.LOW_STATE)[0]
@@ -111,6 +111,6 @@ class UnitreeMujoco:
         return bytes(buffer)
 
     def _step(self) -> None:
-        # A force sensor's value is that of the last step, so a pause stops it, too.
+        # A force sensor's value is that of the last step, so it stays constant in a pause.
         self._measured = self.torque
         self._sim.step(self.torque)

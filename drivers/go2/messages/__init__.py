@@ -1,1 +1,1 @@
-"""What travels on the Go2's wire: topics, byte layouts, and messages as values in SI units."""
+"""Messages of the Go2's wire: topics, byte layouts, and values in SI units."""

@@ -1,4 +1,4 @@
-"""What a LowState says beyond the joints, as the rest of deal-hw knows it."""
+"""Body, motors, battery and remote of a LowState, in deal-hw's types."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deal_hw.types import BodyState, FloatArray
 
 DAMPED_TOLERANCE_NM: Final = 1.5
 DAMPED_TOLERANCE_SHARE: Final = 0.3
-"""How far estimated efforts may be from damping: the motors' noise, and what a moving joint's speed changes
+"""Largest difference of estimated efforts from damping: the motors' noise, and the change of a joint's speed
 within a sample."""
 
 
@@ -21,7 +21,7 @@ def body_state(frame: LowStateFrame, remote: Remote | None) -> BodyState:
 
     Args:
         frame: The state.
-        remote: Its decoded remote; None where none is heard.
+        remote: Its decoded remote; None if none is in reach.
     """
     sticks = np.zeros(4)
     if remote is not None:
@@ -49,7 +49,7 @@ def is_damped(frame: LowStateFrame, damping: FloatArray, effort_limit: FloatArra
     Args:
         frame: The state.
         damping: kd of each joint, (J,) [N·m·s/rad].
-        effort_limit: What each motor can give, (J,) [N·m].
+        effort_limit: Largest effort of each motor, (J,) [N·m].
     """
     braking = np.clip(-damping * frame.velocity, -effort_limit, effort_limit)
     allowed = DAMPED_TOLERANCE_NM + DAMPED_TOLERANCE_SHARE * np.abs(braking)

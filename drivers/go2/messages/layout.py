@@ -1,8 +1,8 @@
-"""Static layouts of the Go2's two low-level messages, as they travel: CDR with its 4-byte header.
+"""Static layouts of the Go2's two low-level messages on the wire: CDR with its 4-byte header.
 
-Every offset is written out: a wrong one would move a joint. Source: IDL of unitree_sdk2 @ 21d0a3b and
+Every offset is written out, because a wrong one would move a joint. Source: IDL of unitree_sdk2 @ 21d0a3b and
 unitree_ros2 @ eea2719, compared byte for byte with two CDR libraries. The first motor's mode byte follows its
-predecessor without padding, so that it is not where the other motors' stride of 36 or 48 bytes would have it.
+predecessor without padding, so the other motors' stride of 36 or 48 bytes does not apply to it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any, Final
 import numpy as np
 
 SLOTS: Final = 20
-"""Motors that the messages have room for; the Go2 uses the first 12."""
+"""Motor slots of the messages; the Go2 uses the first 12."""
 LOW_COMMAND_BYTES: Final = 812
 LOW_STATE_BYTES: Final = 1180
 
 
 def packed(size: int, fields: Mapping[str, tuple[Any, int]]) -> np.dtype[np.void]:
-    """Return the layout of a message of so many bytes, each field with its kind and its first byte."""
+    """Return the layout of a message of this length; each field has its kind and its first byte."""
     return np.dtype(
         {
             "names": list(fields),
@@ -30,7 +30,7 @@ def packed(size: int, fields: Mapping[str, tuple[Any, int]]) -> np.dtype[np.void
     )
 
 
-# What stands at both messages' beginnings, after the encapsulation.
+# The beginning of both messages, after the encapsulation.
 _FRAME: Final = {
     "encapsulation": (("u1", 4), 0),
     "head": (("u1", 2), 4),
@@ -55,7 +55,7 @@ LOW_COMMAND: Final = packed(
     LOW_COMMAND_BYTES,
     {
         **_FRAME,
-        # A motor's numbers without its mode, which is a byte before the padding that the numbers need.
+        # A motor's numbers without its mode byte, which comes before their padding.
         "motor": ((_MOTOR_COMMAND, SLOTS), 28),
         "bms_off": ("u1", 744),
         "bms_reserve": (("u1", 3), 745),
@@ -68,7 +68,7 @@ LOW_COMMAND: Final = packed(
     },
 )
 COMMAND_MODE_AT: Final = np.array([26, *range(60, 60 + 36 * (SLOTS - 1), 36)])
-"""Where each motor's mode byte is in a LowCmd, (20,)."""
+"""Offset of each motor's mode byte in a LowCmd, (20,)."""
 
 _MOTOR_STATE: Final = packed(
     48,
@@ -118,4 +118,4 @@ LOW_STATE: Final = packed(
     },
 )
 STATE_MODE_AT: Final = np.array([81, *range(128, 128 + 48 * (SLOTS - 1), 48)])
-"""Where each motor's mode byte is in a LowState, (20,)."""
+"""Offset of each motor's mode byte in a LowState, (20,)."""

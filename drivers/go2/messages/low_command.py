@@ -29,9 +29,9 @@ MODE_OFF: Final = 0x00
 MODE_SERVO: Final = 0x01
 POSITION_STOP: Final = 2.146e9
 VELOCITY_STOP: Final = 16000.0
-"""What the vendor's examples write to motors that are not commanded, with kp = kd = 0."""
+"""Stop values of the vendor's examples for motors without a command, with kp = kd = 0."""
 _LARGEST: Final = 1e30
-"""Squares of a command's numbers add up to less than this; stop values to 5.5e19."""
+"""Bound on the sum of squares of a command's numbers; stop values have 5.5e19."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class LowCommandEncoder:
         """Return the command as CDR with header and checksum, 812 bytes.
 
         Raises:
-            FrameError: A number is not finite, or absurd.
+            FrameError: A number is not finite, or implausibly large.
         """
         values = self._values
         values[0], values[1], values[2] = command.position, command.velocity, command.effort
@@ -103,14 +103,14 @@ class LowCommandEncoder:
     def _set_modes(self, command: LowCommand) -> None:
         self._bytes[layout.COMMAND_MODE_AT[SLOT]] = command.mode
         self._buffer[6] = command.level
-        # The struct's first 28 bytes hold no motor's numbers: their share of the checksum is kept.
+        # The struct's first 28 bytes hold no motor's numbers, so their part of the checksum is kept.
         self._start = words_crc(low_command_image(bytes(self._buffer))[:28])
 
 
 _FIELD_COUNT: Final = 5
 _MODEL_OF_SLOT: Final = np.array([JOINTS.index(joint) for joint in WIRE_JOINTS])
 _WIRE_ROWS: Final = _MODEL_OF_SLOT[:, None] + len(JOINTS) * np.arange(_FIELD_COUNT)[None, :]
-"""Where in a flat (5, 12) array in model order each number of the wire's rows comes from, (12, 5)."""
+"""Index in a flat (5, 12) array in model order of each number in the wire's rows, (12, 5)."""
 
 
 def decode_low_command(payload: bytes) -> LowCommand:

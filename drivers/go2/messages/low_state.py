@@ -1,4 +1,4 @@
-"""LowState: what the robot says every 2 ms. Import its names from ``messages.protocol``."""
+"""LowState: the robot's state, every 2 ms. Import its names from ``messages.protocol``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from deal_hw.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LowState:
-    """What the robot says every 2 ms, arrays in model order (legs FL, FR, RL, RR).
+    """The robot's state, sent every 2 ms, arrays in model order (legs FL, FR, RL, RR).
 
     Attributes:
         position: q, (12,) [rad].
@@ -43,7 +43,7 @@ class LowState:
         foot_force: Sensor units, (4,).
         foot_force_estimate: The robot's estimate, (4,).
         tick_ms: The robot's clock, modulo 2**32 [ms].
-        remote: What the remote control sent, 40 bytes; see remote.py.
+        remote: The remote control's 40 bytes; see remote.py.
         battery_percent: State of charge.
         battery_current_ma: Negative: discharging [mA].
         battery_status: The battery's own status byte.
@@ -99,7 +99,7 @@ _F8: Final = np.dtype(np.float64)
 
 
 class LowStateFrame:
-    """A LowState as it came: attributes as :class:`LowState`'s, read from the bytes when asked for.
+    """A received LowState: attributes as :class:`LowState`'s, read from the bytes on access.
 
     Attributes:
         payload: The bytes.
@@ -158,7 +158,7 @@ class LowStateFrame:
 
     @property
     def remote(self) -> bytes:
-        """What the remote control sent, 40 bytes."""
+        """The remote control's 40 bytes."""
         return self.payload[1104:1144]
 
     @property
@@ -228,7 +228,7 @@ class LowStateFrame:
 def decode_low_state(payload: bytes, strict: bool = True) -> LowStateFrame:
     """Return the state in a LowState. Reserved fields are ignored: newer firmware may use them.
 
-    Numbers that are not finite pass: what to do about them is the safety module's decision.
+    Numbers that are not finite pass, because the safety module decides about them.
 
     Args:
         payload: CDR with its header.

@@ -3,9 +3,8 @@
 Only the wire knows the order FR, FL, RR, RL of legs and joints; names join it to the model's. Payloads are
 whole CDR messages with their 4-byte header, as DDS and Zenoh carry them.
 
-A trap of this wire: 812 and 1180 are the lengths of LowCmd and LowState both as CDR with header and as the C
-struct that the vendor's checksum is computed over, which has another layout. A C struct given as CDR is
-refused by its missing header.
+A hazard of this wire: LowCmd has 812 bytes and LowState 1180, as CDR with header and also as the C struct of
+the vendor's checksum. The two layouts differ. A C struct given as CDR is refused by its missing header.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""States that were refused by their bytes: how many, why, and what to do about it."""
+"""Counts refused states, with the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deal_hw.drivers.go2.messages.wire import CDR_HEADER
 from deal_hw.errors import FrameError, ProtocolError, VersionMismatchError, WrongDeviceError
 
 StateCheck = Literal["strict", "length"]
-"""What a LowState must pass: all, or all but head and checksum."""
+"""Checks that a LowState must pass: all, or all but head and checksum."""
 OTHER_RULE: Final = (
     "the robot's firmware, or a simulator in its place, has another head or checksum; update deal-hw, or "
     "continue with `--state-check length`, which checks neither, so corrupted states are not detected"
@@ -23,11 +23,11 @@ ANOTHER_ROBOT: Final = (
 
 
 class Refusals:
-    """Counts them.
+    """Counts refused states.
 
     Attributes:
-        count: How many.
-        first: Why the first one was refused, in words; "" before.
+        count: Number of refused states.
+        first: Reason of the first refusal, in words; "" before.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Refusals:
         self._lengths: Counter[int] = Counter()
 
     def add(self, payload: bytes, error: FrameError) -> None:
-        """Take a refused message and why it was refused."""
+        """Take a refused message and the reason."""
         self.count += 1
         self.first = self.first or str(error)
         self._lengths[len(payload)] += 1
@@ -50,13 +50,13 @@ class Refusals:
 
     @property
     def remedy(self) -> str:
-        """What to do where every state was refused."""
+        """Remedy if every state was refused."""
         if 2 * self._simulated > self.count:
             return UNITREE_MUJOCO
         return OTHER_RULE if self.by_rule else ANOTHER_ROBOT
 
     def error(self) -> ProtocolError:
-        """Return what is wrong where every state was refused."""
+        """Return the finding if every state was refused."""
         if self.by_rule:
             return VersionMismatchError(
                 f"go2: {self._ruled} states have the right length, but none has the right head and "

@@ -1,7 +1,7 @@
 """The Go2's remote control: the 40 bytes in each LowState, and the message WirelessController.
 
 Layout of the 40 bytes, from unitree_sdk2_python @ 37116c5: two bytes of head, buttons as 16 bits, then the
-sticks as floats: lx at 4, rx at 8, ry at 12, ly at 20 (L2's way at 16). All zeros: no remote is heard.
+sticks as floats: lx at 4, rx at 8, ry at 12, ly at 20 (L2's travel at 16). All zeros: no remote in reach.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ WIRELESS_BYTES: Final = _WIRELESS.size
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """What the operator holds.
+    """State of the remote.
 
     Attributes:
         buttons: A bit each, as :data:`BUTTONS`.
@@ -87,7 +87,7 @@ def parse_combination(text: str) -> int:
 
 
 def decode_remote(data: bytes) -> Remote | None:
-    """Return what a LowState's 40 bytes say; None where no remote is heard.
+    """Return the remote in a LowState's 40 bytes; None if no remote is in reach.
 
     Raises:
         FrameError: Not 40 bytes.
@@ -116,7 +116,7 @@ def encode_remote(remote: Remote | None) -> bytes:
 
 
 def decode_wireless(payload: bytes) -> Remote:
-    """Return what a WirelessController message says.
+    """Return the remote in a WirelessController message.
 
     Raises:
         FrameError: Wrong length or header.

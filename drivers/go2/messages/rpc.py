@@ -1,7 +1,7 @@
 """Requests to and responses from the Go2's services, as CDR.
 
 Types unitree_api::msg::dds_::Request_ and Response_ (unitree_sdk2 @ 21d0a3b). Parameters and data are JSON.
-Both messages are written byte by byte: they hold a string, so that no static layout fits them.
+Both messages are written byte by byte, because they hold a string and have no static layout.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _REQUEST: Final = struct.Struct("<4sqqqi?")
 _RESPONSE: Final = struct.Struct("<4sqqi")
 _LENGTH: Final = struct.Struct("<I")
 _LONGEST: Final = 1 << 20
-"""A length beyond this is garbage, whatever the payload's own length says."""
+"""A length beyond this is invalid, at any length of the payload."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Request:
 
     Attributes:
         identity: The caller's number of this call; the response repeats it.
-        api: Which function.
+        api: Number of the function.
         parameter: JSON text.
         lease: For exclusive services; 0: none.
         priority: 0: ordinary.
@@ -63,7 +63,7 @@ class Response:
     binary: bytes = b""
 
     def json(self) -> dict[str, Any]:
-        """Return the data as a JSON object; empty where there is none.
+        """Return the data as a JSON object; empty if there is none.
 
         Raises:
             FrameError: The data are no JSON object.

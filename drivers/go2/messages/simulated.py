@@ -1,4 +1,4 @@
-"""States of the vendor's simulator unitree_mujoco: how they are known, and what is said of them."""
+"""States of the vendor's simulator unitree_mujoco: recognition and messages."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from deal_hw.drivers.go2.messages.wire import CDR_HEADER, HEAD
 from deal_hw.errors import FrameError, VersionMismatchError
 
 Simulator = Literal["none", "unitree_mujoco"]
-"""What stands in the place of a robot."""
+"""A simulator in the place of a robot."""
 UNITREE_MUJOCO: Final = (
-    "no head, no battery: this is how the simulator unitree_mujoco fills them; if it is what runs there, add "
+    "no head, no battery: the simulator unitree_mujoco sends such states. If it runs there, add "
     "`--simulator unitree_mujoco`, which says what replaces the checks that its states do not allow. "
-    "A real Go2 never sends them: then do not command it"
+    "A real Go2 never sends them: if it is one, do not command it"
 )
 _HEADLESS: Final = slice(4, 6)
 _BATTERY: Final = slice(1040, 1084)
@@ -23,10 +23,10 @@ _SUPPLY: Final = slice(1156, 1164)
 """Bytes of a LowState that unitree_mujoco leaves 0: head; battery; voltage and current of the supply."""
 NOTICE: Final = (
     "note: the robot is the simulator unitree_mujoco. Its states have no head, clock, checksum and battery, "
-    "and it has no motion switcher: a state counts as new where it differs from the one before, its age is "
-    "that of its reception, and battery and sport mode are not checked. All other limits are the Go2's. It "
-    "holds the torques of the last command for ever: at the end damping is sent until the joints are slow, "
-    "but where deal-hw is killed (kill -9) nothing damps it"
+    "and it has no motion switcher. So a state counts as new if it differs from the one before; its age is "
+    "that of its reception. Battery and sport mode are not checked. All other limits are the Go2's. It holds "
+    "the torques of the last command for ever. At the end damping is sent until the joints are slow. If "
+    "deal-hw is killed (kill -9), nothing damps it"
 )
 
 
@@ -43,7 +43,7 @@ def decode_simulated(payload: bytes) -> LowStateFrame:
     """Return the state in a LowState of unitree_mujoco.
 
     Raises:
-        FrameError: Wrong length or header, or it fills in what the simulator leaves 0.
+        FrameError: Wrong length or header, or a field is set that the simulator leaves 0.
         VersionMismatchError: It has a head, as a real Go2's.
     """
     frame = decode_low_state(payload, strict=False)

@@ -1,4 +1,4 @@
-"""SportModeState: what the vendor's gaits say of themselves, in both layouts that exist.
+"""SportModeState: the state of the vendor's gaits, in both existing layouts.
 
 The SDK's type ends with ten path points (516 bytes with the CDR header), unitree_ros2's does not (236
 bytes); all fields before are the same. Source: IDL of unitree_sdk2 @ 21d0a3b, msg files of unitree_ros2 @
@@ -50,7 +50,7 @@ LONG: Final = packed(LONG_BYTES, {**_FIELDS, **_PATH})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SportState:
-    """What the vendor's gaits say.
+    """State of the vendor's gaits.
 
     Attributes:
         stamp_ns: The robot's time of day [ns].
@@ -60,9 +60,9 @@ class SportState:
         specific_force: Base's frame, (3,) [m/s²].
         rpy: Roll, pitch, yaw, (3,) [rad].
         imu_temperature: [°C].
-        mode: Of the gait machine.
-        progress: Of a movement, 0 to 1.
-        gait: Which gait.
+        mode: Mode of the gait machine.
+        progress: Progress of a movement, 0 to 1.
+        gait: Number of the gait.
         foot_raise_height: [m].
         position: Odometry, (3,) [m].
         body_height: [m].
@@ -72,8 +72,8 @@ class SportState:
         foot_force: (4,), legs FL, FR, RL, RR.
         foot_position: Base's frame, (4, 3) [m].
         foot_velocity: Base's frame, (4, 3) [m/s].
-        path: The points that the robot was told to follow (t, x, y, yaw, vx, vy, vyaw), (10, 7); None in the
-            short layout.
+        path: The points that the robot was commanded to follow (t, x, y, yaw, vx, vy, vyaw), (10, 7); None in
+            the short layout.
     """
 
     stamp_ns: int

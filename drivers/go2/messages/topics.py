@@ -1,4 +1,4 @@
-"""Topics of the Go2 and the types that travel on them.
+"""Topics of the Go2, and their types.
 
 Names are those of DDS, without a leading slash; zenoh-bridge-dds uses them as keys unchanged. Source:
 unitree_sdk2_python @ 37116c5 and unitree_ros2 @ eea2719.
@@ -19,13 +19,14 @@ SPORT_STATE_SLOW: Final = "rt/lf/sportmodestate"
 WIRELESS: Final = "rt/wirelesscontroller"
 
 CLAIM: Final = "rt/deal_hw/claim"
-"""Who commands the robot, said by deal-hw to deal-hw; the robot does not know it. The type is a request's."""
+"""Claim of the program that commands the robot, for other deal-hw programs; the robot ignores it. The type is
+a request's."""
 
 BRIDGE: Final = "rt/deal_hw/bridge"
-"""Who has the robot, said by deal-hw's bridge to its clients. The type is a request's."""
+"""Owner of the robot, from deal-hw's bridge to its clients. The type is a request's."""
 
 SERVICES: Final = ("motion_switcher", "sport", "robot_state")
-"""Services that answer requests: who moves the robot, the vendor's gaits, what runs on the robot."""
+"""Services that answer requests: motion switcher, the vendor's gaits, robot state."""
 
 
 def request(service: str) -> str:

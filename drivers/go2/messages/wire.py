@@ -1,9 +1,10 @@
-"""What the Go2's two low-level messages share: orders of joints, header, checksum, and checks of frames.
+"""Common parts of the Go2's two low-level messages: joint orders, header, checksum, and checks of frames.
 
-CRC-32/MPEG-2 (polynomial 0x04C11DB7, start 0xFFFFFFFF, nothing reflected, nothing inverted at the end) over
-the 32-bit words of the C struct, each taken as a little-endian number and fed most significant bit first;
-the last word, the checksum itself, is left out. The C struct aligns nested structs, CDR does not: its image
-is the CDR body with a few more bytes of padding. Source: crc32_core of unitree_sdk2_python @ 37116c5.
+The checksum is CRC-32/MPEG-2: polynomial 0x04C11DB7, start 0xFFFFFFFF, no reflection, no final inversion. It
+covers the 32-bit words of the C struct without the last one, the checksum itself. Each word is a
+little-endian number, most significant bit first. The C struct aligns nested structs, CDR does not, so the
+struct's image is the CDR body with a few more bytes of padding. Source: crc32_core of unitree_sdk2_python @
+37116c5.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ CRC_START: Final = 0xFFFF_FFFF
 
 
 def words_crc(image: bytes | bytearray, start: int = CRC_START) -> int:
-    """Return the checksum of whole 32-bit words, going on from ``start``."""
+    """Return the checksum of whole 32-bit words, continued from ``start``."""
     words = array("I", image)
     words.byteswap()
     return int(crc32.mpeg_2(words, start))
@@ -66,12 +67,12 @@ def check_frame(payload: bytes, name: str, *, head: bool = True) -> None:
     """Refuse a payload that is not a whole CDR message of this type.
 
     Args:
-        payload: What came.
+        payload: The received bytes.
         name: "LowCmd" or "LowState".
         head: Whether the message's own head counts.
 
     Raises:
-        FrameError: Wrong length, header or head; says which.
+        FrameError: Wrong length, header or head; the message names it.
     """
     size = LOW_COMMAND_BYTES if name == "LowCmd" else LOW_STATE_BYTES
     if len(payload) != size:
@@ -105,7 +106,7 @@ def verify_crc(payload: bytes, name: str) -> None:
     given = int.from_bytes(payload[-4:], "little")
     if words_crc(image(payload)) == given:
         return
-    # Padding carries nothing, and the sender's own is 0 where it hashes.
+    # Padding has no meaning, and the sender computes the checksum with 0 there.
     found = words_crc(image(_without_padding(payload, name)))
     if found != given:
         raise FrameError(f"{name}: the checksum is 0x{given:08X}, expected 0x{found:08X}: corrupt on the way")

@@ -81,7 +81,7 @@ ISR(USART_UDRE_vect)
         UCSR0B &= (uint8_t)~_BV(UDRIE0);
 }
 
-/* Queue a frame, or leave it out where it has no room: half a frame would also corrupt the next one. */
+/* Queue a frame, or drop it if it does not fit: half a frame would also corrupt the next one. */
 static void send(const uint8_t *frame, uint8_t length)
 {
     uint8_t room = (uint8_t)((tx_out - tx_in - 1) & (TX_SIZE - 1));
@@ -102,7 +102,7 @@ static void drive(int16_t pwm)
     } else {
         PORTB &= (uint8_t)~MOTOR_REVERSE;
     }
-    /* A compare value of 0 would still give one clock of every 800: the pin is taken off the timer instead. */
+    /* A compare value of 0 would still give one clock of every 800, so the pin is taken off the timer. */
     if (pwm)
         TCCR1A |= _BV(COM1A1);
     else
@@ -143,7 +143,7 @@ static void set_up(void)
     PCMSK2 = POLE_A_B;
     PCICR = _BV(PCIE1) | _BV(PCIE2);
     set_sleep_mode(SLEEP_MODE_IDLE);
-    /* A control loop that hangs resets the chip, and the motor is off. */
+    /* If the control loop hangs, the chip is reset, which switches the motor off. */
     wdt_enable(WDTO_60MS);
     sei();
 }
@@ -189,7 +189,7 @@ int main(void)
     set_up();
     for (;;) {
         if (ticks_due) {
-            GPIOR0 = 1; /* A simulator counts the cycles in between. */
+            GPIOR0 = 1; /* A simulator counts the cycles until it is 0. */
             tick();
             GPIOR0 = 0;
         } else if (rx_in != rx_out) {
@@ -209,7 +209,7 @@ int main(void)
     }
 }
 
-/* After a reset by the watchdog it still runs, with its shortest time. */
+/* After a reset by the watchdog, the watchdog still runs, with its shortest time. */
 void no_watchdog(void) __attribute__((naked, used, section(".init3")));
 void no_watchdog(void)
 {

@@ -1,7 +1,7 @@
-/* The AVR image under simavr, one millisecond a call, as a shared library for avr_device.py.
+/* The AVR image under simavr, one millisecond for each call, as a shared library for avr_device.py.
  *
- * Encoders, limit switches and the host's bytes go in; bytes, the mean of the motor's PWM and the lamps come out.
- * Edges of the encoders are spread evenly over the millisecond, bytes come as fast as 1 Mbaud carries them.
+ * Inputs: encoders, limit switches and the host's bytes. Outputs: bytes, the mean of the motor's PWM and the lamps.
+ * Edges of the encoders are spread evenly over the millisecond; bytes arrive at 1 Mbaud.
  */
 #include <stdarg.h>
 #include <stdio.h>
@@ -51,13 +51,13 @@ typedef struct {
     int32_t armed, set_pole;
     uint32_t longest_step;  /* Most cycles from the start of a control step to its end, in this call. */
     uint32_t asleep;        /* Idle cycles. */
-    uint32_t complaints;    /* Errors that the simulator saw in this call, such as a byte that came too soon. */
+    uint32_t complaints;    /* Errors of the simulator in this call, such as a byte that came too early. */
     int32_t crashed;
 } board_outputs;
 
 static uint32_t complaints;
 
-/* The simulator has a line for each byte that the chip is too slow to read: they are counted. */
+/* The simulator prints a line for each byte that the chip is too slow to read; these are counted. */
 static void count(avr_t *avr, const int level, const char *format, va_list words)
 {
     (void)avr;

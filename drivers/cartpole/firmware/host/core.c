@@ -1,4 +1,4 @@
-/* The core as a shared library for host_firmware.py: plain numbers in and out, several bytes a call. */
+/* The core as a shared library for host_firmware.py: plain numbers in and out, several bytes for each call. */
 #include "../cartpole.h"
 
 uint32_t host_size(void)

@@ -1,6 +1,6 @@
 /* Fuzz run of the frame decoder and of the whole core: random, mutated and spliced frames, from a seed.
  *
- * Usage: fuzz INPUTS SEED. Prints one line of counts; aborts where the core breaks a promise. Build it with
+ * Usage: fuzz INPUTS SEED. Prints one line of counts; aborts if the core violates an assertion. Build it with
  * -fsanitize=address,undefined. "accepted" counts corrupt frames whose CRC happened to be right.
  */
 #include <inttypes.h>
@@ -118,7 +118,7 @@ int main(int count, char **words)
             }
         }
         CHECK(!same || first);
-        /* An exact copy on the heap, so that reading one byte too far is seen. */
+        /* An exact copy on the heap, so that a read beyond its end is detected. */
         if ((out = malloc(length)) == NULL)
             return 2;
         memcpy(out, data, length);

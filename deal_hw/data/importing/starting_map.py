@@ -1,0 +1,50 @@
+"""Writes a column map to start from, for a file whose channels were not guessed, or not all of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+from deal_hw.data.importing.channels import Channels
+from deal_hw.data.importing.columns import ColumnMap, JointColumns
+from deal_hw.data.importing.guess import guess_time
+
+COLUMN = "COLUMN"
+"""Stands for a name that the user writes."""
+_QUANTITIES = ("position", "target", "velocity", "effort")
+
+
+def starting_map(
+    channels: Channels, joints: Sequence[str] | None = None, guessed: ColumnMap | None = None
+) -> list[str]:
+    """Return the lines of a column map (YAML): the guessed entries, and :data:`COLUMN` for the others.
+
+    Args:
+        channels: The file's channels.
+        joints: Names of the model's joints; None: unknown.
+        guessed: The entries that were guessed; None: none but the time.
+    """
+    time = guess_time(channels) if guessed is None else guessed.time
+    known = {} if guessed is None else {joint.name: joint for joint in guessed.joints}
+    stamps = {"time": time, "command_time": guessed.command_time if guessed else None}
+    lines = [
+        f"{name}: {{column: {COLUMN if stamp is None else json.dumps(stamp.column)}, "
+        f"unit: {'s' if stamp is None else stamp.unit}}}"
+        for name, stamp in stamps.items()
+        if stamp is not None or name == "time"
+    ]
+    for name in _QUANTITIES:
+        pattern = getattr(guessed, name, None)
+        if pattern is not None:
+            lines.append(f"{name}: {json.dumps(pattern)}")
+    names = joints or tuple(known) or ("JOINT",)
+    return [*lines, "joints:", *(f"  - {{{_entries(name, known.get(name))}}}" for name in names)]
+
+
+def _entries(name: str, joint: JointColumns | None) -> str:
+    if joint is None:
+        return f"name: {json.dumps(name)}, position: {COLUMN}, target: {COLUMN}, unit: rad"
+    values = {key: getattr(joint, key) for key in ("name", "column", "index", *_QUANTITIES, "unit")}
+    return ", ".join(
+        f"{key}: {json.dumps(value)}" for key, value in values.items() if value not in (None, "")
+    )

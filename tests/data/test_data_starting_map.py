@@ -1,0 +1,63 @@
+"""A column map to start from: printed where the channels are not guessed, read back as a column map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deal_hw.data.importing.columns import read_column_map
+from deal_hw.data.importing.load import load_tables
+from deal_hw.errors import DatasetError
+
+JOINTS = ("boom", "stick")
+
+
+def printed(path: Path, joints: tuple[str, ...] | None = JOINTS) -> list[str]:
+    """Return the lines of the column map that reading a file prints."""
+    said: list[str] = []
+    try:
+        load_tables(path, joints=joints, say=said.append)
+    except DatasetError as error:
+        said.append(str(error))
+    (start,) = (at for at, text in enumerate(said) if "a column map to start from" in text)
+    return [text for text in said[start + 1 :] if text.startswith("  ")]
+
+
+def test_unknown_channels_give_a_map_that_is_read_once_its_columns_are_named(tmp_path: Path) -> None:
+    """Time is filled in where it is known; each joint of the model has its entry."""
+    path = tmp_path / "a.csv"
+    path.write_text("time,a,b,c,d\n0,1,2,3,4\n0.1,5,6,7,8\n", encoding="utf-8")
+    lines = printed(path)
+    assert lines[0].strip() == 'time: {column: "time", unit: s}'
+    text = "\n".join(lines)
+    assert text.count("COLUMN") == 4
+    for name in "abcd":
+        text = text.replace("COLUMN", name, 1)
+    (tmp_path / "columns.yaml").write_text(text, encoding="utf-8")
+    (table,) = load_tables(path, read_column_map(tmp_path / "columns.yaml"), JOINTS)
+    assert table.position.tolist() == [[1, 3], [5, 7]] and table.target.tolist() == [[2, 4], [6, 8]]
+
+
+def test_an_unknown_time_and_no_model_leave_their_places_open(tmp_path: Path) -> None:
+    """Neither is invented."""
+    path = tmp_path / "a.csv"
+    path.write_text("zeit,a_pos\n0,1\n1,5\n", encoding="utf-8")
+    assert printed(path, None) == [
+        "  time: {column: COLUMN, unit: s}",
+        "  joints:",
+        '    - {name: "JOINT", position: COLUMN, target: COLUMN, unit: rad}',
+    ]
+
+
+@pytest.mark.parametrize("header", ["t_ms,boom_pos_deg,boom_cmd,x", 't_ms,"boom pos deg",boom_cmd,x'])
+def test_a_joint_that_was_not_found_is_added_to_the_guessed_ones(header: str, tmp_path: Path) -> None:
+    """The guessed entries are kept, with their units, and quoted where YAML needs it."""
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n0,180,2,3\n10,90,6,7\n", encoding="utf-8")
+    text = "\n".join(printed(path)).replace("position: COLUMN", "position: x").replace(", target: COLUMN", "")
+    (tmp_path / "columns.yaml").write_text(text, encoding="utf-8")
+    (guessed,), (table,) = load_tables(path), load_tables(path, read_column_map(tmp_path / "columns.yaml"))
+    assert table.position[:, 0].tolist() == guessed.position[:, 0].tolist()
+    assert table.position[:, 0] == pytest.approx([3.14159265, 1.57079633])
+    assert table.position[:, 1].tolist() == [3, 7] and table.time_s.tolist() == [0, 0.01]
