@@ -8,7 +8,8 @@ Each row is an emulator with hidden physics in a process of its own. 4 s of moti
 default settings, and 4 s of `chirp` judge. Two runs over one wire differ, too: they are in real time, and a
 balancing pole is chaotic, so each demonstration shows different parameters. So a seed is run several times
 (--repeats), and the interval beside each error shows what its recording determines. Parameters that a wire's
-device does not have are left out: an ODrive's set-point is moved by the host.
+device does not have are left out: an ODrive's set-point is moved by the host. The wire `firmware` is serial,
+with the firmware of the ATmega328P in simavr at its end.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from deal_hw.errors import DealHwError
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.settings import LinkOptions
 
+FIRMWARE = "firmware"
 NOT_THERE = {"odrive": ("servo.speed_limit",)}
 """Parameters that a wire's device does not have."""
 
@@ -46,7 +48,10 @@ def measure(transport: str, profile: str, seed: int) -> dict[str, Any]:
 
 def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[str, Any]:
     truth_file, run = folder / "truth.json", folder / "run"
-    options = ("--transport", transport, "--profile", profile, "--seed", str(seed))
+    options: tuple[str, ...] = ("--profile", profile, "--seed", str(seed))
+    if transport == FIRMWARE:
+        transport, options = "serial", (*options, "--firmware", "avr")
+    options = ("--transport", transport, *options)
     with EmulatorProcess("cartpole", *options, "--reveal-to", str(truth_file)) as emulator:
         for kind in ("rich", "chirp"):
             collect(
@@ -118,7 +123,9 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> int:
     """Measure the rows and print them as a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--transports", nargs="+", default=["serial", "can", "odrive", "dynamixel"])
+    parser.add_argument(
+        "--transports", nargs="+", default=["serial", "firmware", "can", "odrive", "dynamixel"]
+    )
     parser.add_argument("--profile", default="sensor")
     parser.add_argument("--seeds", type=parse_seeds, default=(1, 2, 3), help="such as 1,2,3 or 0-9")
     parser.add_argument("--repeats", type=int, default=1)
