@@ -2,7 +2,8 @@
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,10 @@ from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError
-from deal_hw.testing.robot_suite import default_command
+from deal_hw.testing.fake_device import FakeDevice
+from deal_hw.testing.faults import FaultyTransport, OneBadFrame
+from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.transport import Transport
 from deal_hw.types import Status
 
 MS = 1_000_000
@@ -287,13 +291,37 @@ def test_without_the_tools_they_are_named(monkeypatch: pytest.MonkeyPatch) -> No
 class Bench:
     """A chip on an emulated cart-pole, and the driver."""
 
-    def __init__(self, truth: CartpoleTruth) -> None:
+    def __init__(self, truth: CartpoleTruth, wrap: Callable[[Transport], Transport] = lambda t: t) -> None:
         """Start the chip: it does not hear what comes before."""
         self.clock = VirtualClock()
         self.device = AvrDevice(truth, start_angle_rad=0.02)
         self.device.advance_to(20 * MS)
         self.clock.advance_ns(self.device.device_ns)
-        self.robot = CartpoleRobot(VirtualTransport(self.device, self.clock), self.clock)
+        self.virtual = VirtualTransport(self.device, self.clock)
+        self.robot = CartpoleRobot(wrap(self.virtual), self.clock)
+
+
+def fake(answer: bytes) -> CartpoleRobot:
+    """Return a driver in front of a device that always says the same."""
+    clock = VirtualClock()
+    return CartpoleRobot(VirtualTransport(FakeDevice(answer), clock), clock)
+
+
+class TestCartpoleOnTheChip(RobotSuite):
+    @pytest.fixture
+    def bench(self) -> Iterator[RobotBench]:
+        fault = OneBadFrame(10)
+        chip = Bench(nominal_truth("ideal"), lambda transport: FaultyTransport(transport, received=fault))
+        known = Info(1, "cartpole", (2, 3, 4), 1000, 200, 1)
+        yield RobotBench(
+            robot=chip.robot,
+            foreign=fake(protocol.encode(replace(known, kind="toaster"))),
+            newer=fake(protocol.encode(replace(known, version=2))),
+            silent=fake(b""),
+            unplug=chip.virtual.unplug,
+            corrupt=fault.corrupt_next,
+        )
+        chip.device.close()
 
 
 @pytest.mark.slow
