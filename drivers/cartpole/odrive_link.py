@@ -29,6 +29,7 @@ from deal_hw.drivers.cartpole.odrive_frames import (
     Command,
     pack,
 )
+from deal_hw.drivers.command_echo import ClockOffset, CommandEcho
 from deal_hw.errors import ConfigurationError, FrameError
 from deal_hw.types import Status
 
@@ -141,14 +142,14 @@ class OdriveLink:
     the drive has no speed limit that leaves its control law unchanged.
 
     The drive does not report which command it received. A state names the newest command sent before the
-    state was sampled. The encoder's clock decides that; this class extrapolates it between samples.
+    state was sampled, by the encoder's clock.
 
     Attributes:
         errors: Number of corrupt or unknown messages.
 
     Args:
         settings: Numbers and mechanics of the parts.
-        clock: Extrapolates the encoder's clock between samples.
+        clock: The clock of commands, and of samples as they arrive.
     """
 
     resync: ClassVar[bytes] = b""
@@ -163,9 +164,9 @@ class OdriveLink:
         self._turns = 0.0
         self._zero_m: float | None = None
         self._homing = False
-        self._device_us, self._heard_ns, self._sequence = 0, clock.now_ns(), -1
+        self._device_us, self._sequence = 0, -1
         self._heartbeat_us: int | None = None
-        self._sent: list[tuple[int, int]] = []
+        self._offset, self._echo = ClockOffset(), CommandEcho()
         self._setpoint_um: int | None = None
         self._info: protocol.Info | None = None
         self._written: dict[int, bytes] = {}
@@ -227,7 +228,8 @@ class OdriveLink:
         match message:
             case protocol.Hello():
                 self._info, self._heartbeat_us, self._written = None, None, {}
-                self._sent, self._armed, self._arming = [], False, None
+                self._armed, self._arming = False, None
+                self._offset, self._echo = ClockOffset(), CommandEcho()
                 return idle + self._watchdog_frames() + self._encoder.encode(message)
             case protocol.Home():
                 self._homing, self._zero_m, self._armed = True, None, False
@@ -307,8 +309,7 @@ class OdriveLink:
 
     def _target(self, target: protocol.Target) -> bytes:
         self._setpoint_um = target.position_um
-        now_us = self._device_us + (self._clock.now_ns() - self._heard_ns) // 1000
-        self._sent = [*self._sent[-63:], (now_us, target.sequence)]
+        self._echo.note(target.sequence, self._clock.now_ns())
         wanted = drive_command(target, self._s)
         turns = (target.position_um / 1e6 + (self._zero_m or 0.0)) / self._s.metres_per_turn
         return (
@@ -369,7 +370,7 @@ class OdriveLink:
         passed_us = (angle.device_us - self._device_us) & _U32
         self._sequence = (self._sequence + (((angle.sequence - self._sequence - 1) & 0xFF) + 1)) & _U32
         self._device_us += passed_us
-        self._heard_ns = self._clock.now_ns()
+        self._offset.take(self._clock.now_ns(), 1000 * self._device_us)
         # After a silence, as between two processes, the heartbeat's time is set anew.
         if self._heartbeat_us is not None and passed_us > self._s.heartbeat_age_s * 1e6:
             self._heartbeat_us = self._device_us
@@ -385,9 +386,7 @@ class OdriveLink:
         lost = AxisError.WATCHDOG_TIMER_EXPIRED
         status |= Status.WATCHDOG if self._axis_errors & lost else Status.NONE
         status |= Status.FAULT if self._axis_errors & ~lost else Status.NONE
-        then_us, newest = next(
-            ((us, number) for us, number in reversed(self._sent) if us <= self._device_us), (0, -1)
-        )
+        newest, age_ns = self._echo.at(1000 * self._device_us, self._offset.offset_ns)
         yield protocol.State(
             sequence=self._sequence,
             device_us=self._device_us,
@@ -398,7 +397,7 @@ class OdriveLink:
             effort_mn=self._force_mn if status & Status.ARMED else 0,
             status=int(status),
             command_sequence=newest if newest >= 0 else protocol.NO_COMMAND,
-            command_age_us=min(self._device_us - then_us, _U32) if newest >= 0 else 0,
+            command_age_us=min(age_ns // 1000, _U32) if newest >= 0 else 0,
         )
 
 

@@ -1,10 +1,10 @@
-"""The stream of LowStates: what is sound and new in it, when it was sensed, and what was commanded then."""
+"""The stream of LowStates: what is sound and new in it, and when it was sensed."""
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Final, get_args
 
+from deal_hw.drivers.command_echo import ClockOffset
 from deal_hw.drivers.go2.messages.protocol import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.errors import FrameError, ProtocolError, TransportLostError, UnknownNameError
@@ -13,9 +13,6 @@ from deal_hw.transport import Message
 PERIOD_MS: Final = 2
 RESTART_MS: Final = 1000
 """A clock that goes back further than this was restarted; by less, a state was overtaken."""
-OFFSET_WINDOW_NS: Final = 1_000_000_000
-"""The clocks' offset is the least of one to two such times: a robot whose clock stood still for a moment
-(a computer that paused) is behind for good, and commands are placed by this offset."""
 _ONE_ROBOT: Final = 0.4
 """A larger share of states that are not new, and two robots send them."""
 _U32: Final = 1 << 32
@@ -30,7 +27,6 @@ class StateStream:
         stale: States so far that were no newer than the one before.
         sequence: Number of the newest state, counted in periods of the robot's clock.
         device_ns: The robot's clock at the newest state, without its wraps [ns].
-        offset_ns: Host clock minus robot clock, at the fastest transit of the last moments [ns].
 
     Args:
         check: What a state must pass.
@@ -47,10 +43,10 @@ class StateStream:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.errors = self.accepted = self.stale = self.device_ns = self.offset_ns = 0
+        self.errors = self.accepted = self.stale = self.device_ns = 0
+        self._offset = ClockOffset()
         self.sequence = -1
         self._tick: int | None = None
-        self._recent_ns = self._former_ns = self._window_ns = 0
         self._refused = Refusals()
 
     def take(self, message: Message) -> LowStateFrame | None:
@@ -85,8 +81,13 @@ class StateStream:
         self.sequence += max(step // PERIOD_MS, 1)
         self._tick = tick
         self.accepted += 1
-        self._keep_time(message.stamp_ns, first)
+        self._offset.take(message.stamp_ns, self.device_ns)
         return frame
+
+    @property
+    def offset_ns(self) -> int:
+        """Host clock minus robot clock, at the fastest transit of the last moments [ns]."""
+        return self._offset.offset_ns
 
     @property
     def doubled(self) -> bool:
@@ -101,39 +102,3 @@ class StateStream:
     def complaint(self) -> ProtocolError | None:
         """Return what is wrong where states come and none is sound; None where none came, or some are."""
         return None if self.accepted or not self._refused.count else self._refused.error()
-
-    def _keep_time(self, receive_ns: int, first: bool) -> None:
-        offset = receive_ns - self.device_ns
-        if first or receive_ns - self._window_ns > OFFSET_WINDOW_NS:
-            self._former_ns = offset if first else self._recent_ns
-            self._recent_ns, self._window_ns = offset, receive_ns
-        self._recent_ns = min(self._recent_ns, offset)
-        self.offset_ns = min(self._former_ns, self._recent_ns)
-
-
-class CommandEcho:
-    """Knows which command was in force when a state was sensed: the robot does not say it."""
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all commands."""
-        self._sent: deque[tuple[int, int]] = deque(maxlen=4096)
-        self._in_force: tuple[int, int] | None = None
-
-    def note(self, sequence: int, stamp_ns: int) -> None:
-        """A new command went out at a time of the host's clock [ns]."""
-        self._sent.append((sequence, stamp_ns))
-
-    def at(self, device_ns: int, offset_ns: int) -> tuple[int, int]:
-        """Return number and age [ns] of the command in force at a time of the robot's clock; (-1, -1): none.
-
-        When a command went out by the robot's clock is settled once, so that ages grow as the clock does.
-        """
-        while self._sent and self._sent[0][1] - offset_ns < device_ns:
-            sequence, stamp_ns = self._sent.popleft()
-            self._in_force = sequence, stamp_ns - offset_ns
-        if self._in_force is None:
-            return -1, -1
-        return self._in_force[0], device_ns - self._in_force[1]

@@ -212,9 +212,24 @@ def test_a_state_names_the_newest_command_that_was_sent_before_it() -> None:
     states(link, sample(1))
     clock.advance_ns(3 * MS)
     link.encode(TARGET)
-    before, after = states(link, sample(2, us=7_999) + sample(3, us=10_000))
+    (before,) = states(link, sample(2, us=7_999))
+    clock.advance_ns(2 * MS)
+    (after,) = states(link, sample(3, us=10_000))
     assert (before.command_sequence, before.command_age_us) == (protocol.NO_COMMAND, 0)
     assert (after.command_sequence, after.command_age_us) == (3, 2_000)
+
+
+def test_a_sample_that_is_read_late_does_not_move_the_commands() -> None:
+    """A sample is read 9 ms late, and the next command is sent then: it is placed by the fastest samples."""
+    clock = VirtualClock()
+    link = OdriveLink(PARTS, clock)
+    states(link, sample(1))
+    clock.advance_ns(14 * MS)
+    states(link, sample(2, us=10_000))
+    link.encode(TARGET)
+    clock.advance_ns(6 * MS)
+    (after,) = states(link, sample(3, us=25_000))
+    assert (after.command_sequence, after.command_age_us) == (3, 6_000)
 
 
 def test_values_that_are_none_are_counted() -> None:

@@ -1,0 +1,61 @@
+"""Which command was in force when a state was sensed, for robots that do not say it."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+OFFSET_WINDOW_NS: Final = 1_000_000_000
+"""The clocks' offset is the least of one to two such times: a robot whose clock stood still for a moment
+(a computer that paused) is behind for good, and commands are placed by this offset."""
+
+
+class ClockOffset:
+    """Host clock minus robot clock, at the fastest transit of the last moments.
+
+    A state that waits on its way, or until somebody reads it, arrives late. Only the fastest show the offset.
+
+    Attributes:
+        offset_ns: The offset [ns].
+    """
+
+    def __init__(self) -> None:
+        self.offset_ns = self._recent_ns = self._former_ns = self._window_ns = 0
+        self._first = True
+
+    def take(self, receive_ns: int, device_ns: int) -> None:
+        """A state came, with its time by both clocks [ns]."""
+        offset = receive_ns - device_ns
+        if self._first or receive_ns - self._window_ns > OFFSET_WINDOW_NS:
+            self._former_ns = offset if self._first else self._recent_ns
+            self._recent_ns, self._window_ns, self._first = offset, receive_ns, False
+        self._recent_ns = min(self._recent_ns, offset)
+        self.offset_ns = min(self._former_ns, self._recent_ns)
+
+
+class CommandEcho:
+    """Knows which command was in force when a state was sensed: the robot does not say it."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all commands."""
+        self._sent: deque[tuple[int, int]] = deque(maxlen=4096)
+        self._in_force: tuple[int, int] | None = None
+
+    def note(self, sequence: int, stamp_ns: int) -> None:
+        """A new command went out at a time of the host's clock [ns]."""
+        self._sent.append((sequence, stamp_ns))
+
+    def at(self, device_ns: int, offset_ns: int) -> tuple[int, int]:
+        """Return number and age [ns] of the command in force at a time of the robot's clock; (-1, -1): none.
+
+        When a command went out by the robot's clock is settled once, so that ages grow as the clock does.
+        """
+        while self._sent and self._sent[0][1] - offset_ns < device_ns:
+            sequence, stamp_ns = self._sent.popleft()
+            self._in_force = sequence, stamp_ns - offset_ns
+        if self._in_force is None:
+            return -1, -1
+        return self._in_force[0], device_ns - self._in_force[1]
