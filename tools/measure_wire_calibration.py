@@ -27,11 +27,13 @@ from deal_hw.bench.rows import write_rows
 from deal_hw.cli.bench import parse_seeds
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.errors import DealHwError
+from deal_hw.errors import DealHwError, InsufficientDataError
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.settings import LinkOptions
 
 FIRMWARE = "firmware"
+TRIES = 3
+"""A recording is made again where a pause of this computer made the safety filter end it too early."""
 NOT_THERE = {"odrive": ("servo.speed_limit",)}
 """Parameters that a wire's device does not have."""
 
@@ -39,11 +41,16 @@ NOT_THERE = {"odrive": ("servo.speed_limit",)}
 def measure(transport: str, profile: str, seed: int) -> dict[str, Any]:
     """Run one row and keep its errors."""
     row: dict[str, Any] = {"transport": transport, "profile": profile, "seed": seed, "error": ""}
-    with tempfile.TemporaryDirectory() as place:
-        try:
-            return row | _calibrated(Path(place), transport, profile, seed)
-        except DealHwError as error:
-            return row | {"error": f"{type(error).__name__}: {error}"}
+    for tries in range(1, TRIES + 1):
+        row["tries"] = tries
+        with tempfile.TemporaryDirectory() as place:
+            try:
+                return row | _calibrated(Path(place), transport, profile, seed) | {"error": ""}
+            except InsufficientDataError as error:
+                row["error"] = f"{type(error).__name__}: {error}"
+            except DealHwError as error:
+                return row | {"error": f"{type(error).__name__}: {error}"}
+    return row
 
 
 def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[str, Any]:
