@@ -124,22 +124,22 @@ class PosteriorShape:
 def correlation_time(residuals: tuple[FloatArray, ...]) -> float:
     """Return the integrated autocorrelation time of whitened residuals, (W, H, J) each, in samples.
 
-    White residuals have 1.
+    It is that of the worst channel, over all recordings: each recording alone is short, and the worst of many
+    would be far from white by chance. White residuals have 1.
     """
     worst = 1.0
-    for r in residuals:
-        H = r.shape[1]
-        power = np.mean(r**2, axis=(0, 1))
-        for j in range(r.shape[2]):
-            if power[j] <= 0:
-                continue
-            total = 1.0
-            for lag in range(1, min(SETTINGS.lags, H - 1) + 1):
-                rho = float(np.mean(r[:, lag:, j] * r[:, :-lag, j]) / power[j])
-                if rho <= 2.0 / np.sqrt(r[:, lag:, j].size):
-                    break
-                total += 2 * rho
-            worst = max(worst, total)
+    for channel in zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True):
+        power = sum(float(np.sum(r**2)) for r in channel) / sum(r.size for r in channel)
+        if power <= 0:
+            continue
+        total = 1.0
+        for lag in range(1, min(SETTINGS.lags, channel[0].shape[1] - 1) + 1):
+            pairs = sum(r[:, lag:].size for r in channel)
+            rho = sum(float(np.sum(r[:, lag:] * r[:, :-lag])) for r in channel) / (pairs * power)
+            if rho <= 2.0 / np.sqrt(pairs):
+                break
+            total += 2 * rho
+        worst = max(worst, total)
     return worst
 
 

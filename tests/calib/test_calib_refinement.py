@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
@@ -224,6 +226,13 @@ def test_correlation_time_by_hand() -> None:
     white = rng.normal(size=(20, 200, 1))
     assert correlation_time((white,)) == pytest.approx(1.0, abs=0.1)
     assert correlation_time((white[:, 1:] + white[:, :-1],)) == pytest.approx(2.0, abs=0.15)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_many_short_recordings_are_no_less_white_than_a_long_one(seed: int) -> None:
+    """Ten of 480 samples: the worst of ten is beyond two standard errors now and then, not all together."""
+    white = np.random.default_rng(seed).normal(size=(10, 3, 160, 2))
+    assert correlation_time(tuple(white)) < MISMATCH.white_samples
 
 
 def _two(low: float = 0.2, high: float = 5.0) -> ParameterSpace:
