@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -61,25 +62,49 @@ SHORT = Recipe(seconds=0.2)
 """Windows in which even a distant start does not diverge."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OutputErrorFit:
-    """Result of an output-error fit, with predictions linearised there.
+    """Result of an output-error fit.
 
     Attributes:
         theta: Physical parameters, (K,).
         latency_s: Total latency [s].
         scale: Scale of each channel's residuals, (M,): the root mean square; for a robust loss at most the
             scaled median.
-        normal: Normal equations of weighted residuals and of the parameters' own priors, with their rows;
-            zero for a fixed latency. Its residuals are divided by ``scale``.
         iterations: Steps used.
+        plain: The windows, with the sensors' noise.
+        weighed: The windows, with ``scale`` and the residuals' correlation time.
+        point: The solver's point.
+        fixed_latency: Whether the latency was not fitted.
+        central: Whether predictions are linearised by central differences, which an uncertainty needs.
     """
 
     theta: FloatArray
     latency_s: float
     scale: FloatArray
-    normal: Normal
     iterations: int
+    plain: Shooting
+    weighed: Shooting
+    point: Point
+    fixed_latency: bool
+    central: bool
+
+    @cached_property
+    def normal(self) -> Normal:
+        """Normal equations of weighted residuals and of the parameters' own priors, with their rows.
+
+        They are zero for a fixed latency. The residuals are divided by ``scale``.
+        """
+        normal = self.weighed.normal(self.point, keep=True, central=self.central)
+        free = np.append(np.ones(len(self.theta)), 0.0 if self.fixed_latency else 1.0)
+        left = zip(self.plain.data, self.plain.residuals(self.point), strict=True)
+        return dataclasses.replace(
+            normal,
+            hessian=normal.hessian * np.outer(free, free),
+            gradient=normal.gradient * free,
+            rows=tuple(dataclasses.replace(r, parameter=r.parameter * free) for r in normal.rows),
+            residual=tuple(_errors(d, r) / self.scale for d, r in left),
+        )
 
 
 def fit_output_error(
@@ -98,8 +123,8 @@ def fit_output_error(
         theta: Start, (K,).
         latency_s: Its latency [s].
         recipe: Settings.
-        iterations: Most steps; 0 to linearise at the start, the recipe's by default.
-        central: Linearise the result by central differences, which its uncertainty needs.
+        iterations: Most steps; 0 to stay at the start, the recipe's by default.
+        central: See :class:`OutputErrorFit`.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -128,18 +153,9 @@ def fit_output_error(
         if not before - normal.cost > recipe.converged * before:
             break
     weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf)
-    normal = weighed.normal(point, keep=True, central=central)
-    free = np.append(np.ones(len(space)), 0.0 if fixed else 1.0)
-    normal = dataclasses.replace(
-        normal,
-        hessian=normal.hessian * np.outer(free, free),
-        gradient=normal.gradient * free,
-        rows=tuple(dataclasses.replace(r, parameter=r.parameter * free) for r in normal.rows),
-        residual=tuple(
-            _errors(d, r) / scale for d, r in zip(plain.data, plain.residuals(point), strict=True)
-        ),
+    return OutputErrorFit(
+        plain.theta(point), float(point.value[-1]), scale, used, plain, weighed, point, fixed, central
     )
-    return OutputErrorFit(plain.theta(point), float(point.value[-1]), scale, normal, used)
 
 
 def prediction_rmse(
