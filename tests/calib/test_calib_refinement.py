@@ -164,7 +164,8 @@ def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal:
     """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
     search = FixedSearch(ideal.theta, 0.021, 0.05)
-    result = CalibrationPipeline(search).run(problem, Budget(), np.random.default_rng(0))
+    method = CalibrationPipeline(search, fits=Refinement(RestartSettings(drawn=1)))
+    result = method.run(problem, Budget(), np.random.default_rng(0))
     assert len(search.budgets) >= 2
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
