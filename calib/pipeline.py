@@ -115,6 +115,7 @@ class CalibrationRun:
         attempts: Runs the search on all recordings and stores its results.
         settings: Which checks to run.
         local: The local fit, if there is one.
+        suspected: Whether an error of the recordings explains them: then no other minimum is looked for.
         progress: Receives progress reports.
     """
 
@@ -125,6 +126,7 @@ class CalibrationRun:
     attempts: Restarts
     settings: Validation
     local: Refined | None = None
+    suspected: bool = False
     progress: ProgressCallback | None = None
 
     def say(self, stage: str, message: str) -> None:
@@ -275,7 +277,7 @@ class Refinement(Fits):
             run.offer("search", searched)
             left -= len(searched.trace)
             refined = refined_from(run, searched.estimate, searched.latency_s)
-            if attempt == 0 and refined.chi2 >= settings.explained:
+            if attempt == 0 and refined.chi2 >= settings.explained and not run.suspected:
                 refined = lower_minimum(run, refined, settings) or refined
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or self._better(refined, best[1]):
@@ -428,7 +430,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         suspect = find_shared_error(problem, local)
     if suspect is not None:
         run.say(BEFORE_SEARCH, str(suspect.alarm))
-    found = fits.best(run)
+    found = fits.best(dataclasses.replace(run, suspected=suspect is not None))
     if suspect is None or not suspect.confirmed(found.theta, found.latency_s):
         return found
     known = dataclasses.replace(found.known, alarms=(suspect.alarm, *found.known.alarms))
