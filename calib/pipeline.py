@@ -218,7 +218,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         white = local is not None and conclusive(problem, local, MISMATCH.white_samples)
         if local is not None and not white and conclusive(problem, local):
             lower = lower_minimum(run, local, RESTARTS)
-            white, local = lower is None, lower or local
+            local = lower or local
+            white = lower is None or conclusive(problem, lower, MISMATCH.white_samples)
         if local is not None and white:
             found = conclude_fit(run, without_search(problem, budget, local), local)
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
@@ -329,13 +330,14 @@ def lower_minimum(run: CalibrationRun, found: Refined, settings: RestartSettings
     The first that noise explains is taken, otherwise the lowest.
     """
     part, shortest = part_of(run.problem, REFINEMENT.local_s), window_stages(run.problem)[:1]
+    run_part = dataclasses.replace(run, problem=part)
     draws = settings.drawn if part.robot.base is None else settings.contact_drawn
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
     best: Refined | None = None
     least = (1.0 - settings.same) * found.chi2
     for theta in part.space.sample(rng, draws):
-        tried = refined_from(dataclasses.replace(run, problem=part), theta, part.first_latency_s, shortest)
+        tried = refined_from(run_part, theta, part.first_latency_s, shortest)
         if tried.chi2 < least:
             best, least = tried, tried.chi2
             if least < settings.explained:
