@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import select
 import threading
 
 from deal_hw.clock import Clock
+from deal_hw.drivers.transports.arrivals import Arrivals
 
 _READ_SIZE = 4096
 
@@ -28,8 +28,7 @@ class ReadAhead:
 
     def __init__(self, fd: int, clock: Clock) -> None:
         self._fd, self._clock = fd, clock
-        # No SimpleQueue: a signal that comes as its time-out ends makes it wait for ever (CPython 3.11).
-        self._arrived: queue.Queue[tuple[int, bytes | OSError]] = queue.Queue()
+        self._arrived: Arrivals[tuple[int, bytes | OSError]] = Arrivals()
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._run, name="tty read-ahead", daemon=True)
         self._thread.start()
@@ -37,8 +36,8 @@ class ReadAhead:
     def take(self, timeout_s: float) -> tuple[int, bytes | OSError] | None:
         """Return what came next, stamp [ns] and bytes (none: hung up) or the error; None after the time."""
         try:
-            arrived = self._arrived.get(timeout=timeout_s) if timeout_s > 0 else self._arrived.get_nowait()
-        except queue.Empty:
+            arrived = self._arrived.take(timeout_s)
+        except TimeoutError:
             return None
         if _is_last(arrived[1]):
             # The thread has ended: whoever asks again shall hear it again.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
-import queue
 import re
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.transports import zenoh_session
+from deal_hw.drivers.transports.arrivals import Arrivals
 from deal_hw.drivers.transports.zenoh_stamps import Echoes
 from deal_hw.errors import (
     ConfigurationError,
@@ -78,8 +78,7 @@ class ZenohTransport(TopicTransport):
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._threads: list[threading.Thread] = []
-        # No SimpleQueue: a signal that comes as its time-out ends makes it wait for ever (CPython 3.11).
-        self._arrived: queue.Queue[Message | None] = queue.Queue()
+        self._arrived: Arrivals[Message | None] = Arrivals(_AT_HAND)
         self._lost = False
         self._heard_ns = 0
         # A daemon thread that is inside Zenoh when the interpreter ends makes the process abort, so close()
@@ -112,7 +111,7 @@ class ZenohTransport(TopicTransport):
         """
         if self._session is not None:
             return
-        self._arrived, self._lost = queue.Queue(), False
+        self._arrived, self._lost = Arrivals(_AT_HAND), False
         self._echoes = None if self._options.listen else Echoes()
         self._heard_ns = self._clock.now_ns()
         self._session = self._open_session()
@@ -183,8 +182,8 @@ class ZenohTransport(TopicTransport):
         """Return the next message of the subscribed topics."""
         self._opened()
         try:
-            message = self._arrived.get(timeout=timeout_s) if timeout_s > 0 else self._arrived.get_nowait()
-        except queue.Empty:
+            message = self._arrived.take(timeout_s)
+        except TimeoutError:
             if self._lost:
                 raise self._gone() from None
             raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s") from None
@@ -264,7 +263,7 @@ class ZenohTransport(TopicTransport):
         self,
         topic: str,
         subscriber: zenoh.Subscriber[Handler[zenoh.Sample]],
-        arrived: queue.Queue[Message | None],
+        arrived: Arrivals[Message | None],
     ) -> None:
         for sample in _until_closed(subscriber.recv):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
@@ -272,14 +271,11 @@ class ZenohTransport(TopicTransport):
                 self._echoes.hear(attachment)
             self._heard_ns = now_ns = self._clock.now_ns()
             arrived.put(Message(topic, sample.payload.to_bytes(), now_ns, attachment))
-            if arrived.qsize() > _AT_HAND:
-                with contextlib.suppress(queue.Empty):
-                    arrived.get_nowait()
 
     def _follow_links(
         self,
         events: zenoh.TransportEventsListener[Handler[zenoh.TransportEvent]],
-        arrived: queue.Queue[Message | None],
+        arrived: Arrivals[Message | None],
     ) -> None:
         import zenoh
 
