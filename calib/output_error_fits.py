@@ -128,6 +128,8 @@ class OutputErrorFits(Fits):
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
         settings, problem = self.settings, run.problem
+        # The fits continue from the search's estimate, so it only has to find the neighbourhood.
+        run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
         if run.settings.cross_validation:
             problem = _joined_stretches(problem)
         if np.isfinite(settings.fitted_s):
@@ -242,17 +244,20 @@ class OutputErrorFits(Fits):
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
         rmse = prediction_rmse(problem, [found["search"], short], settings.compared_s)
         start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
+        fits: list[Member] = []
         for words, prior_std in settings.priors.items():
-            if only is not None and words != settings.prior_of(only):
-                continue
-            windows = [start]
-            for seconds in windows_s:
+            before, fits = fits, []
+            for k, seconds in enumerate(windows_s):
                 recipe = Recipe(seconds=seconds, prior_std=prior_std, robust=settings.robust)
-                windows.append(_member(fit_output_error(problem, *windows[-1], recipe)))
-            for seconds, member in zip(windows_s[:-1], windows[1:], strict=False):
+                # Another prior moves a fit little, so it begins where the fit with the one before ended.
+                begin = before[k] if before else fits[-1] if fits else start
+                fits.append(_member(fit_output_error(problem, *begin, recipe)))
+            for seconds, member in zip(windows_s[:-1], fits, strict=False):
                 found[f"{seconds:g} s{words}"] = member
-            found["long" + words] = windows[-1]
-            found["mean of windows" + words] = _mean(problem, windows[1:])
+            found["long" + words] = fits[-1]
+            found["mean of windows" + words] = _mean(problem, fits)
+            if only is not None and words == settings.prior_of(only):
+                break
         for name, recipe in settings.variants.items():
             if only in (None, name):
                 theta, latency_s = found["long"]

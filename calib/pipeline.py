@@ -69,6 +69,7 @@ class RestartSettings:
         drawn: Most refinements from points drawn in the ranges, before another search. On cart-poles whose
             nominal values lead to another minimum, about one in four of these points leads to the truth.
         contact_drawn: The same with feet on the floor, where a refinement takes as long as a search.
+        evidence: Least gain in deviance of a lower minimum [-]: 20 is odds of 22,000 to 1.
     """
 
     restarts: int = 2
@@ -77,6 +78,7 @@ class RestartSettings:
     explained: float = MISMATCH.chi2
     drawn: int = 8
     contact_drawn: int = 0
+    evidence: float = 20.0
 
 
 RESTARTS = RestartSettings()
@@ -217,9 +219,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         # Another minimum can leave a residual as small as noise, but with a pattern.
         white = local is not None and conclusive(problem, local, MISMATCH.white_samples)
         if local is not None and not white and conclusive(problem, local):
-            lower = lower_minimum(run, local, RESTARTS)
-            local = lower or local
-            white = lower is None or conclusive(problem, lower, MISMATCH.white_samples)
+            local = lower_minimum(run, local, RESTARTS) or local
+            white = conclusive(problem, local)
         if local is not None and white:
             found = conclude_fit(run, without_search(problem, budget, local), local)
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
@@ -281,7 +282,7 @@ class Refinement(Fits):
             if attempt == 0 and refined.chi2 >= settings.explained and not run.suspected:
                 refined = lower_minimum(run, refined, settings) or refined
             previous = best[1].chi2 if best is not None else np.inf
-            if best is None or self._better(refined, best[1]):
+            if best is None or better(refined, best[1], settings):
                 best = (searched, refined)
             elif attempt == 1:
                 # Cross-validation compares the refinement with a search that used its whole budget.
@@ -299,15 +300,6 @@ class Refinement(Fits):
                 best = (best[0], local)
         return conclude_fit(run, *best, self._choose(run, *best), attempt)
 
-    def _better(self, a: Refined, b: Refined) -> bool:
-        """Return whether ``a`` is the better fit; window length counts only where both are explained."""
-        if (
-            all(fit.chi2 < self.restarts.explained for fit in (a, b))
-            and a.shooting.length != b.shooting.length
-        ):
-            return a.shooting.length > b.shooting.length
-        return a.chi2 < b.chi2
-
     def _choose(self, run: CalibrationRun, searched: CalibrationResult, refined: Refined) -> Choice | None:
         """Return the choice of cross-validation; None where the fit explains all but the noise."""
         # A fold is a search and a refinement. With contacts these take a minute each.
@@ -324,25 +316,38 @@ class Refinement(Fits):
         return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
 
 
+def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
+    """Return whether ``a`` is the better fit; window length counts only where both are explained."""
+    both = all(fit.chi2 < settings.explained for fit in (a, b))
+    if both and a.shooting.length != b.shooting.length:
+        return a.shooting.length > b.shooting.length
+    return a.chi2 < b.chi2
+
+
 def lower_minimum(run: CalibrationRun, found: Refined, settings: RestartSettings) -> Refined | None:
     """Return the refinement from a drawn point that ends in a lower minimum; None where none does.
 
-    The first that noise explains is taken, otherwise the lowest.
+    Points are compared on a part of the recordings. The first whose residual is white is taken, otherwise the
+    lowest.
     """
     part, shortest = part_of(run.problem, REFINEMENT.local_s), window_stages(run.problem)[:1]
     run_part = dataclasses.replace(run, problem=part)
     draws = settings.drawn if part.robot.base is None else settings.contact_drawn
+    if not draws:
+        return None
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
-    best: Refined | None = None
-    least = (1.0 - settings.same) * found.chi2
+    same = best = refined_from(run_part, found.theta, found.latency_s, shortest)
     for theta in part.space.sample(rng, draws):
         tried = refined_from(run_part, theta, part.first_latency_s, shortest)
-        if tried.chi2 < least:
-            best, least = tried, tried.chi2
-            if least < settings.explained:
+        if tried.normal.count * np.log(best.chi2 / tried.chi2) > settings.evidence:
+            best = tried
+            if conclusive(part, best, MISMATCH.white_samples):
                 break
-    return best and refined_from(run, best.theta, best.latency_s)
+    if best is same:
+        return None
+    lower = refined_from(run, best.theta, best.latency_s)
+    return lower if better(lower, found, settings) else None
 
 
 def conclude_fit(

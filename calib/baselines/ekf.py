@@ -179,7 +179,7 @@ class _Passes(Stepper):
             ]
         )
         drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)
-        model = settings.velocity_noise * problem.starts[0].velocity_std
+        model = settings.velocity_noise * problem.starts[0].typical_std[C:]
         noise = np.concatenate([np.zeros(C), model, drift]) ** 2
         return ExtendedKalman(np.append(np.zeros(n), self._value[:P]), covariance, n, steps, noise)
 
@@ -187,12 +187,11 @@ class _Passes(Stepper):
         """Run along one recording with the sensors' standard deviations multiplied by a factor."""
         problem = self.problem
         C, P = problem.coordinates, len(self._prior_std)
-        states = problem.starts[data.episode]
-        std = np.concatenate([states.position_std, states.velocity_std])
+        std = problem.starts[data.episode].std
         before = None
         for w, start in enumerate(data.windows.start):
             if before is None or start != before + 1:
-                filter_.restart(np.concatenate([data.start_position[w], data.start_velocity[w]]), std)
+                filter_.restart(np.concatenate([data.start_position[w], data.start_velocity[w]]), std[start])
             before = start
             points = filter_.ask()
             values = np.repeat(self._value[None], len(points), axis=0)

@@ -92,7 +92,7 @@ class Whitening:
         reference: Prediction at the linearisation point, (W, H, M).
         factor: Inverse Cholesky factors of Sigma, (W, H M, H M).
         root: J sqrt(P0): effect of one standard deviation of each start coordinate, (W, H M, 2 C).
-        std: Standard deviations of a start state, (2 C,).
+        std: Standard deviations of each start state, (W, 2 C).
         offset: Start states at the linearisation point relative to the smoothed ones, in units of ``std``,
             (W, 2 C).
     """
@@ -149,19 +149,18 @@ def linearise(
         offset: Start states at the linearisation point, in standard deviations from the smoothed ones, (W, 2
             C).
     """
-    states = problem.starts[data.episode]
     W, C = data.start_position.shape
-    std = np.concatenate([states.position_std, states.velocity_std])
+    std = problem.starts[data.episode].std[data.windows.start]
     around = np.zeros((W, 2 * C)) if offset is None else offset
     # Central differences at half the uncertainty. Friction makes kinks in predictions, and a secant as wide
     # as the error itself describes them better than a derivative.
     count = 1 + 4 * C
-    position = np.repeat(data.start_position[None] + around[:, :C] * std[:C], count, axis=0)
-    velocity = np.repeat(data.start_velocity[None] + around[:, C:] * std[C:], count, axis=0)
+    position = np.repeat(data.start_position[None] + around[:, :C] * std[:, :C], count, axis=0)
+    velocity = np.repeat(data.start_velocity[None] + around[:, C:] * std[:, C:], count, axis=0)
     for s in range(2 * C):
         state, c = (position, s) if s < C else (velocity, s - C)
-        state[1 + 2 * s, :, c] += 0.5 * std[s]
-        state[2 + 2 * s, :, c] -= 0.5 * std[s]
+        state[1 + 2 * s, :, c] += 0.5 * std[:, s]
+        state[2 + 2 * s, :, c] -= 0.5 * std[:, s]
     members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
     predicted = predict(problem, members, data, position, velocity).observed
     # Where the centre diverges, the window has no information on its start state: use the recording.

@@ -198,14 +198,18 @@ class StartStates:
     Attributes:
         position: Tangent coordinates, (T, C).
         velocity: (T, C).
-        position_std: Standard deviation of a smoothed position, (C,).
-        velocity_std: Standard deviation of a smoothed velocity, (C,).
+        std: Standard deviation of a smoothed (position, velocity), (T, 2 C). It grows towards both
+            ends of the recording, where a sample has neighbours on one side only.
     """
 
     position: FloatArray
     velocity: FloatArray
-    position_std: FloatArray
-    velocity_std: FloatArray
+    std: FloatArray
+
+    @property
+    def typical_std(self) -> FloatArray:
+        """Median of the standard deviation over the samples, (2 C,)."""
+        return np.asarray(np.median(self.std, axis=0))
 
 
 def smooth_states(
@@ -227,32 +231,33 @@ def smooth_states(
     seen[channels] = True
     clean = bool(np.all(noise_std[channels[channels < C]] < settings.noise_free_std))
     if clean and np.isfinite(episode.velocity).all() and seen[:C].all():
-        return StartStates(
-            episode.position, episode.velocity, np.maximum(noise_std[:C], 1e-7), np.full(C, 1e-4)
-        )
-    position, slope, gain, slope_gain = _local_polynomials(episode.position, episode.period_s, settings)
-    velocity = slope
+        rounding = np.concatenate([np.maximum(noise_std[:C], 1e-7), np.full(C, 1e-4)])
+        return StartStates(episode.position, episode.velocity, np.tile(rounding, (len(episode.sample), 1)))
+    position, velocity, gain, slope_gain = _local_polynomials(episode.position, episode.period_s, settings)
     # Twice the propagated noise: kinks of stick-slip and saturation are not polynomials.
-    position_std, velocity_std = 2 * noise_std[:C] * gain, 2 * noise_std[:C] * slope_gain
+    std = 2 * np.concatenate([np.outer(gain, noise_std[:C]), np.outer(slope_gain, noise_std[:C])], axis=1)
     gyro = [c for c in range(C)[rotation] if seen[C + c]]
     if gyro:
         smooth, _, gyro_gain, _ = _local_polynomials(episode.velocity[:, gyro], episode.period_s, settings)
         position[:, gyro], velocity[:, gyro] = 0.0, smooth
-        velocity_std[gyro] = 2 * noise_std[C:][gyro] * gyro_gain
+        std[:, C + np.array(gyro)] = 2 * np.outer(gyro_gain, noise_std[C:][gyro])
     if episode.estimate_std is not None:
         estimate = np.broadcast_to(episode.estimate_std, (len(episode.sample), 2 * C))
-        states, known = np.concatenate([episode.position, episode.velocity], axis=1), np.isfinite(estimate)
-        given = known.all(axis=0) & ~seen
-        std = np.sqrt(np.mean(np.where(known, estimate, 0.0) ** 2, axis=0))
-        position[:, given[:C]], position_std[given[:C]] = states[:, :C][:, given[:C]], std[:C][given[:C]]
-        velocity[:, given[C:]], velocity_std[given[C:]] = states[:, C:][:, given[C:]], std[C:][given[C:]]
-    return StartStates(position, velocity, position_std, velocity_std)
+        given = np.isfinite(estimate).all(axis=0) & ~seen
+        position[:, given[:C]] = episode.position[:, given[:C]]
+        velocity[:, given[C:]] = episode.velocity[:, given[C:]]
+        std[:, given] = estimate[:, given]
+    return StartStates(position, velocity, std)
 
 
 def _local_polynomials(
     values: FloatArray, period_s: float, settings: DataSettings
-) -> tuple[FloatArray, FloatArray, float, float]:
-    """Smooth columns (Savitzky-Golay); return values and slopes, (T, n), and both gains on white noise."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Smooth columns (Savitzky-Golay).
+
+    Returns:
+        Values and slopes, (T, n), and the gain of each on white noise, (T,).
+    """
     T, order = len(values), settings.smoothing_order
     length = max(2 * round(settings.smoothing_s / period_s / 2) + 1, settings.fewest_smoothed)
     half = length // 2
@@ -262,6 +267,7 @@ def _local_polynomials(
             "record longer"
         )
     smooth, slope = np.empty_like(values), np.empty_like(values)
+    gain, slope_gain = np.empty(T), np.empty(T)
     centre = savgol_coeffs(length, order, use="dot")
     rate = savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
     for t in range(T):
@@ -274,4 +280,5 @@ def _local_polynomials(
             rates = savgol_coeffs(length, order, deriv=1, delta=period_s, pos=at, use="dot")
         section = values[first : first + length]
         smooth[t], slope[t] = weights @ section, rates @ section
-    return smooth, slope, float(np.linalg.norm(centre)), float(np.linalg.norm(rate))
+        gain[t], slope_gain[t] = np.linalg.norm(weights), np.linalg.norm(rates)
+    return smooth, slope, gain, slope_gain

@@ -338,10 +338,8 @@ class Shooting:
 
     @property
     def state_std(self) -> FloatArray:
-        """Standard deviation of smoothed start states over all episodes, (2 C,)."""
-        starts = [self.problem.starts[d.episode] for d in self.data]
-        each = [np.concatenate([s.position_std, s.velocity_std]) for s in starts]
-        return np.asarray(np.max(each, axis=0))
+        """Typical standard deviation of smoothed start states, the largest of all episodes, (2 C,)."""
+        return np.asarray(np.max([self.problem.starts[d.episode].typical_std for d in self.data], axis=0))
 
     def cost(self, point: Point) -> float:
         """Return the sum of all squared whitened residuals at a point; infinite where it diverged."""

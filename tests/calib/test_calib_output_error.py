@@ -188,7 +188,7 @@ def test_a_stopped_run_is_resumed_to_the_same_numbers(problem: Problem, tmp_path
     method = searching(folds=False)
 
     def stop(progress: Progress) -> None:
-        if progress.stage == "search" and progress.done == 4:
+        if progress.stage == "search" and progress.done == 2:
             raise StoppedError
 
     whole = method.run(problem, BUDGET, np.random.default_rng(0))

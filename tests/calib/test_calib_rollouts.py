@@ -155,12 +155,31 @@ def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Case, problem: P
     assert explained(problem, wrong, 10) > 1e3
 
 
+def test_start_states_are_less_certain_at_both_ends_of_a_recording() -> None:
+    """A cubic fitted to 21 samples: at the middle 8 times, at the end 1.24 times as certain as one sample.
+
+    The gain of a fitted value is the root of its leverage, h_tt of the polynomial's hat matrix.
+    """
+    case = make_case("cartpole", "sensor", 1, 5.0)
+    problem = Problem(case.robot, case.space, [case.fit], threads=1)
+    states, length = problem.starts[0], 2 * round(0.1 / case.fit.period_s / 2) + 1
+    powers = np.vander(np.linspace(-1.0, 1.0, length), 4)
+    leverage = np.diag(powers @ np.linalg.solve(powers.T @ powers, powers.T))
+    half, std = length // 2, 2 * problem.noise_std[:2]
+    np.testing.assert_allclose(
+        states.std[half:-half, :2], np.tile(std * leverage[half] ** 0.5, (len(states.std) - 2 * half, 1))
+    )
+    np.testing.assert_allclose(states.std[: half + 1, :2], np.outer(leverage[: half + 1] ** 0.5, std))
+    np.testing.assert_allclose(states.std[::-1], states.std)
+    assert np.all(states.std[0] > 1.8 * states.typical_std)
+
+
 def test_whitening_takes_out_a_wrong_start_state(ideal: Case, problem: Problem) -> None:
     """What one standard deviation of start velocity does to a window is whitened to about one."""
     data = problem.windows(20)[0]
     truth = Members(ideal.theta[None], np.zeros(1))
     whitening = linearise(problem, truth, data)
-    velocity = data.start_velocity + np.array([0.0, problem.starts[0].velocity_std[1]])
+    velocity = data.start_velocity + np.array([0.0, problem.starts[0].typical_std[3]])
     moved = predict(problem, truth, data, data.start_position, velocity).observed
     size = np.linalg.norm(whitening.apply(moved - whitening.reference)[0], axis=1)
     raw = np.linalg.norm(((moved[0] - whitening.reference) / data.std).reshape(len(size), -1), axis=1)
