@@ -59,7 +59,7 @@ class Demo(Checked):
     episodes: Annotated[int | None, Range(1, 1000)] = None
     """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s."""
 
-    firmware: Annotated[Literal["python", "host", "avr"], CARTPOLE] = "python"
+    firmware: Annotated[Literal["auto", "host", "python", "avr"], CARTPOLE] = "auto"
     """How the firmware of the cart-pole runs, as for `deal-hw emulate cartpole`."""
 
     on_stand: Annotated[bool, Only(("go2",))] = False

@@ -31,9 +31,6 @@ _SECOND_DEVICE: Final = 0x5EC0_0000
 class SlcanAdapter:
     """The adapter, the bus and the devices on it, as one device that speaks the adapter's characters.
 
-    Attributes:
-        received_bytes: How many characters have come from the host.
-
     Args:
         devices: Devices on the bus, whose bytes are frames in the layout of :data:`FRAME`; the first is the
             cart-pole itself.
@@ -41,7 +38,6 @@ class SlcanAdapter:
     """
 
     def __init__(self, devices: list[EmulatedDevice], faults: CanFaults) -> None:
-        self.received_bytes = 0
         self._devices = devices
         self._faults = faults
         self._reader = LineReader()
@@ -56,6 +52,11 @@ class SlcanAdapter:
     def device_ns(self) -> int:
         """Device time at which the next tick runs [ns]."""
         return self._devices[0].device_ns
+
+    @property
+    def received_bytes(self) -> int:
+        """Bytes of the frames from the host that reached a device; not the adapter's own commands."""
+        return sum(device.received_bytes for device in self._devices)
 
     @property
     def armed(self) -> bool:
@@ -83,7 +84,6 @@ class SlcanAdapter:
 
     def receive(self, data: bytes) -> None:
         """Take characters from the host; frames reach the devices in their next tick."""
-        self.received_bytes += len(data)
         for line in self._reader.feed(data):
             self._answers += self._answer(line)
 

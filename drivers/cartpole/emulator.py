@@ -104,14 +104,12 @@ class Hazards:
 
 
 class PtyDevice(Protocol):
-    """The device behind the port: takes and returns characters, in device time.
+    """The device behind the port: takes and returns characters, in device time."""
 
-    Attributes:
-        received_bytes: Number of bytes from the host.
-        trouble: Present fault of its wire, in words; "" for none.
-    """
-
-    received_bytes: int
+    @property
+    def received_bytes(self) -> int:
+        """Number of bytes from the host."""
+        ...
 
     @property
     def trouble(self) -> str:
@@ -331,7 +329,7 @@ class CartpoleEmulator:
 
 
 def serial_emulator(
-    truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "python"
+    truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "auto"
 ) -> CartpoleEmulator:
     """Return an emulated cart-pole with a serial port.
 

@@ -4,22 +4,36 @@ from __future__ import annotations
 
 from deal_hw.drivers.cartpole.avr_device import AvrDevice
 from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice
-from deal_hw.drivers.cartpole.host_firmware import HostFirmware
+from deal_hw.drivers.cartpole.host_firmware import HostFirmware, library
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
-from deal_hw.errors import UnknownNameError
+from deal_hw.errors import ConfigurationError, UnknownNameError
 
-FIRMWARES = ("python", "host", "avr")
-"""In Python with a float servo; the C core compiled for this host; the chip's image under simavr."""
+FIRMWARES = ("auto", "host", "python", "avr")
+"""The C core compiled for this host; in Python with a float servo; the chip's image under simavr.
+
+"auto" is "host" where the core can be compiled, otherwise "python".
+"""
 
 
-def device_of(truth: CartpoleTruth, firmware: str = "python") -> EmulatedDevice:
+def usable_firmware(firmware: str) -> str:
+    """Return the firmware that "auto" stands for on this host; others as given."""
+    if firmware != "auto":
+        return firmware
+    try:
+        library()
+    except ConfigurationError:
+        return "python"
+    return "host"
+
+
+def device_of(truth: CartpoleTruth, firmware: str = "auto") -> EmulatedDevice:
     """Return an emulated device with this firmware.
 
     Raises:
         UnknownNameError: There is no such firmware.
         ConfigurationError: A compiler or simavr is missing, or the sources are refused.
     """
-    match firmware:
+    match usable_firmware(firmware):
         case "python":
             return CartpoleDevice(truth)
         case "host":

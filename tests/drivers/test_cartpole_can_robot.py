@@ -19,14 +19,14 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers import claim_name, make_robot
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.can_emulator import SlcanAdapter, can_device, can_devices, can_emulator
-from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept
+from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept, frame_id
 from deal_hw.drivers.cartpole.can_robot import CanFrames, can_robot
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.link import SerialLink
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
-from deal_hw.drivers.transports.slcan_transport import SlcanTransport
+from deal_hw.drivers.transports.slcan_transport import SlcanTransport, encode_line
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import (
     ConfigurationError,
@@ -378,3 +378,12 @@ def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     trajectory = Dataset.open(tmp_path / "run" / "dataset").read(0).trajectory
     assert trajectory.position.shape[0] >= 180
     assert np.isfinite(trajectory.position).all()
+
+
+def test_only_frames_on_the_bus_have_reached_the_device() -> None:
+    """A dry run opens the adapter, and the device has heard nothing; then it hears one frame of 16 bytes."""
+    adapter = SlcanAdapter([can_device(nominal_truth())], CanFaults())
+    adapter.receive(b"\rC\rS6\rO\r")
+    assert adapter.received_bytes == 0
+    adapter.receive(encode_line(f"{frame_id('Stop', 1):X}", b"\1\0\0\0"))
+    assert adapter.received_bytes == FRAME.size == 16

@@ -25,7 +25,8 @@ from deal_hw.drivers.cartpole.description import (
     parameter_space,
 )
 from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.host_firmware import HostFirmware, Settings, settings_of
+from deal_hw.drivers.cartpole.firmwares import FIRMWARES, usable_firmware
+from deal_hw.drivers.cartpole.host_firmware import HostFirmware, Settings, library, settings_of
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
 from deal_hw.drivers.cartpole.servo import Servo
@@ -325,6 +326,17 @@ def test_a_host_without_compiler_is_told_what_to_install(monkeypatch: pytest.Mon
     monkeypatch.setenv("CC", "no-such-cc")
     with pytest.raises(ConfigurationError, match="no-such-cc, which is not installed; apt-get install gcc"):
         native.build("x", (native.compiler(),), (), "apt-get install gcc")
+
+
+@needs_compiler
+def test_the_emulator_runs_the_core_where_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    """auto: the C core; without a compiler the firmware in Python. A firmware that was named stays."""
+    library.cache_clear()
+    assert usable_firmware("auto") == "host"
+    library.cache_clear()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert [usable_firmware(name) for name in FIRMWARES] == ["python", "host", "python", "avr"]
+    library.cache_clear()
 
 
 @needs_compiler

@@ -77,12 +77,20 @@ def emulate_cartpole(
             raise MissingExtraError(error.name, "sim") from error
         raise
     truth = _truth(config)
-    own = {"firmware": config.firmware} if config.firmware != "python" else {}
+    own: dict[str, str] = {}
+    runs = ""
+    if (config.transport or "serial") == "serial":
+        from deal_hw.drivers.cartpole.firmwares import usable_firmware
+
+        own["firmware"] = usable_firmware(config.firmware)
+        runs = f", firmware {own['firmware']}"
     link = None if config.link is None else Path(config.link)
     emulator: CartpoleOnAWire = make(truth, link=link, hazards=_hazards(config), **own)
     try:
         announce(f"port {emulator.open()}")
-        announce(f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused; Ctrl-C ends")
+        announce(
+            f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused{runs}; Ctrl-C ends"
+        )
         with realtime_priority(), happenings(config.events_to, emulator.changes) as tell:
 
             def step() -> bool:

@@ -209,9 +209,9 @@ class EmulateSettings:
     truth_from: File | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
-    firmware: Annotated[Literal["python", "host", "avr"], CARTPOLE] = "python"
-    """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
-    under simavr."""
+    firmware: Annotated[Literal["auto", "host", "python", "avr"], CARTPOLE] = "auto"
+    """Cart-pole: the firmware's C core compiled for this computer (host), a copy in Python, or the image for
+    the ATmega328P under simavr (avr). auto: host, or python without a C compiler."""
 
     link: Annotated[File | None, CARTPOLE] = None
     """Make a symbolic link to the port here."""
