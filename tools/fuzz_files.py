@@ -24,7 +24,7 @@ from pathlib import Path
 from fuzz.kind import FileKind, Kind
 from fuzz.run import make_input, run
 
-GROUPS = ("recordings", "wire", "calibration")
+GROUPS = ("recordings", "wire", "cartpole_wires", "calibration")
 
 
 def kinds() -> dict[str, Kind]:

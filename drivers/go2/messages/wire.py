@@ -107,12 +107,13 @@ def verify_crc(payload: bytes, name: str) -> None:
     if words_crc(image(payload)) == given:
         return
     # Padding has no meaning, and the sender computes the checksum with 0 there.
-    found = words_crc(image(_without_padding(payload, name)))
+    found = words_crc(image(without_padding(payload, name)))
     if found != given:
         raise FrameError(f"{name}: the checksum is 0x{given:08X}, expected 0x{found:08X}: corrupt on the way")
 
 
-def _without_padding(payload: bytes, name: str) -> bytes:
+def without_padding(payload: bytes, name: str) -> bytes:
+    """Return a "LowCmd" or "LowState" of the right length with zeros between its fields."""
     return (np.frombuffer(payload, "u1") & _padding_mask(name)).tobytes()
 
 

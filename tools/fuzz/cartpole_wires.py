@@ -1,0 +1,139 @@
+"""Inputs: what a cart-pole's CAN bus, ODrive and Dynamixel servos send."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from deal_hw.clock import VirtualClock
+from deal_hw.drivers.cartpole import protocol
+from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage
+from deal_hw.drivers.cartpole.dynamixel import packets
+from deal_hw.drivers.cartpole.dynamixel.bus import Bus
+from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BYTES
+from deal_hw.drivers.cartpole.odrive_frames import Command, pack
+from deal_hw.drivers.cartpole.odrive_link import DRIVE_NODE, ENCODER_NODE, OdriveLink, OdriveSettings
+from deal_hw.drivers.transports.slcan_transport import LineReader, decode_line, encode_line
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.errors import FrameError, TransportTimeoutError
+from deal_hw.testing.fake_device import FakeDevice
+from fuzz.kind import Kind, WireKind
+from fuzz.mutations import damage_bytes, mended
+
+_SERVOS = (1, 2)
+_INFO = protocol.Info(1, "cartpole", (1, 2, 3), 1000, 200, 0x1234)
+_ACK = protocol.Ack(2, protocol.MessageType.ARM, protocol.Result.DONE)
+
+
+def _state(number: int) -> protocol.State:
+    return protocol.State(number, 5_000_000, 1000, -2000, 3000, -4000, 500, 3, 5, 900)
+
+
+def _can_frames() -> list[bytes]:
+    """Return a part of a bus with one device; the twentieth state brings a heartbeat."""
+    device = CanLink(unique_id=7)
+    messages: list[CanMessage] = [_INFO, _ACK, *map(_state, range(38, 42))]
+    return [b"".join(device.encode(message) for message in messages), device.encode(_state(40))]
+
+
+def _read_can(data: bytes) -> None:
+    whole = data[: len(data) // FRAME.size * FRAME.size]
+    host = CanLink()
+    for part in (data, whole, whole[::-1]):
+        list(host.decode_all(part))
+
+
+def _odrive_frames() -> list[bytes]:
+    """Return an ODrive's heartbeat and estimates, and an encoder node's samples."""
+    drive = pack(DRIVE_NODE, Command.HEARTBEAT, 0, 8, 0, 0) + pack(
+        DRIVE_NODE, Command.ENCODER_ESTIMATES, 0.5, -0.25
+    )
+    encoder = CanLink(ENCODER_NODE, unique_id=7)
+    samples = b"".join(encoder.encode(Angle(number, 1000 * number, 5, 6, 0)) for number in range(1, 4))
+    return [drive + encoder.encode(_INFO) + samples + drive, drive, samples]
+
+
+def _read_odrive(data: bytes) -> None:
+    link = OdriveLink(OdriveSettings(), VirtualClock())
+    link.encode(protocol.Hello(1))
+    for _ in range(2):
+        list(link.decode(data[: len(data) // FRAME.size * FRAME.size]))
+
+
+def _lines() -> list[bytes]:
+    channels = (("123", b"\1\2\3"), ("7ff", bytes(8)), ("000", b""))
+    return [b"".join(encode_line(*line) for line in channels) + b"\rV1013\r\x07t1230\r"]
+
+
+def _read_lines(data: bytes) -> None:
+    reader, half = LineReader(), len(data) // 2
+    for line in (*reader.feed(data[:half]), *reader.feed(data[half:])):
+        decode_line(line)
+
+
+def _requests() -> list[bytes]:
+    return [
+        packets.instruction(packets.BROADCAST, packets.Instruction.SYNC_WRITE, bytes(range(64, 84))),
+        packets.instruction(1, packets.Instruction.READ, b"\x84\0\x04\0")
+        + packets.instruction(2, packets.Instruction.WRITE, b"\x40\0\xff\xff\xfd\x01"),
+    ]
+
+
+def _read_requests(data: bytes) -> None:
+    """Read as a servo does, in two pieces."""
+    parser, half = packets.PacketParser(), len(data) // 2
+    for part in (data[:half], data[half:]):
+        list(parser.feed(part))
+    list(packets.protocol_1_requests(data))
+
+
+def blocks(*, fast: bool) -> bytes:
+    """Return the answer of both servos to a group read."""
+    parts = [(servo, 0, bytes(range(servo, servo + BLOCK_BYTES))) for servo in _SERVOS]
+    if fast:
+        return packets.fast_status(parts, len(_SERVOS) * (BLOCK_BYTES + 4))
+    return b"".join(packets.status(*part) for part in parts)
+
+
+def read_answer(data: bytes, fast: bool) -> dict[int, bytes]:
+    """Return what the driver takes from the answer to a group read."""
+    clock = VirtualClock()
+    transport = VirtualTransport(FakeDevice(data), clock)
+    transport.open()
+    bus = Bus(transport, clock, 1_000_000, 0.003)
+    bus.ask(_SERVOS, BLOCK_ADDRESS, BLOCK_BYTES, fast=fast)
+    return bus.take(10**12) or {}
+
+
+def _read_answer(data: bytes) -> None:
+    for fast in (True, False):
+        try:
+            read_answer(data, fast)
+        except (FrameError, TransportTimeoutError):
+            continue
+
+
+def _mend_packet(data: bytes) -> bytes:
+    return data[:-2] + packets.crc(data[:-2]).to_bytes(2, "little")
+
+
+def _odd_packet(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
+    """Return a sound packet of any servo, error or instruction, and parameters."""
+    return packets.packet(
+        rng.randrange(256), damage_bytes(rng, data, others)[: rng.randrange(1, 300)] or b"\0"
+    )
+
+
+KINDS: dict[str, Kind] = {
+    "wire_can": WireKind(make=_can_frames, read=_read_can, mutations=(damage_bytes,)),
+    "wire_odrive": WireKind(make=_odrive_frames, read=_read_odrive, mutations=(damage_bytes,)),
+    "wire_slcan": WireKind(make=_lines, read=_read_lines, mutations=(damage_bytes,)),
+    "wire_servo_requests": WireKind(
+        make=_requests, read=_read_requests, mutations=(damage_bytes, mended(damage_bytes, _mend_packet))
+    ),
+    "wire_servo_answers": WireKind(
+        make=lambda: [blocks(fast=True), blocks(fast=False)],
+        read=_read_answer,
+        mutations=(damage_bytes, mended(damage_bytes, _mend_packet), _odd_packet),
+    ),
+}

@@ -1,0 +1,227 @@
+#!/usr/bin/env python3
+"""Count the corrupt frames that each codec takes for good ones.
+
+    python tools/fuzz_frames.py --inputs 10000000 --out docs/measured/fuzz_frames.json
+
+Each input is a sound frame with one fault: flipped bits, another byte, a byte lost or too many, an end cut
+off, or a burst of random bytes. A codec accepts it if anything comes out that was not sent. A checksum of n
+bits accepts 1 of 2^n random frames; this is the "expected" of a row, and few flipped bits are always found.
+The C core runs its own fuzzer (firmware/host/fuzz.c) under the address and undefined-behaviour sanitizers.
+CAN frames are not here: their checksum is the adapter's. Damaged frames of every wire, those with a right
+checksum too, are in tools/fuzz_files.py.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from fuzz.cartpole_wires import blocks, read_answer
+from rich.console import Console
+from rich.progress import track
+
+from deal_hw.bench.rows import write_rows
+from deal_hw.drivers.cartpole import native, protocol
+from deal_hw.drivers.cartpole.dynamixel import packets
+from deal_hw.drivers.go2.fake import FakeGo2
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.wire import without_padding
+from deal_hw.errors import FrameError, TransportTimeoutError
+
+SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuzzFrames:
+    """Count the corrupt frames that each codec takes for good ones."""
+
+    inputs: int = 1_000_000
+    """Inputs of each codec."""
+
+    seed: int = 1
+    """Seed of the faults."""
+
+    codecs: tuple[str, ...] = ()
+    """Names of codecs; by default all."""
+
+    out: Path | None = None
+    """Write the rows to this JSON file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Codec:
+    """A codec with a checksum.
+
+    Attributes:
+        frames: Sound frames.
+        contents: Returns what a receiver takes from some bytes, one entry a message.
+        bits: Bits of the checksum.
+    """
+
+    frames: Sequence[bytes]
+    contents: Callable[[bytes], list[bytes]]
+    bits: int
+
+
+def damaged(rng: random.Random, frame: bytes) -> bytes:
+    """Return a frame with one fault; it may equal the frame."""
+    data, at = bytearray(frame), rng.randrange(len(frame))
+    match rng.randrange(6):
+        case 0:
+            for _ in range(rng.randint(1, 4)):
+                data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        case 1:
+            data[at] ^= rng.randint(1, 255)
+        case 2:
+            del data[at]
+        case 3:
+            data.insert(at, rng.randrange(256))
+        case 4:
+            del data[at:]
+        case _:
+            burst = rng.randbytes(min(rng.randint(2, 16), len(data) - at))
+            data[at : at + len(burst)] = burst
+    return bytes(data)
+
+
+def _serial(data: bytes) -> list[bytes]:
+    return protocol.FrameDecoder().feed(b"\0" + data + b"\0")
+
+
+def _dynamixel(data: bytes) -> list[bytes]:
+    # The next packet's header ends one that lost its end.
+    found = packets.PacketParser().feed(data + packets.HEADER)
+    return [bytes([p.servo, p.instruction]) + p.params for p in found]
+
+
+def _checked(decode: Callable[[bytes], object], name: str) -> Callable[[bytes], list[bytes]]:
+    def contents(data: bytes) -> list[bytes]:
+        try:
+            decode(data)
+        except FrameError:
+            return []
+        # Bytes between the fields have no meaning.
+        return [without_padding(data, name)]
+
+    return contents
+
+
+def _answer(*, fast: bool) -> Callable[[bytes], list[bytes]]:
+    def contents(data: bytes) -> list[bytes]:
+        try:
+            return [b"".join(read_answer(data, fast).values())]
+        except (FrameError, TransportTimeoutError):
+            return []
+
+    return contents
+
+
+def _low_command() -> bytes:
+    values = np.linspace(-1.0, 1.0, 12)
+    return LowCommandEncoder().encode(LowCommand(values, values, np.abs(values), np.abs(values), values))
+
+
+CODECS = {
+    "cart-pole, serial": Codec(
+        frames=[
+            protocol.encode(protocol.Target(5, 100_000, 80_000, 8_000, 4_000, 1_000_000)),
+            protocol.encode(protocol.State(6, 5_000_000, 1000, -2000, 3000, -4000, 500, 3, 5, 900)),
+            protocol.encode(protocol.Arm(2)),
+        ],
+        contents=_serial,
+        bits=16,
+    ),
+    "Dynamixel, requests": Codec(
+        frames=[
+            packets.instruction(packets.BROADCAST, packets.Instruction.SYNC_WRITE, bytes(range(64, 84))),
+            packets.instruction(1, packets.Instruction.READ, b"\x84\0\x04\0"),
+            packets.instruction(2, packets.Instruction.WRITE, b"\x40\0\xff\xff\xfd\x01"),
+        ],
+        contents=_dynamixel,
+        bits=16,
+    ),
+    "Dynamixel, fast answers": Codec(frames=[blocks(fast=True)], contents=_answer(fast=True), bits=16),
+    "Dynamixel, plain answers": Codec(frames=[blocks(fast=False)], contents=_answer(fast=False), bits=16),
+    "Go2, LowCmd": Codec(frames=[_low_command()], contents=_checked(decode_low_command, "LowCmd"), bits=32),
+    "Go2, LowState": Codec(
+        frames=[encode_low_state(FakeGo2().state())],
+        contents=_checked(decode_low_state, "LowState"),
+        bits=32,
+    ),
+}
+CORE = "cart-pole, the firmware's C core"
+
+
+def fuzz(name: str, codec: Codec, inputs: int, seed: int) -> dict[str, Any]:
+    """Return the row of a codec.
+
+    Raises:
+        RuntimeError: A sound frame is not taken.
+    """
+    sent = [codec.contents(frame) for frame in codec.frames]
+    if any(len(found) != 1 for found in sent):
+        raise RuntimeError(f"{name}: a sound frame is not taken")
+    rng, corrupt, accepted, began = random.Random(seed), 0, 0, time.perf_counter()
+    for _ in track(range(inputs), name, console=Console(stderr=True), disable=not sys.stderr.isatty()):
+        number = rng.randrange(len(sent))
+        data = damaged(rng, codec.frames[number])
+        if data == codec.frames[number]:
+            continue
+        corrupt += 1
+        accepted += any(found not in sent[number] for found in codec.contents(data))
+    return {
+        "codec": name,
+        "inputs": inputs,
+        "corrupt": corrupt,
+        "accepted": accepted,
+        "expected": round(corrupt / 2**codec.bits, 1),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+
+
+def fuzz_core(inputs: int, seed: int) -> dict[str, Any]:
+    """Return the row of the firmware's core; an assertion or a sanitizer ends the run with its message."""
+    command = (native.compiler(), *native.CFLAGS, *SANITIZERS)
+    program = native.build("fuzz", command, ("host/fuzz.c", *native.CORE), "apt-get install gcc libc6-dev")
+    began = time.perf_counter()
+    done = subprocess.run([program, str(inputs), str(seed)], stdout=subprocess.PIPE, text=True, check=True)
+    found = json.loads(done.stdout)
+    corrupt = found["corrupt"] + found["garbage"]
+    return {
+        "codec": CORE,
+        "inputs": inputs,
+        "corrupt": corrupt,
+        "accepted": found["accepted"] + found["garbage_accepted"],
+        "expected": round(corrupt / 2**16, 1),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+
+
+def main(config: FuzzFrames) -> int:
+    """Print each row; return 1 if a codec accepts more than its checksum may by chance."""
+    rows = []
+    for name in config.codecs or (CORE, *CODECS):
+        if name == CORE:
+            row = fuzz_core(config.inputs, config.seed)
+        else:
+            row = fuzz(name, CODECS[name], config.inputs, config.seed)
+        print(json.dumps(row), flush=True)
+        rows.append(row)
+    if config.out is not None:
+        write_rows(config.out, rows, program=f"tools/{Path(__file__).name}")
+    # Four standard deviations of a Poisson count above what is expected.
+    return int(any(row["accepted"] > row["expected"] + 4 * max(row["expected"], 1) ** 0.5 for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(FuzzFrames, description=__doc__)))
