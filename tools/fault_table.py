@@ -101,7 +101,7 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         "exit_code": rig.run.returncode,
         **row,
         **judge(rig, report),
-        "operator": headline(rig.output),
+        "operator": headline(rig.output).replace(f"{rig.folder}/", "PORT/"),
         "notes": rig.said,
         "complaints": complaints(rig, report, row),
         "fault_ns": rig.fault_ns,

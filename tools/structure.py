@@ -80,6 +80,8 @@ from import_graph import (
     targets,
 )
 
+from deal_hw.bench.rows import describe_call
+
 FORMAT = "deal_hw.structure/1"
 SOLVERS = frozenset({"solve", "lstsq", "cho_solve", "lu_solve", "solve_triangular", "pinv"})
 NUMERIC_ROOTS = frozenset({"np", "numpy", "math"})
@@ -119,7 +121,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         print_comparison(before, counted)
     if given.json:
-        given.json.write_text(json.dumps(counted, indent=1) + "\n", encoding="utf-8")
+        said = counted | describe_call("tools/structure.py")
+        given.json.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

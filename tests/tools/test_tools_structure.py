@@ -144,7 +144,9 @@ def test_other_folder_and_written_file(tree: Path, capsys: pytest.CaptureFixture
     """A folder inside deal_hw can be named without it; --json is read back by --compare."""
     out = tree / "old.json"
     assert structure.main(["--root", str(tree), "--folder", "cli", "--json", str(out)]) == 0
-    assert json.loads(out.read_text(encoding="utf-8"))["rooms"] == {"calibrate": ["run"], "run": []}
+    found = json.loads(out.read_text(encoding="utf-8"))
+    assert found["rooms"] == {"calibrate": ["run"], "run": []}
+    assert found["argv"][0] == "tools/structure.py" and "git_commit" in found["machine"]
     assert str(tree) not in out.read_text(encoding="utf-8")
     (tree / "deal_hw/errors.py").write_text("X = 1\n" * 21, encoding="utf-8")
     capsys.readouterr()
