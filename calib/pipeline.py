@@ -82,6 +82,7 @@ class RestartSettings:
 
 
 RESTARTS = RestartSettings()
+ONE_SEARCH = RestartSettings(restarts=0, drawn=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +118,6 @@ class CalibrationRun:
         attempts: Runs the search on all recordings and stores its results.
         settings: Which checks to run.
         local: The local fit, if there is one.
-        suspected: Whether an error of the recordings explains them: then no other minimum is looked for.
         progress: Receives progress reports.
     """
 
@@ -128,7 +128,6 @@ class CalibrationRun:
     attempts: Restarts
     settings: Validation
     local: Refined | None = None
-    suspected: bool = False
     progress: ProgressCallback | None = None
 
     def say(self, stage: str, message: str) -> None:
@@ -279,7 +278,7 @@ class Refinement(Fits):
             run.offer("search", searched)
             left -= len(searched.trace)
             refined = refined_from(run, searched.estimate, searched.latency_s)
-            if attempt == 0 and refined.chi2 >= settings.explained and not run.suspected:
+            if attempt == 0 and refined.chi2 >= settings.explained:
                 refined = lower_minimum(run, refined, settings) or refined
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or better(refined, best[1], settings):
@@ -426,20 +425,23 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
-    """Return a strategy's result, with an alarm if commands and measurements share an error.
+    """Return a strategy's result; a brief one, with an alarm, if commands and measurements share an error.
 
-    The alarm is reported before the search. It stays in the result if the search predicts no better.
+    The alarm is reported before the search. A search may still find a simulator that predicts as well as the
+    corrected recordings; then they are right, and the strategy runs. Otherwise no parameters can be.
     """
     problem, local = run.problem, run.local
     suspect = None
     asked = run.settings.diagnosis and run.settings.local_first
     if asked and (local is None or unexplained(local, MISMATCH.white_samples)):
         suspect = find_shared_error(problem, local)
-    if suspect is not None:
-        run.say(BEFORE_SEARCH, str(suspect.alarm))
-    found = fits.best(dataclasses.replace(run, suspected=suspect is not None))
-    if suspect is None or not suspect.confirmed(found.theta, found.latency_s):
-        return found
+    if suspect is None:
+        return fits.best(run)
+    run.say(BEFORE_SEARCH, str(suspect.alarm))
+    unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
+    found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
+    if not suspect.confirmed(found.theta, found.latency_s):
+        return fits.best(run)
     known = dataclasses.replace(found.known, alarms=(suspect.alarm, *found.known.alarms))
     return dataclasses.replace(found, known=known, facts={**found.facts, "shared_error": suspect.to_json()})
 

@@ -11,11 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deal_hw.calib import pipeline
 from deal_hw.calib.data.channel_change import ChannelChange
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import local_fit, refine
-from deal_hw.calib.validation.shared_errors import find_shared_error, shared_errors
-from deal_hw.calib.validation.verdict import trust, unexplained
+from deal_hw.calib.pipeline import CalibrationRun, Refinement, with_shared_error
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation.shared_errors import FoundError, find_shared_error, shared_errors
+from deal_hw.calib.validation.verdict import Validation, trust, unexplained
 from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
@@ -181,3 +185,27 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
     verdict = trust(result)
     assert verdict.colour == "red" and "Multiply all times by 0.5" in verdict.do
     assert result.provenance["shared_error"]["errors"][0]["kind"] == "clock"
+
+
+@pytest.mark.slow
+def test_a_search_that_predicts_as_well_refutes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Right recordings that were suspected: the calibration goes on as without the suspicion."""
+    right = problem("pendulum", None, tmp_path)
+    suspicion = FoundError(tuple(shared_errors(right))[:1], 1.0, 100.0, 500.0, right, 10)
+    monkeypatch.setattr(pipeline, "find_shared_error", lambda problem, local: suspicion)
+    said: list[Progress] = []
+    rng = np.random.default_rng(0)
+    run = CalibrationRun(
+        problem=right,
+        budget=Budget(population=20, generations=4),
+        rng=rng,
+        search=Eki(),
+        attempts=Restarts(Eki(), rng, None),
+        settings=Validation(),
+        progress=said.append,
+    )
+    found = with_shared_error(Refinement(), run)
+    assert any(str(suspicion.alarm) == p.message for p in said)
+    assert "shared_error" not in found.facts and suspicion.alarm not in found.known.alarms
+    # Only the second of the two runs checks the result.
+    assert "split_half" in found.facts
