@@ -1,8 +1,10 @@
 """`ekf`: parameters as additional states of an extended Kalman filter that runs along the recording.
 
-It is the filter of the paper's Table 6. The state is (positions, velocities, parameters in their own scale,
-latency). The model is one sample of simulation, and its Jacobian comes from forward differences in one batch.
-The filter is extended, not unscented or ensemble: nonlinearity within the uncertainty is ignored.
+It is the filter of the paper's Table 6. The paper does not say how often it ran along the recording:
+`ekf-one-pass` runs once, `ekf` several times, with noise that falls to the sensors' own. The state is
+(positions, velocities, parameters in their own scale, latency). The model is one sample of simulation, and
+its Jacobian comes from forward differences in one batch. The filter is extended, not unscented or ensemble:
+nonlinearity within the uncertainty is ignored.
 """
 
 from __future__ import annotations
@@ -251,6 +253,11 @@ class _Passes(Stepper):
 class Ekf(Search):
     """Augmented extended Kalman filter; it draws nothing."""
 
-    name = "ekf"
     stepper = _Passes
     settings: EkfSettings = field(default_factory=EkfSettings)
+    name: str = "ekf"
+
+
+def one_pass() -> Ekf:
+    """Return `ekf-one-pass`: the filter runs along the recordings once, with the sensors' own noise."""
+    return Ekf(EkfSettings(passes=1, first_noise_factor=1.0), name="ekf-one-pass")

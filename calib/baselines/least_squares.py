@@ -4,10 +4,11 @@ And `least-squares-multistart`, a stronger one for real recordings: windows, a l
 
 The first is the plain textbook baseline of the paper's Table 6. Every control period starts from the reported
 state, and the simulation predicts the next one. `scipy.optimize.least_squares` (trust region, with the ranges
-as bounds) minimises the sum of squared differences from the midpoint of the ranges. Each recorded quantity is
-divided by its change in one control period; there are no other weights. There is no noise model, no latency
-unless given, and no second start: errors in the recorded states go into the parameters, and a start on a
-plateau stays there. Parameters are in their own scale (log for positive ones).
+as bounds) minimises the sum of squared differences. It starts at the midpoint of the ranges, or as
+`least-squares-random` at a random point of the linear ranges: the paper found it sensitive to the start. Each
+recorded quantity is divided by its change in one control period; there are no other weights. There is no
+noise model, no latency unless given, and no second start: errors in the recorded states go into the
+parameters, and a start on a plateau stays there. Parameters are in their own scale (log for positive ones).
 """
 
 from __future__ import annotations
@@ -42,10 +43,12 @@ class LeastSquaresSettings:
     Attributes:
         tolerance: Relative change of cost and parameters at which the search ends.
         diverged: Residual of a diverged simulation [typical changes]: scipy takes no infinities.
+        random_start: Whether it starts from a random point, uniform in the linear range.
     """
 
     tolerance: float = 1e-8
     diverged: float = 1e3
+    random_start: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,15 +157,21 @@ class OneShotSearch(Search, abc.ABC):
 
 @dataclass(frozen=True)
 class LeastSquaresBaseline(OneShotSearch):
-    """Single-start least squares on the one-step prediction error; nothing is drawn."""
+    """Single-start least squares on the one-step prediction error."""
 
-    name = "least-squares"
     settings: LeastSquaresSettings = field(default_factory=LeastSquaresSettings)
+    name: str = "least-squares"
 
     def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """See :meth:`OneShotSearch.solve`."""
-        latency_s = log.coordinates.clip_latency(0.0)
-        return _solve(log.problem, latency_s, log.budget.generations, self.settings)
+        space, latency_s = log.problem.space, log.coordinates.clip_latency(0.0)
+        start = rng.uniform(space.low, space.high) if self.settings.random_start else space.center
+        return _solve(log.problem, start, latency_s, log.budget.generations, self.settings)
+
+
+def from_random_start() -> LeastSquaresBaseline:
+    """Return `least-squares-random`: `least-squares` from a random point of the range."""
+    return LeastSquaresBaseline(LeastSquaresSettings(random_start=True), name="least-squares-random")
 
 
 def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
@@ -177,12 +186,12 @@ def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: F
 
 
 def _solve(
-    problem: Problem, latency_s: float, iterations: int, settings: LeastSquaresSettings
+    problem: Problem, start: FloatArray, latency_s: float, iterations: int, settings: LeastSquaresSettings
 ) -> FittedStart:
     space = problem.space
     error = OneStep(problem, latency_s, settings.diverged)
     ends = dict.fromkeys(("ftol", "xtol", "gtol"), settings.tolerance) | {"max_nfev": max(iterations, 1)}
-    solution = _minimise(error, 0.0, space.to_scale(space.center), ends)
+    solution = _minimise(error, 0.0, space.to_scale(start), ends)
     count = len(solution.fun)
     if np.isfinite(space.prior[1]).any():
         # Without a noise model, a prior's standard deviation is weighted by the residuals' own spread.

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman
+from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman, one_pass
 from deal_hw.calib.data.problem import Problem, taken
 from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
@@ -131,6 +131,19 @@ def test_a_diverged_filter_says_so(recorded: Callable[..., Recorded]) -> None:
     result = Ekf(EkfSettings(passes=2)).run(made, Budget(), np.random.default_rng(0))
     assert result.chi2 > 3.0
     assert "diverged" in result.alarms[0].means
+
+
+def test_one_pass_is_one(small_problem: Callable[..., Problem]) -> None:
+    """It has the sensors' own noise from the start; `ekf` cut to one pass has 30 times that."""
+    problem = small_problem(seconds=0.8)
+    found = one_pass().run(problem, Budget(), np.random.default_rng(0))
+    assert found.method == "ekf-one-pass" and len(found.trace) == 1
+    plain = Ekf(EkfSettings(first_noise_factor=1.0)).run(
+        problem, Budget(generations=1), np.random.default_rng(0)
+    )
+    np.testing.assert_array_equal(found.estimate, plain.estimate)
+    noisy = Ekf().run(problem, Budget(generations=1), np.random.default_rng(0))
+    assert np.abs(np.log(found.estimate / noisy.estimate)).max() > 1e-3
 
 
 def test_passes_start_with_the_prior_that_a_parameter_has(recorded: Callable[..., Recorded]) -> None:

@@ -7,7 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.least_squares import LeastSquaresBaseline, OneStep, textbook_covariance
+from deal_hw.calib.baselines.least_squares import (
+    LeastSquaresBaseline,
+    OneStep,
+    from_random_start,
+    textbook_covariance,
+)
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
@@ -35,6 +40,19 @@ class TestLeastSquares(MethodSuite):
             tolerance=1e-3,
             open_store=SearchCheckpoint,
         )
+
+
+def test_a_random_start_is_drawn_in_the_linear_ranges(small_problem: Callable[..., Problem]) -> None:
+    """Without an iteration left it ends at the generator's own draw, another for each seed."""
+    problem = small_problem()
+    space = problem.space
+    for seed in (0, 1):
+        found = from_random_start().run(problem, Budget(generations=1), np.random.default_rng(seed))
+        drawn = np.random.default_rng(seed).uniform(space.low, space.high)
+        np.testing.assert_allclose(found.estimate, drawn, rtol=1e-9)
+    again = from_random_start().run(problem, Budget(generations=60), np.random.default_rng(1))
+    midpoint = LeastSquaresBaseline().run(problem, Budget(generations=60), np.random.default_rng(1))
+    np.testing.assert_allclose(again.estimate, midpoint.estimate, rtol=1e-3)
 
 
 def test_says_when_it_has_not_converged(small_problem: Callable[..., Problem]) -> None:
