@@ -100,15 +100,21 @@ def test_a_policy_that_would_not_run_is_refused(tmp_path: Path, deploy: Callable
 
 
 def test_a_policy_of_a_red_calibration_is_asked_about(
-    tmp_path: Path, deploy: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    deploy: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Without a terminal it is refused; with one the answer decides, and so does the option."""
+    """Without a terminal it is refused; with one the answer decides, and so does the option. Amber warns."""
     path = edited(tmp_path / "p.onnx", lambda spec: spec["training"].update({VERDICT: "red"}))
     said = deploy(path)
     assert "a red verdict" in said and "--trust-calibration" in said and "no-port" not in said
     assert "no-port" in deploy(path, "deploy", "cartpole", "--trust-calibration")
     amber = edited(tmp_path / "a.onnx", lambda spec: spec["training"].update({VERDICT: "amber"}))
-    assert "no-port" in deploy(amber)
+    assert "no-port" in deploy(amber, "deploy", "cartpole", "--trust-calibration")
+    assert main(["deploy", "cartpole", "--port", "no-port", "--policy", str(amber)]) == REFUSED
+    warning, error = capsys.readouterr().err.strip().splitlines()
+    assert "an amber verdict" in warning and "Ctrl-C" in warning and "no-port" in error
 
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     asked: list[str] = []

@@ -45,7 +45,7 @@ class RunPlan:
         transport: Name of the transport.
         motion: The motion.
         policy: Policy file; "" for none.
-        trust_calibration: Whether to run a policy whose calibration has a red verdict.
+        trust_calibration: Whether to run a policy without a question or warning about its verdict.
         policy_digest: SHA-256 of the checked policy file, the only one that will be opened; "" if none was
         checked.
         recording: Episode to replay; "" for none.
@@ -155,8 +155,15 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
             policy = stack.enter_context(TrialPolicy(Path(plan.policy)))
             try_policy(policy, description)
             digests.append(policy.digest)
-            if policy.spec.training.get(VERDICT) == "red" and not plan.trust_calibration:
+            verdict = policy.spec.training.get(VERDICT)
+            if verdict == "red" and not plan.trust_calibration:
                 _ask(Path(plan.policy), view or RunView())
+            elif verdict == "amber" and not plan.trust_calibration and view is not None:
+                view.warn(
+                    f"{Path(plan.policy).name} was trained under a calibration with an amber verdict: the "
+                    "calibrated model does not explain all of the robot's motion; read the alarms in its "
+                    "report, and be ready to stop the robot (Ctrl-C)"
+                )
             walks = plan.motion not in ("excite", "rich")
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
             if limited and view is not None:
