@@ -28,6 +28,7 @@ AVR_CC = (
     "-Werror",
 )
 CFLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
+SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 def cache() -> Path:
@@ -74,6 +75,16 @@ def build(
 def compiler() -> str:
     """Return the C compiler of this host: ``$CC``, or cc."""
     return os.environ.get("CC") or "cc"
+
+
+def fuzzer() -> Path:
+    """Return the core's fuzzer (``host/fuzz.c``: inputs, seed), built with the sanitizers.
+
+    Raises:
+        ConfigurationError: There is no C compiler, or it refuses the sources.
+    """
+    command = (compiler(), *CFLAGS, *SANITIZERS)
+    return build("fuzz", command, ("host/fuzz.c", *CORE), "apt-get install gcc libc6-dev")
 
 
 def image() -> Path:

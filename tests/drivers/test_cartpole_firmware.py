@@ -360,20 +360,12 @@ def test_float_servo_and_core_agree_on_nominal_gains() -> None:
     assert (STIFFNESS_N_M, DAMPING_NS_M, SPEED_LIMIT_M_S) == (80.0, 8.0, 1.0)
 
 
-@pytest.fixture(scope="module")
-def fuzzer() -> Path:
-    """Build the fuzzer of the core with the sanitizers."""
-    if shutil.which(native.compiler()) is None:
-        pytest.skip("no C compiler: apt-get install gcc libc6-dev")
-    options = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    return native.build(
-        "fuzz", (native.compiler(), *native.CFLAGS, *options), ("host/fuzz.c", *native.CORE), ""
-    )
-
-
-def test_a_fuzz_run_finds_nothing(fuzzer: Path) -> None:
+@needs_compiler
+def test_a_fuzz_run_finds_nothing() -> None:
     """200 000 whole, mutated and random frames: no crash, no frame lost, no corrupt one taken."""
-    done = subprocess.run([fuzzer, "200000", "1"], capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(
+        [native.fuzzer(), "200000", "1"], capture_output=True, text=True, check=True, timeout=120
+    )
     found = json.loads(done.stdout)
     assert found["good"] + found["corrupt"] + found["garbage"] > 199_000
     # A random frame passes a CRC of 16 bits once in 65 536; these are 160 000, most of them no frame at all.
