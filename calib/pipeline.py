@@ -80,6 +80,10 @@ class RestartSettings:
     contact_drawn: int = 0
     evidence: float = 20.0
 
+    def draws(self, problem: Problem) -> int:
+        """Return the number of refinements from drawn points."""
+        return self.drawn if problem.robot.base is None else self.contact_drawn
+
 
 RESTARTS = RestartSettings()
 ONE_SEARCH = RestartSettings(restarts=0, drawn=0)
@@ -258,11 +262,12 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
 
 @dataclass(frozen=True)
 class Refinement(Fits):
-    """A search and its refinement, repeated from other draws while the residual is unexplained.
+    """A search and its refinement; where the residual is unexplained, also drawn points, then other searches.
 
     The first search is short: a few generations find the basin, and the refinement finds its minimum with
-    fewer simulations. Later searches use the whole budget, except for a floating base: there, long windows
-    with contacts carry little information.
+    fewer simulations. If no refinement from a drawn point ends lower, the model is wrong, and nothing else is
+    searched. Later searches use the whole budget, except for a floating base: there, long windows with
+    contacts carry little information.
     """
 
     restarts: RestartSettings = RESTARTS
@@ -278,16 +283,19 @@ class Refinement(Fits):
             run.offer("search", searched)
             left -= len(searched.trace)
             refined = refined_from(run, searched.estimate, searched.latency_s)
-            if attempt == 0 and refined.chi2 >= settings.explained:
-                refined = lower_minimum(run, refined, settings) or refined
+            same = False
+            if attempt == 0 and refined.chi2 >= settings.explained and settings.draws(run.problem):
+                lower = lower_minimum(run, refined, settings)
+                # No drawn point ends lower: the model is wrong, not the search.
+                refined, same = lower or refined, lower is None
+            # Two searches with the same unexplained residual say this, too.
             previous = best[1].chi2 if best is not None else np.inf
+            same = same or abs(refined.chi2 - previous) < settings.same * previous
             if best is None or better(refined, best[1], settings):
                 best = (searched, refined)
             elif attempt == 1:
                 # Cross-validation compares the refinement with a search that used its whole budget.
                 best = (searched, best[1])
-            # Two searches with the same unexplained residual: the model is wrong, not the search.
-            same = abs(refined.chi2 - previous) < settings.same * previous
             if best[1].chi2 < settings.explained or same or left < settings.fewest_generations:
                 break
         if best is None:
@@ -297,9 +305,11 @@ class Refinement(Fits):
             # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
                 best = (best[0], local)
-        return conclude_fit(run, *best, self._choose(run, *best), attempt)
+        return conclude_fit(run, *best, self._choose(run, *best, brief=attempt == 0), attempt)
 
-    def _choose(self, run: CalibrationRun, searched: CalibrationResult, refined: Refined) -> Choice | None:
+    def _choose(
+        self, run: CalibrationRun, searched: CalibrationResult, refined: Refined, *, brief: bool
+    ) -> Choice | None:
         """Return the choice of cross-validation; None where the fit explains all but the noise."""
         # A fold is a search and a refinement. With contacts these take a minute each.
         floating = run.problem.robot.base is not None
@@ -309,9 +319,9 @@ class Refinement(Fits):
         robust = run.settings.robust and kurtosis(refined.normal.residual) > ROBUST.heavy_tails
         # Drawn after all searches, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
-        # A fold needs no more generations than the search on all data.
+        # A fold's search needs no more generations than that on all data, and ends as early.
         generations = max(len(searched.trace), self.restarts.fewest_generations)
-        less = dataclasses.replace(run.budget, generations=generations)
+        less = dataclasses.replace(run.budget, generations=generations, brief=brief)
         return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
 
 
@@ -329,15 +339,14 @@ def lower_minimum(run: CalibrationRun, found: Refined, settings: RestartSettings
     Points are compared on a part of the recordings. The first whose residual is white is taken, otherwise the
     lowest.
     """
+    if not settings.draws(run.problem):
+        return None
     part, shortest = part_of(run.problem, REFINEMENT.local_s), window_stages(run.problem)[:1]
     run_part = dataclasses.replace(run, problem=part)
-    draws = settings.drawn if part.robot.base is None else settings.contact_drawn
-    if not draws:
-        return None
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
     same = best = refined_from(run_part, found.theta, found.latency_s, shortest)
-    for theta in part.space.sample(rng, draws):
+    for theta in part.space.sample(rng, settings.draws(part)):
         tried = refined_from(run_part, theta, part.first_latency_s, shortest)
         if tried.normal.count * np.log(best.chi2 / tried.chi2) > settings.evidence:
             best = tried

@@ -86,8 +86,11 @@ def test_a_search_that_ends_in_another_minimum_is_not_the_answer(noisy: Case, re
     assert found.facts["restarts"] == 0
 
 
-def test_only_the_first_search_is_brief(noisy: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a brief search leaves unexplained is searched for to the end, and that search is compared."""
+@pytest.mark.parametrize(("drawn", "brief"), [(0, [True, False]), (2, [True])])
+def test_only_the_first_search_is_brief(
+    noisy: Case, monkeypatch: pytest.MonkeyPatch, drawn: int, brief: list[bool]
+) -> None:
+    """What a brief search leaves unexplained is searched for to the end, unless drawn points end no lower."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     refined = dataclasses.replace(refine(problem, noisy.theta, noisy.latency_s), chi2=9.0)
     monkeypatch.setattr(pipeline, "refined_from", lambda *_: refined)
@@ -100,9 +103,9 @@ def test_only_the_first_search_is_brief(noisy: Case, monkeypatch: pytest.MonkeyP
         attempts=Restarts(search, np.random.default_rng(0), None),
         settings=Validation(cross_validation=False),
     )
-    outcome = Refinement().best(run)
-    assert [budget.brief for budget in search.budgets] == [True, False]
-    assert outcome.facts["restarts"] == 1
+    outcome = Refinement(RestartSettings(drawn=drawn)).best(run)
+    assert [budget.brief for budget in search.budgets] == brief
+    assert outcome.facts["restarts"] == len(brief) - 1
 
 
 def test_refinement_recovers_an_ideal_robot_exactly(ideal: Case) -> None:
@@ -160,13 +163,13 @@ def test_no_prediction_of_noisy_samples_errs_by_less_than_their_noise(noisy: Cas
     assert exact.errors({"truth": truth}).to_json()["noise"]["mean"] is None
 
 
-def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal: Case) -> None:
-    """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
+def test_a_residual_that_no_drawn_point_lowers_is_the_models(ideal: Case) -> None:
+    """With a wrong latency forced on it nothing explains the data: one search, two folds, an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
     search = FixedSearch(ideal.theta, 0.021, 0.05)
     method = CalibrationPipeline(search, fits=Refinement(RestartSettings(drawn=1)))
     result = method.run(problem, Budget(), np.random.default_rng(0))
-    assert len(search.budgets) >= 2
+    assert [budget.brief for budget in search.budgets] == [True] * 3
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 

@@ -101,7 +101,7 @@ def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> Non
 def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
     """Stopped in the second search and in the refinement: no search runs twice, the numbers are the same."""
     # Nothing is ever explained and no two searches agree: all three attempts are made.
-    fits = Refinement(RestartSettings(explained=0.0, same=0.0, fewest_generations=1))
+    fits = Refinement(RestartSettings(explained=0.0, same=0.0, fewest_generations=1, drawn=0))
     search = Eki(EkiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
     method = CalibrationPipeline(search, settings=Validation(local_first=False), fits=fits)
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
