@@ -37,12 +37,17 @@ class BatchPolicy(Protocol):
         ...
 
 
-def demonstration_policy(robot: str) -> OnnxPolicy:
-    """Return the demonstration policy of a robot, trained under uniform domain randomisation.
+def demonstration_policy(robot: str, checkpoint: Path | None = None) -> OnnxPolicy:
+    """Return a policy that demonstrates a robot: its shipped one, or a checkpoint of another training.
+
+    The shipped ones were trained under uniform domain randomisation.
 
     Raises:
         UnknownNameError: None is shipped; the message lists those that are.
+        PolicyError: The checkpoint is no policy.
     """
+    if checkpoint is not None:
+        return OnnxPolicy(checkpoint)
     if robot not in SHIPPED:
         raise UnknownNameError("robot with a demonstration policy", robot, SHIPPED)
     return OnnxPolicy(ASSETS / f"{robot}_udr.onnx")

@@ -71,6 +71,7 @@ KEY = (
     "profile",
     "demonstration",
     "demonstration_s",
+    "checkpoint",
     "split",
     "range_ratio",
     "method",

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from deal_hw.bench.loop import calibration_row
@@ -26,6 +27,7 @@ KEY = (
     "profile",
     "demonstration",
     "demonstration_s",
+    "checkpoint",
     "method",
     "refined",
     "range_ratio",
@@ -45,6 +47,8 @@ class Cell:
         profile: Profile of the robot.
         demonstration: "excite" or "policy".
         demonstration_s: Its length [s].
+        checkpoint: Name of the policy that demonstrates; "" for the shipped one.
+        policy: Its file.
         method: Name of the method.
         refined: Whether the refinement follows.
         range_ratio: Ratio of the search range.
@@ -57,6 +61,8 @@ class Cell:
     profile: str
     demonstration: str
     demonstration_s: float
+    checkpoint: str
+    policy: Path | None
     method: str
     refined: bool
     range_ratio: float
@@ -80,6 +86,7 @@ def make_cells(
     refine_all: bool = False,
     demonstration: str = "excite",
     demonstration_s: float = DEMONSTRATION_S,
+    checkpoints: Sequence[Path | None] = (None,),
 ) -> list[Cell]:
     """Return the cells of a bench, seed by seed, so that a stopped bench has complete seeds.
 
@@ -101,12 +108,16 @@ def make_cells(
             profile=profile,
             demonstration=demonstration,
             demonstration_s=demonstration_s,
+            checkpoint="" if policy is None else policy.stem,
+            policy=policy,
             method=method,
             refined=refine_all or method == "default",
             range_ratio=range_ratio,
             seed=seed,
         )
-        for task, range_ratio, seed, method in itertools.product(tasks, range_ratios, seeds, methods)
+        for task, range_ratio, policy, seed, method in itertools.product(
+            tasks, range_ratios, checkpoints, seeds, methods
+        )
     ]
 
 
@@ -140,6 +151,7 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
             cell.space,
             centred=cell.protocol == "paper",
             by_policy=cell.demonstration == "policy",
+            checkpoint=cell.policy,
             seconds=cell.demonstration_s,
         )
         part, _ = calibration_row(case, cell.method, budget, threads)

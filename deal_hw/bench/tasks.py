@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -91,6 +92,7 @@ class _Ask:
     space: str
     centred: bool
     by_policy: bool
+    checkpoint: Path | None
     seconds: float
 
     def ranges(self, table: Mapping[str, Callable[[], ParameterSpace]]) -> ParameterSpace:
@@ -112,6 +114,7 @@ def make_case(
     *,
     centred: bool = False,
     by_policy: bool = False,
+    checkpoint: Path | None = None,
     seconds: float = DEMONSTRATION_S,
 ) -> Case:
     """Draw a truth and record a demonstration and a held-out motion.
@@ -125,13 +128,14 @@ def make_case(
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
         by_policy: The shipped policy demonstrates the robot, as in the paper, instead of motions that excite
             more. The cart-pole's demonstration always begins with its policy.
+        checkpoint: The file of another policy that demonstrates instead of the shipped one.
         seconds: Length of the demonstration [s]; a held-out motion has `DEMONSTRATION_S`.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
         CalibrationError: No drawn truth could demonstrate.
     """
-    return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, seconds))
+    return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, checkpoint, seconds))
 
 
 def _cartpole(ask: _Ask) -> Case:
@@ -149,7 +153,7 @@ def _cartpole(ask: _Ask) -> Case:
         motion="balance" if ask.by_policy else "rich",
         seconds=ask.seconds,
         seed=seed,
-        policy=str(shipped_policy("cartpole") or ""),
+        policy=str(ask.checkpoint or shipped_policy("cartpole") or ""),
     )
     # A second balancing attempt would be no stronger.
     shown, search = demonstrate(virtual, plan, 1 if ask.by_policy else ATTEMPTS)
@@ -173,7 +177,7 @@ def _cartpole(ask: _Ask) -> Case:
         channel_std=find_profile(profile).sensor.position_std,
         refused=truth.refused,
         truth=truth,
-        policy=_population("cartpole", DESCRIPTION) if ask.by_policy else None,
+        policy=_population("cartpole", DESCRIPTION, ask.checkpoint) if ask.by_policy else None,
         excitation_levels=tuple(attempt.level for attempt in search.attempts),
     )
 
@@ -188,7 +192,7 @@ def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
     description = robot_description(task)
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
-        shown = _policy(task, description) if ask.by_policy else flail(rng, description)
+        shown = _policy(task, description, ask.checkpoint) if ask.by_policy else flail(rng, description)
         return shown, flail(rng, description, FAST_HZ)
 
     space = ask.ranges(parameter_spaces(task))
@@ -226,7 +230,7 @@ def _go2(ask: _Ask) -> Case:
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
         fast = sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
         if ask.by_policy:
-            return _policy("go2", floor.DESCRIPTION), fast
+            return _policy("go2", floor.DESCRIPTION, ask.checkpoint), fast
         return sway(robot, rng, ask.seconds), fast
 
     space = ask.ranges(floor.SPACES)
@@ -240,16 +244,16 @@ FORWARD_M_S = 0.4
 WANTED = (FORWARD_M_S, 0.0, 0.0)
 
 
-def _policy(robot: str, description: RobotDescription) -> Behaviour:
+def _policy(robot: str, description: RobotDescription, checkpoint: Path | None) -> Behaviour:
     from deal_hw.policies.demonstration import Demonstration, demonstration_policy
 
-    return Demonstration(demonstration_policy(robot), description, WANTED)
+    return Demonstration(demonstration_policy(robot, checkpoint), description, WANTED)
 
 
-def _population(robot: str, description: RobotDescription) -> PopulationPolicy:
+def _population(robot: str, description: RobotDescription, checkpoint: Path | None) -> PopulationPolicy:
     from deal_hw.policies.demonstration import PopulationDemonstration, demonstration_policy
 
-    return PopulationDemonstration(demonstration_policy(robot), description, WANTED)
+    return PopulationDemonstration(demonstration_policy(robot, checkpoint), description, WANTED)
 
 
 def _target(
@@ -309,7 +313,7 @@ def _target(
         heldout_truth=heldout.position,
         channel_std=std,
         refused=refused,
-        policy=_population(task, robot.description) if ask.by_policy else None,
+        policy=_population(task, robot.description, ask.checkpoint) if ask.by_policy else None,
     )
 
 

@@ -116,6 +116,9 @@ class Bench:
     demonstration_seconds: Annotated[float, Range(1, 600, "s"), ROBOTS] = 4.0
     """Length of the demonstration [s]."""
 
+    checkpoint: Annotated[tuple[Path, ...], ROBOTS] = ()
+    """Policies (.onnx) that demonstrate instead of the shipped one, with --demonstration policy."""
+
     population: Annotated[int | None, Range(2, 100_000), SEARCHES] = None
     """Members of a search; by default 100, for methods of the paper 200."""
 
@@ -142,6 +145,8 @@ class Bench:
         parse_seeds(self.seeds)
         parse_ratios(self.range_ratio)
         refuse_others(self, "bench", self.bench)
+        if self.checkpoint and self.demonstration != "policy":
+            raise ConfigurationError("--checkpoint names policies; add --demonstration policy")
         if self.bench in ("loop", "speed", "real") and "," in self.range_ratio:
             raise ConfigurationError(
                 f"--range-ratio {self.range_ratio}: `bench {self.bench}` takes one ratio"
@@ -334,6 +339,7 @@ def _calibration(config: Bench, out: Path) -> _Table:
         refine_all=config.refine_all,
         demonstration=config.demonstration,
         demonstration_s=config.demonstration_seconds,
+        checkpoints=config.checkpoint or (None,),
     )
     cells = calibration.cells(
         chosen, population=config.population, generations=config.generations, threads=config.threads

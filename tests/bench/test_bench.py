@@ -7,13 +7,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 
 from deal_hw.bench import calibration
 from deal_hw.bench.rows import write_rows
 from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
+from deal_hw.workflows.shipped import shipped_policy
 
 FIELDS = {
     "bench",
@@ -214,3 +217,40 @@ def test_a_length_of_the_demonstration_belongs_to_the_calibration_benches() -> N
     with pytest.raises(ConfigurationError, match="--demonstration-seconds"):
         Bench(bench="loop", demonstration_seconds=2.0)
     assert "demonstration_s" in calibration.KEY
+
+
+def test_a_checkpoint_demonstrates_and_names_its_rows(tmp_path: Path) -> None:
+    """DEAL's Table 5: another policy moves the robot, and closed-loop methods run that policy, too."""
+    shipped = shipped_policy("cartpole")
+    assert shipped is not None
+    early = tmp_path / "early.onnx"
+    model = onnx.load(str(shipped))
+    for tensor in model.graph.initializer:
+        weak = 0.5 * numpy_helper.to_array(tensor)
+        tensor.CopyFrom(numpy_helper.from_array(weak.astype(np.float32), tensor.name))
+    onnx.save(model, str(early))
+    cells = calibration.make_cells(
+        "paper",
+        ["cartpole"],
+        "ideal",
+        ["midpoint"],
+        [3.0],
+        [3],
+        demonstration="policy",
+        checkpoints=[None, early],
+    )
+    assert [cell.checkpoint for cell in cells] == ["", "early"]
+    commands, shown = [], []
+    for path in (None, early):
+        case = make_case("cartpole", "ideal", 3, 3.0, centred=True, by_policy=True, checkpoint=path)
+        policy = case.policy
+        assert policy is not None
+        before = np.zeros((policy.history, 2))
+        policy.restart(1, before, before, before[:, :1], policy.history)
+        commands.append(policy(np.full((1, 2), 0.05), np.zeros((1, 2))))
+        shown.append(case.fit.target)
+    assert abs(commands[0] - commands[1]).max() > 1e-4 < abs(shown[0] - shown[1]).max()
+    with pytest.raises(ConfigurationError, match="--demonstration policy"):
+        Bench(bench="paper", checkpoint=(early,))
+    row = calibration.run_cell(cells[1], population=4, generations=1, threads=1)
+    assert row["error"] == "" and row["checkpoint"] == "early" and "policy" not in row
