@@ -166,18 +166,18 @@ def _so101(ask: _Ask) -> CalibrateSettings:
 def _go2(ask: _Ask) -> CalibrateSettings:
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
-    name = "go2_suspended"
-    files = ask.recorded(name, ("train",), "page 'Go2 on a stand, public recording' of the documentation")
+    parts = [f"traj_0_part{number}" for number in range(1, 5)]
+    files = ask.recorded("go2", parts, "page 'Go2 on a stand, public recording' of the documentation")
     parameters = ask.folder / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
     recordings = Recordings(
         model=DESCRIPTION.mjcf,
-        data=tuple(files),
+        data=tuple(files[:3]),
         parameters=parameters,
         columns=files[0].with_name("columns.yaml"),
         window=0.2,
     )
-    return CalibrateSettings(recordings=recordings)
+    return CalibrateSettings(recordings=recordings, holdout=(files[3],))
 
 
 PROBLEMS: Mapping[str, Callable[[_Ask], CalibrateSettings]] = {

@@ -73,7 +73,7 @@ class Bench:
     first fit to the fitted recordings."""
 
     real: Annotated[Path | None, Only(("first-answer",))] = None
-    """Folder with so101/ and go2_suspended/: the recordings and the columns.yaml of each. Pages 'SO-101 arm'
+    """Folder with so101/ and go2/: the recordings and the columns.yaml of each. Pages 'SO-101 arm'
     and 'Go2 on a stand, public recording' of the documentation make them. Without it these two are
     skipped."""
 
