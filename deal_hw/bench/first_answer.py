@@ -289,6 +289,7 @@ def _compared(
     from deal_hw.calib.methods import make_method
     from deal_hw.calib.validation.metrics import HeldOut
     from deal_hw.calib.validation.verdict import trust
+    from deal_hw.sim.recordings.parts import joined
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 
     # Imports are not counted.
@@ -315,9 +316,11 @@ def _compared(
     )
     shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s))
 
+    # Whole recordings, as far as they are fitted: its windows must not end where ours were cut.
+    whole = Problem(work.robot, work.space, joined(work.episodes), threads=threads)
     since = _Stopwatch.start()
     sysid = with_delay(settings.sysid_window_s).run(
-        Problem(work.robot, work.space, work.episodes, threads=threads),
+        whole,
         Budget(generations=settings.sysid_iterations),
         np.random.default_rng(seed),
     )
