@@ -45,11 +45,14 @@ def check_excitation(problem: Problem) -> None:
     joints = problem.robot.joints
     spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
-    if problem.known_std is None and not problem.noise_free:
-        # A recording without motion can show less noise than its sensor has, even none. A joint that friction
-        # held is not enough to calibrate from.
-        noises = np.maximum(noises, problem.robot.description.sensor.position_std)
     settings = problem.settings
+    if problem.known_std is None and not problem.noise_free:
+        # A joint that friction held shows few values of its encoder, and less noise than its sensor has, even
+        # none. That is not enough to calibrate from.
+        values = np.array([[len(np.unique(x)) for x in e.position[:, joints].T] for e in problem.episodes])
+        sensor = np.asarray(problem.robot.description.sensor.position_std)
+        coarse = np.max(values, axis=0) < settings.least_motion
+        noises = np.where(coarse, np.maximum(noises, sensor), noises)
     least = settings.least_motion if problem.known_std is None else settings.least_chosen_motion
     still = [
         f"{name} moved {span:.2g} (noise {noise:.2g})"

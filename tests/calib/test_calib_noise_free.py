@@ -76,12 +76,15 @@ def test_the_scan_takes_the_refinement_itself_at_its_own_step(seen: Seen) -> Non
 
 
 def test_exact_motion_need_not_stand_out_of_a_sensor_that_was_not_there(seen: Seen) -> None:
-    """A joint that moved 10 mrad is excited where its state is exact, and not where a sensor saw it."""
+    """10 mrad excite a joint whose state is exact or whose sensor is fine, but not with 2 mrad a count."""
     position = seen.episode.position.copy()
     swing = position[:, -1] - position[:, -1].mean()
     position[:, -1] = position[0, -1] + 0.01 * swing / np.ptp(swing)
     little = dataclasses.replace(seen.episode, position=position)
     check_excitation(Problem(seen.robot, seen.space, [little], threads=1))
-    sensed = dataclasses.replace(little, exact=False)
+    fine = dataclasses.replace(little, exact=False)
+    check_excitation(Problem(seen.robot, seen.space, [fine], threads=1))
+    position[:, -1] = np.round(position[:, -1] / 2e-3) * 2e-3
+    sensed = dataclasses.replace(fine, position=position)
     with pytest.raises(InsufficientDataError, match="hardly moves"):
         check_excitation(Problem(seen.robot, seen.space, [sensed], threads=1))
