@@ -84,6 +84,7 @@ LINES = (
 VALUES: dict[str, tuple[str, ...]] = {
     "addresses": ("10.0.0.7",),
     "calibration": ("distribution.json",),
+    "checkpoint": ("early.onnx",),
     "ca": ("ca2.pem",),
     "certificate": ("c2.pem",),
     "key": ("k2.pem",),
