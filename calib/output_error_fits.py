@@ -2,11 +2,13 @@
 
 The right residual scale, the right window length, and whether to stop early differ between robots. So:
 
-1. A fit over short windows from the nominal values measures the size of the residuals.
-2. The search runs with this residual scale.
+1. A fit over short windows from the nominal values measures the size of the residuals. Fits over longer
+   windows continue from it. Both are shown at once.
+2. The search runs with this residual scale. If its estimate predicts short windows better than the first fit,
+   the longer windows are fitted again from there.
 3. Cross-validation over the motions compares candidates by their prediction of unseen data. Candidates are
-   the search's estimate, fits over short and long windows, and the mean of the fits over all window lengths.
-   Fits differ in the loss (robust or not), in the latency (free or none) and in the prior width.
+   the fits over short and long windows, that over the longest ones with a robust loss or without a latency,
+   and the search's estimate if it was the better start.
 4. The best candidate is fitted to all data. Two halves of the data are compared, and confounded parameters
    are listed.
 
@@ -60,9 +62,7 @@ class OutputErrorSettings:
 
     Attributes:
         windows_s: Windows of the fits [s]; each fit starts where the one before ended. Model error biases
-            each window length differently; the mean may be better than any of them.
-        priors: Width of the prior around the nominal values, as a share of the range, by the suffix of a
-            candidate's name.
+            each window length differently.
         search_s: Length of data for the search, spread evenly over the recordings [s]. The search only has to
             find the neighbourhood.
         stretch_s: Recordings are divided into stretches of this length for the search [s].
@@ -82,7 +82,6 @@ class OutputErrorSettings:
     """
 
     windows_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
-    priors: Mapping[str, float] = field(default_factory=lambda: {"": Recipe().prior_std, ", wide prior": 1.0})
     search_s: float = 12.0
     stretch_s: float = 2.5
     folds: int = 3
@@ -110,42 +109,71 @@ class OutputErrorSettings:
 
     def recipe(self, name: str) -> Recipe:
         """Return the residual weights of a candidate, for intervals and the split-half check."""
-        prior_std = self.priors[self.prior_of(name)]
-        long = Recipe(seconds=self.long_s, prior_std=prior_std, robust=self.robust)
-        return self.variants.get(name, long)
+        return self.variants.get(name, Recipe(seconds=self.long_s, robust=self.robust))
 
-    def prior_of(self, name: str) -> str:
-        """Return the key of the prior in a candidate's name."""
-        return next((words for words in self.priors if words and name.endswith(words)), "")
+
+@dataclass(frozen=True)
+class FirstFits:
+    """The fits from the nominal values.
+
+    Attributes:
+        problem: The recordings as they are fitted.
+        short: The fit of short windows.
+        windows: The fits of growing windows that continue from it.
+    """
+
+    problem: Problem
+    short: OutputErrorFit
+    windows: Sequence[OutputErrorFit]
 
 
 @dataclass(frozen=True)
 class OutputErrorFits(Fits):
-    """A search, candidate fits, and the choice of the best predictor by cross-validation."""
+    """A search, candidate fits, and the choice of the best predictor by cross-validation.
+
+    Attributes:
+        settings: The settings.
+        first: The fits from the nominal values, once they are made.
+    """
 
     settings: OutputErrorSettings = field(default_factory=OutputErrorSettings)
+    first: FirstFits | None = None
 
-    def best(self, run: CalibrationRun) -> FitOutcome:
-        """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
+    def started(self, run: CalibrationRun) -> OutputErrorFits:
+        """Fit short and long windows from the nominal values. See :meth:`Fits.started`."""
         settings, problem = self.settings, run.problem
-        # The fits continue from the search's estimate, so it only has to find the neighbourhood.
-        run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
         if run.settings.cross_validation:
             problem = _joined_stretches(problem)
         if np.isfinite(settings.fitted_s):
             parts = [p for e in problem.episodes for p in stretches(e, settings.stretch_s) if p.usable.any()]
             problem = problem.on(spread(parts, settings.fitted_s), problem.known_std)
         run.say("residual", "fits short windows from the model's own values")
-        first = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
+        short = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
+        run.offer("fit of short windows", short)
+        windows = self._windows(run, problem, _member(short))
+        run.offer("fit of long windows", windows[-1])
+        return dataclasses.replace(self, first=FirstFits(problem, short, windows))
+
+    def best(self, run: CalibrationRun) -> FitOutcome:
+        """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
+        made = self.first or self.started(run).first
+        if made is None:
+            raise RuntimeError("unreachable: a started strategy has its first fits")
+        settings, problem, first, windows = self.settings, made.problem, made.short, made.windows
+        # The fits continue from the search's estimate, so it only has to find the neighbourhood.
+        run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
         run.offer("search", searched)
         # Drawn after the search, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
+        better = self._better_start(problem, first, searched)
+        if better:
+            windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
         choice = Choice("long", {}, settings.long_s, note="without folds")
         if run.settings.cross_validation:
-            choice = self._choose(run, problem, seed)
+            choice = self._choose(run, problem, seed, search=better)
         run.say("fit", f"{choice.chosen} on all recordings")
-        members = self._members(run, problem, _member(first), searched, choice.chosen)
+        members = self._members(problem, first, windows, searched if better else None, choice.chosen)
         theta, latency_s = members[choice.chosen]
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
@@ -162,7 +190,7 @@ class OutputErrorFits(Fits):
             # With fitted start states the residual shows model error, not smoothing error.
             local = with_rows(run.local)
             known, facts["physics_step"] = with_step(run.problem, local, known, theta)
-        chi2, left = float(np.mean((fit.scale / problem.noise.position_std) ** 2)), None
+        chi2, left = fit.chi2, None
         if settings.mismatch_s:
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
             chi2 = left.normal.cost / max(left.normal.count, 1)
@@ -205,8 +233,11 @@ class OutputErrorFits(Fits):
             std[problem.channels] = np.maximum(std[problem.channels], first.scale)
         return problem.on(spread([p for p in parts if p.usable.any()], self.settings.search_s), std)
 
-    def _choose(self, run: CalibrationRun, problem: Problem, seed: int) -> Choice:
-        """Fit every candidate without each fold and compare the predictions of that fold."""
+    def _choose(self, run: CalibrationRun, problem: Problem, seed: int, *, search: bool) -> Choice:
+        """Fit every candidate without each fold and compare the predictions of that fold.
+
+        Without ``search``, that on all recordings was no better start, and no fold is searched.
+        """
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = (
@@ -219,9 +250,13 @@ class OutputErrorFits(Fits):
             question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"
             run.say("cross-validation", question)
             first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, settings.first)
-            rng = np.random.default_rng([seed, fold])
-            searched = run.search.run(self._reduced(train, first), run.budget, rng)
-            return self._members(run, train, _member(first), searched)
+            searched, start = None, _member(first)
+            if search:
+                rng = np.random.default_rng([seed, fold])
+                searched = run.search.run(self._reduced(train, first), run.budget, rng)
+                if self._better_start(train, first, searched):
+                    start = searched.estimate, searched.latency_s
+            return self._members(train, first, self._windows(run, train, start), searched)
 
         def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
             rmse = prediction_rmse(test, members, settings.long_s)
@@ -230,34 +265,35 @@ class OutputErrorFits(Fits):
         found = on_folds(problem, masks, fits, errors, "long", settings.long_s)
         return dataclasses.replace(found, steps=problem.steps - before)
 
+    def _better_start(self, problem: Problem, first: OutputErrorFit, searched: CalibrationResult) -> bool:
+        """Return whether the search's estimate predicts short windows better than the first fit."""
+        both = [_member(first), (searched.estimate, searched.latency_s)]
+        error = np.mean(np.log(prediction_rmse(problem, both, self.settings.compared_s)), axis=1)
+        return bool(error[1] < error[0])
+
+    def _windows(self, run: CalibrationRun, problem: Problem, start: Member) -> list[OutputErrorFit]:
+        """Return the fits over growing windows, from a start."""
+        windows_s = self.settings.windows_s if run.settings.cross_validation else (self.settings.long_s,)
+        recipe, found = self.settings.recipe("long"), list[OutputErrorFit]()
+        for seconds in windows_s:
+            found.append(fit_output_error(problem, *start, dataclasses.replace(recipe, seconds=seconds)))
+            start = _member(found[-1])
+        return found
+
     def _members(
         self,
-        run: CalibrationRun,
         problem: Problem,
-        short: Member,
-        searched: CalibrationResult,
+        first: OutputErrorFit,
+        windows: Sequence[OutputErrorFit],
+        searched: CalibrationResult | None,
         only: str | None = None,
     ) -> dict[str, Member]:
-        """Return every candidate's estimate, or ``only`` one; ``short`` is the fit over short windows."""
-        settings = self.settings
-        windows_s = settings.windows_s if run.settings.cross_validation else (settings.long_s,)
-        found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
-        rmse = prediction_rmse(problem, [found["search"], short], settings.compared_s)
-        start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
-        fits: list[Member] = []
-        for words, prior_std in settings.priors.items():
-            before, fits = fits, []
-            for k, seconds in enumerate(windows_s):
-                recipe = Recipe(seconds=seconds, prior_std=prior_std, robust=settings.robust)
-                # Another prior moves a fit little, so it begins where the fit with the one before ended.
-                begin = before[k] if before else fits[-1] if fits else start
-                fits.append(_member(fit_output_error(problem, *begin, recipe)))
-            for seconds, member in zip(windows_s[:-1], fits, strict=False):
-                found[f"{seconds:g} s{words}"] = member
-            found["long" + words] = fits[-1]
-            found["mean of windows" + words] = _mean(problem, fits)
-            if only is not None and words == settings.prior_of(only):
-                break
+        """Return every candidate's estimate, or as many as ``only`` needs."""
+        settings, found = self.settings, {"short": _member(first)}
+        if searched is not None:
+            found["search"] = searched.estimate, searched.latency_s
+        found |= {f"{fit.recipe.seconds:g} s": _member(fit) for fit in windows[:-1]}
+        found["long"] = _member(windows[-1])
         for name, recipe in settings.variants.items():
             if only in (None, name):
                 theta, latency_s = found["long"]
@@ -381,13 +417,6 @@ def _error(problem: Problem, rmse: FloatArray) -> float:
 
 def _member(fit: OutputErrorFit) -> Member:
     return fit.theta, fit.latency_s
-
-
-def _mean(problem: Problem, members: Sequence[Member]) -> Member:
-    """Return the mean estimate, with each parameter in its own scale."""
-    scaled = [problem.space.to_scale(theta) for theta, _ in members]
-    theta = problem.space.from_scale(np.mean(scaled, axis=0))
-    return theta, float(np.mean([latency_s for _, latency_s in members]))
 
 
 def _known(problem: Problem, fit: OutputErrorFit) -> Uncertainty:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -110,6 +110,22 @@ class FitOutcome:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
+class Fit(Protocol):
+    """The result of a fit of any kind."""
+
+    @property
+    def theta(self) -> FloatArray:
+        """Physical parameters, (K,)."""
+
+    @property
+    def latency_s(self) -> float:
+        """Total latency [s]."""
+
+    @property
+    def chi2(self) -> float:
+        """Mean squared residual over the noise variance."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationRun:
     """State shared by the stages of one calibration.
@@ -139,9 +155,9 @@ class CalibrationRun:
         if self.progress is not None:
             self.progress(Progress(stage, 0, 1, message))
 
-    def offer(self, stage: str, found: Refined | CalibrationResult) -> None:
+    def offer(self, stage: str, found: Fit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""
-        theta = found.theta if isinstance(found, Refined) else found.estimate
+        theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
         if self.progress is not None:
             self.progress(
                 Progress(
@@ -158,6 +174,13 @@ class CalibrationRun:
 
 class Fits(abc.ABC):
     """Strategy where the local fit is not enough: searches, candidate fits, and the choice among them."""
+
+    def started(self, run: CalibrationRun) -> Fits:
+        """Report the strategy's fits from the nominal values, and return the strategy that continues them.
+
+        They come before everything that takes long. There are none by default.
+        """
+        return self
 
     @abc.abstractmethod
     def best(self, run: CalibrationRun) -> FitOutcome:
@@ -232,7 +255,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             if local is not None and progress is not None:
                 local = with_rows(local)
                 report_unidentifiable(problem, local, progress)
-            found = with_shared_error(self.fits, dataclasses.replace(run, local=local))
+            run = dataclasses.replace(run, local=local)
+            found = with_shared_error(self.fits.started(run), run)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {

@@ -69,6 +69,7 @@ class OutputErrorFit:
     Attributes:
         theta: Physical parameters, (K,).
         latency_s: Total latency [s].
+        recipe: The settings.
         scale: Scale of each channel's residuals, (M,): the root mean square; for a robust loss at most the
             scaled median.
         iterations: Steps used.
@@ -81,6 +82,7 @@ class OutputErrorFit:
 
     theta: FloatArray
     latency_s: float
+    recipe: Recipe
     scale: FloatArray
     iterations: int
     plain: Shooting
@@ -88,6 +90,12 @@ class OutputErrorFit:
     point: Point
     fixed_latency: bool
     central: bool
+
+    @property
+    def chi2(self) -> float:
+        """Mean squared ratio of the residuals' scale to the sensors' noise, timing included."""
+        problem = self.plain.problem
+        return float(np.mean((self.scale / problem.noise_std[problem.channels]) ** 2))
 
     @cached_property
     def normal(self) -> Normal:
@@ -154,7 +162,7 @@ def fit_output_error(
             break
     weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf)
     return OutputErrorFit(
-        plain.theta(point), float(point.value[-1]), scale, used, plain, weighed, point, fixed, central
+        plain.theta(point), float(point.value[-1]), recipe, scale, used, plain, weighed, point, fixed, central
     )
 
 

@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class RefinementSettings:
         given_right: Chi2 of most of the shortest windows below which the latency is the right whole step.
         most_windows: Share of the windows that counts as most [-].
         local_s: Length of data on which the local fit starts [s].
-        local_hopeless: Chi2 of the shortest windows above which longer ones are not tried.
+        local_hopeless: Chi2 of the shortest windows above which the local fit does not continue.
     """
 
     stages_s: tuple[float, ...] = (0.2, 0.4, 0.8)
@@ -105,6 +106,7 @@ def refine(
     notify: Callable[[Refined], None] | None = None,
     states: States | None = None,
     shake: bool = True,
+    hopeless: float = np.inf,
 ) -> Refined:
     """Refine parameters from a start.
 
@@ -119,6 +121,7 @@ def refine(
         states: Start states of the first stage's windows; the smoothed states by default.
         shake: With contacts, draw other start states where the solver stops early. With exact states, reduce
             the weight of windows that no small step explains.
+        hopeless: Chi2 above which a fit that has used its iterations does not continue, without contacts.
 
     Raises:
         InsufficientDataError: Not even the shortest window fits.
@@ -150,7 +153,7 @@ def refine(
                 shooting, point, iterations, settings.rounds if shake else 0
             )
         else:
-            point, normal, used = _solved(shooting, point, iterations, fixed_latency)
+            point, normal, used = _solved(shooting, point, iterations, fixed_latency, hopeless)
         done += used
         found = _refined(shooting, point, normal, done, fixed_latency)
         if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
@@ -160,6 +163,8 @@ def refine(
             states = shooting.states(point)
         if notify is not None and np.isfinite(found.chi2):
             notify(found)
+        if not found.chi2 < hopeless:
+            break
     if result is None:
         raise InsufficientDataError("no window length was given")
     return result
@@ -181,11 +186,12 @@ def refine_windows(
 
 
 def _solved(
-    shooting: Shooting, point: Point, iterations: int, fixed_latency: bool
+    shooting: Shooting, point: Point, iterations: int, fixed_latency: bool, hopeless: float = np.inf
 ) -> tuple[Point, Normal, int]:
     if shooting.contacts:
         return solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
-    return solve(shooting, point, SolverSettings(iterations=iterations), fixed_latency=fixed_latency)
+    solver = SolverSettings(iterations=iterations, hopeless=hopeless)
+    return solve(shooting, point, solver, fixed_latency=fixed_latency)
 
 
 def _refined(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Refined:
@@ -324,21 +330,25 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     gets the fit after each window length: on a damped robot the first is often nearly the result, in a third
     of the time.
     """
-    fixed = problem.fixed_latency_s is not None
-    latency_s = problem.first_latency_s
-
-    def fit(part: Problem, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None) -> Refined:
-        return refine(
-            part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.noise_free
-        )
-
-    part, nominal = part_of(problem, SETTINGS.local_s), problem.space.nominal
+    hopeless = np.inf if problem.noise_free else SETTINGS.local_hopeless
+    fit = partial(
+        refine,
+        fixed_latency=problem.fixed_latency_s is not None,
+        notify=notify,
+        shake=problem.noise_free,
+        hopeless=hopeless,
+    )
+    part, theta, latency_s = (
+        part_of(problem, SETTINGS.local_s),
+        problem.space.nominal,
+        problem.first_latency_s,
+    )
     if part is problem or problem.noise_free:
-        found = fit(problem, nominal, latency_s, None)
+        found = fit(problem, theta, latency_s)
         return found if np.isfinite(found.chi2) else None
     short, *longer = window_stages(problem)
-    found = fit(part, nominal, latency_s, (short,))
-    if not found.chi2 < SETTINGS.local_hopeless:
+    found = fit(part, theta, latency_s, (short,))
+    if not found.chi2 < hopeless:
         return found if np.isfinite(found.chi2) else None
     try:
         return fit(problem, found.theta, found.latency_s, longer)

@@ -33,6 +33,7 @@ class SolverSettings:
         reach: Width of a prior around the start, in the parameters' own scale, which holds insensitive
             parameters. It is as wide as a range of ratio 5, and moves with each new start.
         gain: Relative decrease of the cost below which the solver is not started again.
+        hopeless: Mean squared residual above which it is not started again either.
         settled: Relative decrease of the cost below which a step of start states alone is the last.
     """
 
@@ -43,6 +44,7 @@ class SolverSettings:
     smallest_step: float = 1e-5
     reach: float = 1.0
     gain: float = 3e-3
+    hopeless: float = np.inf
     settled: float = 1e-4
 
 
@@ -129,7 +131,8 @@ def solve(
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
         point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
         used += max(more, 1)
-        if used >= settings.iterations or not normal.cost < before * (1 - settings.gain):
+        gained = normal.cost < before * (1 - settings.gain)
+        if used >= settings.iterations or not gained or normal.cost > settings.hopeless * normal.count:
             break
         before = normal.cost
     # The rows are large and one-sided; uncertainty uses central differences at the end.

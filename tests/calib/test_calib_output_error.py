@@ -14,7 +14,7 @@ import pytest
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_output_error, prediction_rmse
-from deal_hw.calib.output_error_fits import OutputErrorFits, output_error_method
+from deal_hw.calib.output_error_fits import OutputErrorFits, OutputErrorSettings, output_error_method
 from deal_hw.calib.pipeline import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
@@ -147,30 +147,40 @@ def test_a_right_model_needs_no_search(problem: Problem) -> None:
     assert found.estimate == pytest.approx(TRUTH, rel=0.02)
 
 
+CANDIDATES = {"short", "0.4 s", "0.8 s", "1.2 s", "long", "long, robust", "long, no latency"}
+
+
 def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationResult) -> None:
     """Every candidate has an error in each fold, a fit wins, and the truth lies in the intervals."""
     folds = result.provenance["cross_validation"]
-    assert set(folds["errors"]) == {
-        "search",
-        "short",
-        "long",
-        "long, wide prior",
-        "long, robust",
-        "long, no latency",
-        "mean of windows",
-        "mean of windows, wide prior",
-        "0.4 s",
-        "0.8 s",
-        "1.2 s",
-        "0.4 s, wide prior",
-        "0.8 s, wide prior",
-        "1.2 s, wide prior",
-    }
+    assert set(folds["errors"]) == CANDIDATES
     assert all(len(errors) == 2 for errors in folds["errors"].values())
     assert folds["chosen"] != "long, no latency"
     assert result.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
     assert np.all(result.interval[:, 0] <= TRUTH) and np.all(result.interval[:, 1] >= TRUTH)
     assert result.latency_s == pytest.approx(LATE_S, abs=2e-3)
+
+
+def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_start(problem: Problem) -> None:
+    """A first fit that stays at wrong nominal values: the folds search, and the truth is still found."""
+    stuck = OutputErrorSettings(first=Recipe(seconds=0.2, iterations=0), windows_s=(0.4, 2.0))
+    method = CalibrationPipeline(
+        Eki(), "output-error", Validation(local_first=False), fits=OutputErrorFits(stuck)
+    )
+    offered: list[tuple[str, float]] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.estimate is not None:
+            offered.append((progress.stage, float(progress.estimate[0])))
+
+    found = method.run(problem, BUDGET, np.random.default_rng(0), watch)
+    assert [stage for stage, _ in offered] == ["fit of short windows", "fit of long windows", "search"]
+    assert offered[0][1] == problem.space.nominal[0]
+    assert offered[1][1] == pytest.approx(TRUTH[0], rel=0.03)
+    assert set(found.provenance["cross_validation"]["errors"]) == (CANDIDATES - {"0.8 s", "1.2 s"}) | {
+        "search"
+    }
+    assert found.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
 
 
 def test_halves_of_a_right_model_agree(problem: Problem, result: CalibrationResult) -> None:
