@@ -7,7 +7,7 @@ solver sees the parameters alone. A robust loss is a weight per residual, comput
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -116,18 +116,24 @@ def minimise(
 
 
 def solve(
-    shooting: Shooting, point: Point, settings: SolverSettings, *, fixed_latency: bool
+    shooting: Shooting,
+    point: Point,
+    settings: SolverSettings,
+    *,
+    fixed_latency: bool,
+    notify: Callable[[Point, Normal], None] | None = None,
 ) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states.
 
-    Return the solution, the normal equations there, and the number of derivatives.
+    Return the solution, the normal equations there, and the number of derivatives. ``notify`` gets each
+    accepted step.
     """
     bounds, used, before = value_bounds(shooting.problem), 0, shooting.cost(point)
     normal: Normal | None = None
     # Beside a kink, steps shrink to nothing. A new trust region around the updated start states continues, or
     # shows that this is the end.
     while True:
-        fit = _Following(shooting, point, normal)
+        fit = _Following(shooting, point, normal, notify)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
         point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
         used += max(more, 1)
@@ -155,12 +161,19 @@ def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int)
 class _Following:
     """The residual as a function of the parameters alone; start states follow.
 
-    It starts at a point and, if known, the normal equations there with their rows.
+    It starts at a point and, if known, the normal equations there with their rows. ``notify`` gets the later
+    ones.
     """
 
-    def __init__(self, shooting: Shooting, point: Point, normal: Normal | None) -> None:
+    def __init__(
+        self,
+        shooting: Shooting,
+        point: Point,
+        normal: Normal | None,
+        notify: Callable[[Point, Normal], None] | None,
+    ) -> None:
         self._shooting, self._here, self._normal = shooting, point, normal
-        self._last = point
+        self._last, self._notify = point, notify
 
     def at(self, value: FloatArray) -> Point:
         """Return the point at parameters and latency, (K + 1,)."""
@@ -183,7 +196,10 @@ class _Following:
         """Return the normal equations at parameters and latency, (K + 1,); kept for the last ones."""
         point = self.at(value)
         if self._normal is None or point is not self._here:
+            moved = point is not self._here
             self._normal, self._here = self._shooting.normal(point, keep=True), point
+            if moved and self._notify is not None:
+                self._notify(point, self._normal)
         return self._normal
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -17,7 +18,7 @@ from deal_hw.calib import pipeline
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.pipeline import (
     CalibrationPipeline,
@@ -60,6 +61,28 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
     assert not conclusive(problem, leaving(pattern), MISMATCH.white_samples)
     # What is far below the noise needs no explanation.
     assert conclusive(problem, leaving(0.5 * pattern), MISMATCH.white_samples)
+
+
+def test_a_local_fit_is_reported_step_by_step(small_problem: Callable[..., Problem]) -> None:
+    """Costs fall within a window length, no report is of the nominal values, and the last is the result."""
+    problem = small_problem()
+    told: list[Refined] = []
+    found = local_fit(problem, told.append)
+    assert found is not None and np.array_equal(told[-1].theta, found.theta)
+    lengths = [fit.shooting.length for fit in told]
+    assert lengths == sorted(lengths) and len(told) > 2 * len(set(lengths))
+    for length in set(lengths):
+        costs = [fit.normal.cost for fit in told if fit.shooting.length == length]
+        assert all(later <= before * (1 + 1e-9) for before, later in itertools.pairwise(costs))
+    assert not any(np.array_equal(fit.theta, problem.space.nominal) for fit in told)
+
+
+def test_a_hopeless_fit_does_not_begin_again(small_problem: Callable[..., Problem]) -> None:
+    """A limit below the chi2 of the first window length, 2e-10: one run of the solver, no longer windows."""
+    problem = small_problem()
+    whole = refine(problem, problem.space.nominal, 0.0)
+    early = refine(problem, problem.space.nominal, 0.0, hopeless=1e-12)
+    assert early.iterations < whole.iterations and early.shooting.length < whole.shooting.length
 
 
 @pytest.mark.parametrize("rescued_by", ["local fit", "drawn points"])
