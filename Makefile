@@ -40,11 +40,12 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
-# Tests that need the DDS peer or the AVR's tools are skipped without them, and say what to install.
+# Tests that need the DDS peer or the AVR's tools are skipped without them, and say what to install. One thread of
+# OpenMP a process: with more, the two workers' threads wait for each other on two cores.
 test: $(STAMP) ## all tests that need no robot
 	@tools/build_dds_peer.sh || true
 	@tools/install_avr_tools.sh || true
-	$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
 dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 	@tools/build_dds_peer.sh

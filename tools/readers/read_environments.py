@@ -13,6 +13,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import deal_hw.workflows.environments  # noqa: F401  registers the tasks
 
+STEPS = 5
+"""Steps of the training that goes on: each costs the gradient steps of a whole batch."""
+
 
 def main(model: Path) -> None:
     """Check all tasks, single and vector, and the model that training left."""
@@ -29,8 +32,8 @@ def main(model: Path) -> None:
             if seen not in batch.observation_space:
                 raise AssertionError(f"{name}: observations {seen.shape}")
         loaded = SAC.load(model, env=gymnasium.make("deal_hw/CartPole-v0"), device="cpu")
-        loaded.learn(50, reset_num_timesteps=False)
-    print(f"{', '.join(names)}; SAC goes on from step {loaded.num_timesteps - 50}")
+        loaded.learn(STEPS, reset_num_timesteps=False)
+    print(f"{', '.join(names)}; SAC goes on from step {loaded.num_timesteps - STEPS}")
 
 
 if __name__ == "__main__":
