@@ -69,7 +69,6 @@ class RestartSettings:
         drawn: Most refinements from points drawn in the ranges, before another search. On cart-poles whose
             nominal values lead to another minimum, about one in four of these points leads to the truth.
         contact_drawn: The same with feet on the floor, where a refinement takes as long as a search.
-        evidence: Least gain in deviance of a lower minimum [-]: 20 is odds of 22,000 to 1.
     """
 
     restarts: int = 2
@@ -78,7 +77,6 @@ class RestartSettings:
     explained: float = MISMATCH.chi2
     drawn: int = 8
     contact_drawn: int = 0
-    evidence: float = 20.0
 
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
@@ -372,7 +370,7 @@ def lower_minimum(run: CalibrationRun, found: Refined, settings: RestartSettings
     same = best = refined_from(run_part, found.theta, found.latency_s, shortest)
     for theta in part.space.sample(rng, settings.draws(part)):
         tried = refined_from(run_part, theta, part.first_latency_s, shortest)
-        if tried.normal.count * np.log(best.chi2 / tried.chi2) > settings.evidence:
+        if tried.normal.count * np.log(best.chi2 / tried.chi2) > MISMATCH.evidence:
             best = tried
             if conclusive(part, best, MISMATCH.white_samples):
                 break

@@ -20,7 +20,7 @@ from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
-from deal_hw.calib.uncertainty.intervals import ended_at_bound
+from deal_hw.calib.uncertainty.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
 from deal_hw.calibration import Alarm, listed
@@ -34,7 +34,6 @@ class DiagnosisSettings:
     """Settings of :func:`diagnose`.
 
     Attributes:
-        evidence: Least gain in held-out deviance of a named cause [-]: 20 is odds of 22,000 to 1.
         noticed: Least share of the held-out squared residual that it explains [-].
         most: Most named causes.
         alike: Least explained share of a named body's mass, relative to the best one's [-].
@@ -50,7 +49,6 @@ class DiagnosisSettings:
         burst_size: Least squared residual of a burst over the median [-].
     """
 
-    evidence: float = 20.0
     noticed: float = 0.03
     most: int = 3
     alike: float = 0.8
@@ -223,7 +221,7 @@ def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
     found = fit.theta[len(problem.space) :]
     share = 1 - with_play.chi2 / without.chi2
     deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
-    if not (deviance > SETTINGS.evidence and share > SETTINGS.noticed):
+    if not (deviance > MISMATCH.evidence and share > SETTINGS.noticed):
         return None
     order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
     joints = [plays[k].elements[0] for k in order]
@@ -249,7 +247,7 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
         gains = [left.gain(taken, group) for group in groups]
         group = groups[int(np.argmax(gains))]
         share = 1 - float(np.exp(-max(gains) / left.count))
-        if max(gains) <= SETTINGS.evidence or share <= SETTINGS.noticed:
+        if max(gains) <= MISMATCH.evidence or share <= SETTINGS.noticed:
             break
         found.append(_cause_diagnosis(left, taken, group, share, max(gains)))
         taken += group
@@ -405,7 +403,7 @@ class _Left:
 def _varying_delay(known: Evidence) -> Diagnosis | None:
     """Return whether each command seems to have its own delay; see :mod:`.random_delay`."""
     found = random_delay(known.rows, known.answers, known.period_s)
-    if found is None or not (found.gain > SETTINGS.evidence and found.share > SETTINGS.noticed):
+    if found is None or not (found.gain > MISMATCH.evidence and found.share > SETTINGS.noticed):
         return None
     seen = (
         f"{100 * found.share:.2g} % of the squared residual comes where commands change fast, as if each "

@@ -45,7 +45,6 @@ class SharedErrorSettings:
         window_s: Windows of the fits [s]; windows of other clocks have as many samples.
         tried: Number of candidates that are fitted: those that the nominal values predict best.
         iterations: Most steps of each fit.
-        evidence: Least gain in held-out deviance of a candidate [-], as in the diagnosis.
         decisive: Least share of the held-out squared residual that it explains [-].
         noticed: The same where only noise remains [-].
         alike: Largest ratio of the held-out squared residual to the best one's for candidates that are named
@@ -58,7 +57,6 @@ class SharedErrorSettings:
     window_s: float = 0.2
     tried: int = 5
     iterations: int = 8
-    evidence: float = 20.0
     decisive: float = 0.5
     noticed: float = 0.2
     alike: float = 1.1
@@ -246,7 +244,7 @@ def _decides(before: float, after: float, count: int) -> bool:
     share = settings.noticed if after <= MISMATCH.chi2 else settings.decisive
     if not np.isfinite(after) or not after < (1 - share) * before:
         return False
-    return not np.isfinite(before) or count * math.log(before / after) > settings.evidence
+    return not np.isfinite(before) or count * math.log(before / after) > MISMATCH.evidence
 
 
 def _samples(test: Problem, length: int) -> int:
