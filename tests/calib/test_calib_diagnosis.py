@@ -12,7 +12,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.uncertainty.intervals import with_rows
+from deal_hw.calib.uncertainty.intervals import MISMATCH, with_rows
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, name_causes
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
@@ -138,7 +138,7 @@ def test_two_causes_are_named_and_the_larger_first() -> None:
     v, _ = _motion()
     found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
     assert [f.cause for f in found] == ["load", "damping"]
-    assert found[0].deviance > found[1].deviance > diagnosis.SETTINGS.evidence
+    assert found[0].deviance > found[1].deviance > MISMATCH.evidence
 
 
 def test_contact_comes_in_bursts() -> None:
@@ -194,7 +194,7 @@ def test_random_delays_push_where_commands_change() -> None:
     """Impulses of 0.5 (standard deviation) times what each command changes: 0.5 s in these units."""
     rows, answers = _pushed(lambda change, rng: 0.5 * change * rng.standard_normal(change.shape))
     found = random_delay(rows, answers, PERIOD_S)
-    assert found is not None and found.gain > diagnosis.SETTINGS.evidence
+    assert found is not None and found.gain > MISMATCH.evidence
     assert found.std_s == pytest.approx(0.5, rel=0.15)
 
 
