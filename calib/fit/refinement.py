@@ -378,11 +378,8 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
         hopeless=hopeless,
         notify_step=_clear_gains(notify) if notify is not None else None,
     )
-    part, theta, latency_s = (
-        part_of(problem, SETTINGS.local_s),
-        problem.space.nominal,
-        problem.first_latency_s,
-    )
+    part = part_of(problem, SETTINGS.local_s)
+    theta, latency_s = problem.space.nominal, problem.first_latency_s
     if part is problem or problem.noise_free:
         found = fit(problem, theta, latency_s)
         return found if np.isfinite(found.chi2) else None
