@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deal_hw.data.checks.slip import LEAST_S, Slip, find_slip, slip_verdict
+from deal_hw.data.checks.slip import ALIKE, LEAST_S, Slip, find_slip, slip_verdict
 from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.testing.plain_robots import make_robot, record
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
@@ -104,6 +107,23 @@ def test_closed_loop_of_a_cart_pole(by_s: float, severity: Severity) -> None:
         )
         recording = (made.device_s, made.position, made.sent_s, made.position_target)
         assert slip_verdict(*slipped(recording, 7.0, by_s), np.array([0])).severity is severity
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("pendulum", 2001), ("cart-pole", 2001), ("pendulum", 5)])
+def test_backlash_is_not_refused(kind: str, seed: int) -> None:
+    """Where motions are small, play delays them; the message says so, and the recording is used."""
+    rows = list(csv.reader(io.StringIO(record(make_robot(kind, seed, "backlash"), 0, 12.0))))
+    values = np.array(rows[1:], dtype=float)
+    commands = [i for i, name in enumerate(rows[0]) if name.endswith(".command")]
+    positions = [i for i in range(1, len(rows[0])) if i not in commands]
+    actuated = np.array([rows[0][i].removesuffix(".command") for i in commands])
+    joints = np.array([positions.index(rows[0].index(name)) for name in actuated])
+    time = values[:, 0]
+    found = find_slip(time, values[:, positions], time, values[:, commands], joints)
+    assert found is not None and found.clear > 0.5 and found.alike < ALIKE
+    verdict = slip_verdict(time, values[:, positions], time, values[:, commands], joints)
+    assert verdict.severity is not Severity.FAIL
+    assert "backlash looks similar" in verdict.message
 
 
 def real(name: str) -> Recording:
