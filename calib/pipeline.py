@@ -42,6 +42,7 @@ from deal_hw.calib.uncertainty.intervals import (
 )
 from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
 from deal_hw.calib.validation.cross_validation import Choice, choose
+from deal_hw.calib.validation.diagnosis import find_play
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.verdict import Validation, judge, unexplained
 from deal_hw.calibration import (
@@ -52,6 +53,7 @@ from deal_hw.calibration import (
     Progress,
     ProgressCallback,
     StateStore,
+    listed,
 )
 from deal_hw.types import FloatArray
 
@@ -254,13 +256,14 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 local = with_rows(local)
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
-            found = with_shared_error(self.fits.started(run), run)
+            fits = self.fits.started(run)
+            found = with_play(run) or with_shared_error(fits, run)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
             "search": searched.method,
             "search_seconds": searched.seconds,
-            "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
+            "search_estimate": dict(zip(searched.space.names, map(float, searched.estimate), strict=True)),
             "search_latency_s": searched.latency_s,
             **found.facts,
         }
@@ -453,6 +456,30 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
     known = dataclasses.replace(found.known, alarms=(mismatch(weighted.chi2), *found.known.alarms))
     facts = {**found.facts, "channel_weights": scale}
     return dataclasses.replace(found, chi2=weighted.chi2, known=known, facts=facts)
+
+
+def with_play(run: CalibrationRun) -> FitOutcome | None:
+    """Return the fit with play in the gears as more parameters, if only noise is left then; otherwise None.
+
+    No search follows: no model without play can be right.
+    """
+    if run.local is None or not run.settings.diagnosis:
+        return None
+    play = find_play(run.problem, run.local)
+    if play is None or not play.explains:
+        return None
+    wide = dataclasses.replace(run, problem=play.problem, progress=None)
+    fit = refined_from(wide, play.theta, play.latency_s)
+    if not conclusive(play.problem, fit):
+        return None
+    added = play.problem.space.names[-len(play.diagnosis.joints) :]
+    do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
+    alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
+    run.say(BEFORE_SEARCH, str(alarm))
+    found = conclude_fit(wide, without_search(play.problem, run.budget, fit), fit)
+    known = dataclasses.replace(found.known, alarms=(alarm, *found.known.alarms))
+    facts = {**found.facts, "diagnosis": [dataclasses.asdict(play.diagnosis)]}
+    return dataclasses.replace(found, known=known, facts=facts)
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

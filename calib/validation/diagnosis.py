@@ -131,6 +131,30 @@ class Diagnosis:
 
 
 @dataclass(frozen=True, slots=True)
+class Play:
+    """Play in the gears, found by fitting a model with it to a part of the recordings.
+
+    Attributes:
+        diagnosis: Play as the cause of the residual.
+        problem: The recordings, with the named joints' plays as more parameters.
+        theta: The fit's values of these parameters.
+        latency_s: Its latency [s].
+        chi2: Mean squared residual over the noise variance, of motion that was not fitted.
+    """
+
+    diagnosis: Diagnosis
+    problem: Problem
+    theta: FloatArray
+    latency_s: float
+    chi2: float
+
+    @property
+    def explains(self) -> bool:
+        """Whether it leaves only noise of motion that was not fitted, and less than half of the residual."""
+        return self.chi2 < MISMATCH.chi2 and self.diagnosis.share >= SETTINGS.decisive
+
+
+@dataclass(frozen=True, slots=True)
 class Evidence:
     """Evidence for a diagnosis.
 
@@ -153,7 +177,8 @@ class Evidence:
 
 def diagnose(problem: Problem, refined: Refined) -> tuple[Diagnosis, ...]:
     """Return the causes of a fit's residual, best supported first; the fit has linearised residuals."""
-    play = find_play(problem, refined)
+    found_play = find_play(problem, refined)
+    play = None if found_play is None else found_play.diagnosis
     if play is not None and play.share >= SETTINGS.decisive:
         return (play,)
     found = name_causes(evidence(problem, refined))
@@ -180,7 +205,7 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
     )
 
 
-def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
+def find_play(problem: Problem, refined: Refined) -> Play | None:
     """Fit a model with play in every gear to a part of the recordings, and compare predictions of the rest.
 
     The fit without play, ``refined``, has used all recordings.
@@ -190,18 +215,20 @@ def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
     if description.actuation != "position" or problem.robot.base is not None or problem.noise_free or known:
         return None
     span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
+    coordinate_units = problem.robot.coordinate_units[problem.robot.joints]
+    units = dict(zip(description.joint_names, coordinate_units, strict=True))
     plays = [
         Parameter(
             name=f"{name}.play",
             kind="servo_play",
             elements=(name,),
-            unit="-",
+            unit=units[joint],
             nominal=0.0,
             low=0.0,
             high=SETTINGS.most_play * float(most),
             scale="linear",
         )
-        for name, most in zip(names, span, strict=True)
+        for name, joint, most in zip(names, description.actuated, span, strict=True)
         if most > 0
     ]
     wide = problem.with_more(plays)
@@ -224,17 +251,16 @@ def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
     if not (deviance > MISMATCH.evidence and share > SETTINGS.noticed):
         return None
     order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
-    joints = [plays[k].elements[0] for k in order]
-    units = dict(
-        zip(description.joint_names, problem.robot.coordinate_units[problem.robot.joints], strict=True)
-    )
-    acted = dict(zip(names, description.actuated, strict=True))
-    sizes = listed([f"{found[k]:.2g} {units[acted[j]]} at {j}" for k, j in zip(order, joints, strict=True)])
+    named = [plays[k] for k in order]
+    joints = [play.elements[0] for play in named]
+    sizes = listed([f"{found[k]:.2g} {plays[k].unit} at {plays[k].elements[0]}" for k in order])
     seen_words = (
         f"With play in the gears ({sizes}) the model predicts motion that it was not fitted to with chi2 "
         f"{with_play.chi2:.3g} instead of {without.chi2:.3g}: backlash."
     )
-    return _finding("backlash", share, deviance, joints, listed(joints), seen_words)
+    cause = _finding("backlash", share, deviance, joints, listed(joints), seen_words)
+    theta = np.concatenate([fit.theta[: len(problem.space)], found[order]])
+    return Play(cause, problem.with_more(named), theta, fit.latency_s, with_play.chi2)
 
 
 def name_causes(known: Evidence) -> list[Diagnosis]:

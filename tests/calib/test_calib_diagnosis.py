@@ -17,9 +17,12 @@ from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, name_causes
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
-from deal_hw.testing.plain_robots import Fault, PlainRobot, make_robot, write
+from deal_hw.calib.validation.verdict import trust
+from deal_hw.calibration import Budget
+from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
@@ -264,6 +267,33 @@ def test_play_is_found_and_measured(tmp_path: Path) -> None:
     """A gear with 0.06 rad of play: refitted with play in it the model predicts the rest to the noise."""
     _, problem, fit = _truth("pendulum", "backlash", tmp_path)
     found = find_play(problem, fit)
-    assert found is not None and found.cause == "backlash" and found.joints == ("pivot",)
-    assert "0.06 rad at pivot" in found.alarm.seen and "servo_play" in found.alarm.do
-    assert found.share > diagnosis.SETTINGS.decisive
+    assert found is not None and found.explains
+    cause = found.diagnosis
+    assert cause.cause == "backlash" and cause.joints == ("pivot",)
+    assert "0.06 rad at pivot" in cause.alarm.seen and "servo_play" in cause.alarm.do
+    assert cause.share > diagnosis.SETTINGS.decisive
+
+
+def test_play_that_explains_all_becomes_a_parameter(tmp_path: Path) -> None:
+    """No search follows; the result has the play, the true values, and one alarm."""
+    robot, problem, _ = _truth("pendulum", "backlash", tmp_path)
+    result = calibrate_episodes(
+        problem.robot,
+        problem.space,
+        problem.episodes,
+        problem.episodes[:1],
+        method="default",
+        budget=Budget(population=8, generations=2),
+        rng=np.random.default_rng(0),
+        threads=1,
+    )
+    assert result.space.names == (*problem.space.names, "pivot.play") and result.steps < 5_000_000
+    assert result.provenance["search"] == "local fit" and result.chi2 < MISMATCH.chi2
+    true = np.array([robot.truth.get(name, PLAY) for name in result.space.names])
+    np.testing.assert_allclose(result.estimate[-1], PLAY, rtol=0.02)
+    inside = (result.interval[:, 0] <= true) & (true <= result.interval[:, 1])
+    assert inside.mean() >= 0.75
+    (alarm,) = [one for one in result.alarms if "play" in one.seen]
+    assert "it has the play as pivot.play" in alarm.do
+    assert result.heldout_nrmse["calibrated"] < 0.1 * result.heldout_nrmse["nominal"]
+    assert trust(result).colour == "amber"

@@ -40,6 +40,7 @@ from deal_hw.workflows.say import Say, aloud, silent
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
+    from deal_hw.calib.validation.metrics import HeldoutErrors
     from deal_hw.control.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
@@ -212,10 +213,11 @@ def calibrate_episodes(
 
     held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
 
-    def beside_nominal(theta: FloatArray, latency: float) -> dict[str, tuple[FloatArray, float]]:
-        return {"nominal": (space.nominal, 0.0), "calibrated": (theta, latency)}
+    def errors(of: HeldOut, theta: FloatArray, latency: float) -> HeldoutErrors:
+        nominal = of.problem.space.nominal
+        return of.errors({"nominal": (nominal, 0.0), "calibrated": (theta, latency)})
 
-    judge = None if held_out is None else lambda *fit: held_out.errors(beside_nominal(*fit)).nrmse
+    judge = None if held_out is None else lambda *fit, of=held_out: errors(of, *fit).nrmse
     best = BestSoFar(space, judge, say)
     searcher = make_method(method, refine=budget.refine)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
@@ -241,9 +243,12 @@ def calibrate_episodes(
     result = dataclasses.replace(result, alarms=alarms)
     if held_out is None:
         return result
-    errors = held_out.errors(beside_nominal(result.estimate, result.latency_s))
-    provenance = {**result.provenance, "heldout_rmse": errors.to_json()}
-    return dataclasses.replace(result, heldout_nrmse=errors.nrmse, provenance=provenance)
+    if len(result.space) > len(space):
+        # Play in the gears became a parameter.
+        held_out = HeldOut(robot, result.space, holdout, heldout_window_s, threads)
+    found = errors(held_out, result.estimate, result.latency_s)
+    provenance = {**result.provenance, "heldout_rmse": found.to_json()}
+    return dataclasses.replace(result, heldout_nrmse=found.nrmse, provenance=provenance)
 
 
 def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None:
