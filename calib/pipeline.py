@@ -461,7 +461,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
 def with_play(run: CalibrationRun) -> FitOutcome | None:
     """Return the fit with play in the gears as more parameters, if only noise is left then; otherwise None.
 
-    No search follows: no model without play can be right.
+    No search follows: nothing but noise is left to explain.
     """
     if run.local is None or not run.settings.diagnosis:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
@@ -167,6 +167,18 @@ class CalibrationResult:
         verdicts = self.verdicts or ("",) * len(self.space)
         named = zip(self.space.names, verdicts, strict=True)
         return tuple(name for name, verdict in named if verdict == "not identifiable")
+
+    def restricted(self, space: ParameterSpace) -> CalibrationResult:
+        """Return the result of a space's parameters alone, which come first; others were added to it."""
+        K = len(space)
+        return replace(
+            self,
+            space=space,
+            estimate=self.estimate[:K],
+            interval=self.interval[:K],
+            covariance=None if self.covariance is None else self.covariance[:K, :K],
+            verdicts=self.verdicts[:K],
+        )
 
     def distribution(self) -> ParameterDistribution:
         """Return the calibrated distribution of the parameters."""

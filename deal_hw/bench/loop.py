@@ -60,16 +60,18 @@ def calibration_row(
         threads=threads,
         policy=d.policy,
     )
-    coverage, width = _intervals(d, result, threads)
+    # Play in the gears may have become a parameter.
+    found = result.restricted(d.space)
+    coverage, width = _intervals(d, found, threads)
     truth = d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]
-    held_out = HeldOut(d.robot, d.space, [d.heldout], threads=threads, truth=[truth])
-    candidates = {"nominal": (d.space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}
+    held_out = HeldOut(d.robot, result.space, [d.heldout], threads=threads, truth=[truth])
+    candidates = {"nominal": (result.space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}
     errors = held_out.errors(candidates).nrmse
-    verdicts = zip(d.space.names, result.verdicts, strict=False)
+    verdicts = zip(d.space.names, found.verdicts, strict=False)
     untold = [name for name, verdict in verdicts if verdict == "not identifiable"]
     row = {
-        "error_percent": error_percent(result.estimate, d.theta),
-        "log_error_x100": log_error_x100(result.estimate, d.theta),
+        "error_percent": error_percent(found.estimate, d.theta),
+        "log_error_x100": log_error_x100(found.estimate, d.theta),
         "null_error_percent": error_percent(d.space.center, d.theta),
         "null_log_error_x100": log_error_x100(d.space.center, d.theta),
         "coverage90": coverage,
@@ -86,7 +88,7 @@ def calibration_row(
         "alarms": [str(alarm) for alarm in result.alarms],
         "untold": untold,
         "null_directions": list(result.null_directions),
-        "per_parameter": per_parameter(result, d.theta),
+        "per_parameter": per_parameter(found, d.theta),
         "refused_truths": d.refused,
         "excitation_levels": list(d.excitation_levels),
     }

@@ -192,7 +192,7 @@ def run_cell(
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"
         return row
-    unit = work.space.normalize(result.estimate)
+    unit = result.space.normalize(result.estimate)
     rmse = result.provenance.get("heldout_rmse", {})
     row |= {f"heldout_nrmse_{name}": value for name, value in result.heldout_nrmse.items()}
     row |= {f"heldout_rmse_{name}": value for name, value in rmse.get("mean", {}).items()}
@@ -206,13 +206,13 @@ def run_cell(
         "alarms": [str(alarm) for alarm in result.alarms],
         "chi2": result.chi2,
         "at_bound": [
-            name for name, u in zip(work.space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6
+            name for name, u in zip(result.space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6
         ],
         "null_directions": list(result.null_directions),
         **{
             name: result.provenance.get(name)
             for name in ("cross_validation", "split_half", "confounded", "heldout_rmse")
         },
-        "estimate": dict(zip(work.space.names, map(float, result.estimate), strict=True)),
+        "estimate": dict(zip(result.space.names, map(float, result.estimate), strict=True)),
     }
     return row

@@ -269,6 +269,7 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
                 **({} if beside is None else {done.beside_name: float(beside.estimate[k])}),
             }
             for k, p in enumerate(result.space)
+            if p.name in done.truth
         },
         "known": {
             name: {"value": value, "truth": done.truth[name]}

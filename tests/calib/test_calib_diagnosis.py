@@ -297,3 +297,6 @@ def test_play_that_explains_all_becomes_a_parameter(tmp_path: Path) -> None:
     assert "it has the play as pivot.play" in alarm.do
     assert result.heldout_nrmse["calibrated"] < 0.1 * result.heldout_nrmse["nominal"]
     assert trust(result).colour == "amber"
+    asked = result.restricted(problem.space)
+    assert asked.space.names == problem.space.names and len(asked.verdicts) == len(asked.estimate)
+    np.testing.assert_array_equal(asked.distribution().mean, result.distribution().mean[:-1])
