@@ -103,6 +103,12 @@ class Alarm:
         return f"{self.seen} {self.means} {self.do}"
 
 
+def percent(share: float) -> str:
+    """Return a share as text, in percent with two digits, or as a whole number from 100 on."""
+    value = 100 * share
+    return f"{value:.2g} %" if value < 99.5 else f"{value:.0f} %"
+
+
 def listed(names: Sequence[str], most: int = 6) -> str:
     """Return names as text, of many only the first.
 

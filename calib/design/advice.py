@@ -17,7 +17,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior
 from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import CalibrationResult, percent
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
     OF_FAMILY,
@@ -258,7 +258,7 @@ def _advice(
 def _amount(space: ParameterSpace, k: int, std: float) -> str:
     """Format a standard deviation: in percent on a log scale, with the unit on a linear one."""
     if space.log_scale[k]:
-        return f"{100 * std:.2g} %"
+        return percent(std)
     return f"{std:.2g} {space.free[k].unit}"
 
 

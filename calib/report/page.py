@@ -19,7 +19,7 @@ from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.story import make_story
 from deal_hw.calib.validation.verdict import trust
-from deal_hw.calibration import RESULT_FILE, CalibrationResult
+from deal_hw.calibration import RESULT_FILE, CalibrationResult, percent
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import Parameter
@@ -222,7 +222,7 @@ def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
     if std is None:
         return "–"
     parameter = result.space[name]
-    return f"{100 * std:.2g} %" if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
+    return percent(std) if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
 
 
 def with_value(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from deal_hw import calibration
 from deal_hw.calib.validation.verdict import SETTINGS as VERDICT
 from deal_hw.calibration import CalibrationResult
 
@@ -105,9 +106,8 @@ def _times(ratio: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Format a share with two digits as percent, without a line break inside."""
-    value = 100.0 * share
-    return f"{value:.2g}\u00a0%" if value < 99.5 else f"{value:.0f}\u00a0%"
+    """Return a share in percent, without a line break inside."""
+    return calibration.percent(share).replace(" ", "\u00a0")
 
 
 def _in_units(rmse: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
-from deal_hw.calibration import Alarm, listed
+from deal_hw.calibration import Alarm, listed, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
@@ -301,7 +301,7 @@ def _finding(
 ) -> Diagnosis:
     looks, means, do = LOOKS[cause]
     if not seen:
-        seen = f"{100 * share:.2g} % of the squared residual on left-out motion looks like {looks}: {cause}."
+        seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: {cause}."
     alarm = Alarm(seen, means, do.replace("{}", where))
     return Diagnosis(cause, float(share), float(deviance), tuple(joints), alarm)
 
@@ -328,11 +328,11 @@ def _mass_diagnosis(left: _Left, taken: Sequence[Signature], share: float, devia
     # The signature is a change per share of the mass; the residual is prediction minus measurement.
     change = {k: -float(left.coefficients([*taken, bodies[k]])[-1]) for k in alike}
     ways = [
-        f"{bodies[k].where} {100 * abs(change[k]):.2g} % {'heavier' if change[k] > 0 else 'lighter'}"
+        f"{bodies[k].where} {percent(abs(change[k]))} {'heavier' if change[k] > 0 else 'lighter'}"
         for k in alike
     ]
     seen = (
-        f"With {' or '.join(ways)} the model predicts left-out motion with {100 * share:.2g} % less squared "
+        f"With {' or '.join(ways)} the model predicts left-out motion with {percent(share)} less squared "
         "residual: another mass."
     )
     names = [bodies[k].where for k in alike]
@@ -432,7 +432,7 @@ def _varying_delay(known: Evidence) -> Diagnosis | None:
     if found is None or not (found.gain > MISMATCH.evidence and found.share > SETTINGS.noticed):
         return None
     seen = (
-        f"{100 * found.share:.2g} % of the squared residual comes where commands change fast, as if each "
+        f"{percent(found.share)} of the squared residual comes where commands change fast, as if each "
         f"had its own delay (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
     )
     return _finding("delay", found.share, found.deviance, (), "", seen)

@@ -15,7 +15,7 @@ from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlati
 from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import diagnose
 from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult, percent
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
 
@@ -187,9 +187,9 @@ def trust(result: CalibrationResult) -> Trust:
     elif not calibrated <= SETTINGS.worse * nominal:
         return Trust(
             "red",
-            f"On held-out motion the calibrated model errs by {100 * calibrated:.2g} % of the signal's "
+            f"On held-out motion the calibrated model errs by {percent(calibrated)} of the signal's "
             "range, your "
-            f"own model by {100 * nominal:.2g} %.",
+            f"own model by {percent(nominal)}.",
             "The calibrated model is worse.",
             "Do not use it. Check units, signs and joint order of the recordings, then the alarms.",
         )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult, percent
 from deal_hw.description import RobotDescription
 from deal_hw.sim.recordings.overlay import Overlay, Prediction
 from deal_hw.types import Trajectory
@@ -59,7 +59,7 @@ def summary_markdown(
 
 def _mean_errors(overlay: Overlay) -> str:
     shares = ", ".join(
-        f"{name} {100 * float(np.nanmean(prediction.position_nrmse)):.2g} %"
+        f"{name} {percent(float(np.nanmean(prediction.position_nrmse)))}"
         for name, prediction in overlay.predictions.items()
     )
     return (
@@ -111,7 +111,7 @@ def _by_joint(overlay: Overlay, description: RobotDescription) -> list[str]:
 def _cells(prediction: Prediction, description: RobotDescription) -> list[str]:
     rmse = (prediction.window_rmse**2).mean(axis=0) ** 0.5
     return [
-        f"{1e3 * value:.3g} m{unit} ({100 * share:.2g} %)"
+        f"{1e3 * value:.3g} m{unit} ({percent(share)})"
         for value, unit, share in zip(
             rmse, description.position_units, prediction.position_nrmse, strict=True
         )

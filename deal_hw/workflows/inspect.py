@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Protocol
 
-from deal_hw.calibration import CalibrationResult, read_result
+from deal_hw.calibration import CalibrationResult, percent, read_result
 from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
@@ -87,7 +87,7 @@ class Inspection:
         lines = []
         for name, prediction in self.overlay.predictions.items():
             shares = ", ".join(
-                f"{joint} {100 * share:.2g} %"
+                f"{joint} {percent(share)}"
                 for joint, share in zip(self.overlay.joint_names, prediction.position_nrmse, strict=True)
             )
             window_s = self.overlay.window_s
@@ -170,7 +170,7 @@ class Inspection:
 
     def _repr_html_(self) -> str:
         rows = self.rows()
-        cells = [[v if isinstance(v, str) else f"{100 * v:.2g} %" for v in row.values()] for row in rows]
+        cells = [[v if isinstance(v, str) else percent(v) for v in row.values()] for row in rows]
         return html_table(list(rows[0]), cells) if rows else html_table((self.note,), [])
 
 

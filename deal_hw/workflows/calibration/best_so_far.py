@@ -18,6 +18,7 @@ from deal_hw.calibration import (
     CalibrationResult,
     Progress,
     ProgressCallback,
+    percent,
 )
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -136,8 +137,8 @@ class BestSoFar:
         errors = self.result.heldout_nrmse
         if errors:
             return (
-                f"held-out error {100 * errors['calibrated']:.2g} % of the signal's range "
-                f"(your own model: {100 * errors['nominal']:.2g} %)"
+                f"held-out error {percent(errors['calibrated'])} of the signal's range "
+                f"(your own model: {percent(errors['nominal'])})"
             )
         return f"residuals {math.sqrt(max(self.result.chi2, 0.0)):.2g} times the sensor's noise"
 
