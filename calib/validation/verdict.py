@@ -205,9 +205,15 @@ def trust(result: CalibrationResult) -> Trust:
             "Use it, but trust predictions more than single values.",
         )
     if result.alarms:
-        count = f"There {'is 1 alarm' if len(result.alarms) == 1 else f'are {len(result.alarms)} alarms'}."
+        many = len(result.alarms)
+        count, read = (
+            (f"There are {many} alarms.", "Read them") if many > 1 else ("There is 1 alarm.", "Read it")
+        )
         return Trust(
-            "amber", f"{gain} {count}", "The result has a known weakness.", "Read them before you use it."
+            "amber",
+            f"{gain} {count}",
+            "The result has a known weakness.",
+            f"{read} before you use the result.",
         )
     if math.isnan(result.chi2):
         return Trust(

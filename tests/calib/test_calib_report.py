@@ -194,7 +194,7 @@ def test_the_story_comes_first_then_the_verdict_then_alarms() -> None:
         "after 0.2 s",
         "Can it be used?",
         "! Amber.",
-        "Read them before you use it",
+        "Read it before you use the result",
         "1 alarm",
         "seen the rail is bent by 2 mm it means friction to do buy one",
         "90 % interval",
