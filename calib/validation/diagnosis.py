@@ -2,9 +2,9 @@
 
 Three kinds of evidence use one statistic. Play in the gears is a candidate model: refitted on a part of the
 recordings, it predicts the rest. Other causes have signatures, which a regression adds to the parameters:
-fitted on some windows, they predict the others. A random delay predicts no sample, but where the residual is
-large: it is compared with a random force of constant size. The statistic is the held-out deviance: twice the
-logarithm of the likelihood ratio, with an estimated noise level.
+fitted on some windows, they predict the others. Their statistic is the held-out deviance: twice the
+logarithm of the likelihood ratio, with an estimated noise level. A random delay predicts no sample, but where
+the residual is large: beside random forces of constant size, it must make the residual likelier.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Test for a random delay of each command, on the residual of a fit.
 
 Random delays predict no sample, but they predict where the residual is large: each pushes in proportion to
-the change of its command. The alternative is a random force of constant size, white or slow, which is how any
-other model error looks. All are Gaussian processes beside white noise. The likelihood of left-out windows
-decides.
+the change of its command. Any other model error looks like a random force of constant size, white or slow.
+All are Gaussian processes beside white noise. Random delays are found where the residual is likelier with
+them than with these forces alone.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
-from scipy.optimize import minimize_scalar
+from scipy.optimize import Bounds, minimize
 
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation.signatures import SignatureResponse
@@ -47,16 +46,16 @@ class RandomDelaySettings:
     """Settings of :func:`random_delay`.
 
     Attributes:
-        windows: Number of windows, spread over the recordings.
+        windows: Most windows, spread over the recordings.
         rows: Residuals of each window, from its start.
         slow_s: Correlation time of the slow force [s].
-        most: Largest absolute log ratio of the variances of process and noise [-].
+        ratio: Least and largest ratio of the mean variances of a process and the noise [-].
     """
 
-    windows: int = 60
+    windows: int = 30
     rows: int = 240
     slow_s: float = 0.1
-    most: float = 12.0
+    ratio: tuple[float, float] = (1e-5, 1e5)
 
 
 SETTINGS = RandomDelaySettings()
@@ -67,8 +66,8 @@ class RandomDelay:
     """How well random delays explain a residual.
 
     Attributes:
-        deviance: Gain in held-out deviance over white noise.
-        gain: The same over the best of all other processes.
+        deviance: Gain in deviance over white noise.
+        gain: Gain in deviance over white noise and random forces, beside these.
         share: Share of the residual's variance.
         std_s: Standard deviation of the delays [s].
     """
@@ -82,7 +81,7 @@ class RandomDelay:
 def random_delay(
     rows: Sequence[WindowRows], answers: Sequence[SignatureResponse], period_s: float
 ) -> RandomDelay | None:
-    """Compare random delays with other processes; None where there is nothing to compare.
+    """Compare random delays and forces with forces alone; None where there is nothing to compare.
 
     Residuals and the windows' responses to commands are given per episode.
     """
@@ -93,21 +92,17 @@ def random_delay(
     windows = [_Window.of(rows[e], answers[e], w) for e, w in chosen]
     change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])
     rms = np.sqrt(np.mean(change**2, axis=0))
-    # The process of power 0: noise alone.
-    found = {"noise": _Process([0.0 * w.residual for w in windows], [w.residual**2 for w in windows])}
-    found |= {
-        "delay": _Process.of(windows, "delay", rms, period_s),
-        "white": _Process.of(windows, "white", rms, period_s),
-        "slow": _Process.of(windows, "slow", rms, period_s),
-    }
-    held_out = {name: process.held_out() for name, process in found.items()}
-    ratio, level = found["delay"].fitted(np.ones(len(windows), dtype=bool))
-    power = ratio * found["delay"].mean_power
+    residual = np.stack([window.residual for window in windows])
+    delay = _unit(windows, "delay", rms, period_s)
+    forces = [_unit(windows, name, rms, period_s) for name in ("white", "slow")]
+    noise, delays, without, both = (
+        _fitted(residual, processes) for processes in ([], [delay], forces, [*forces, delay])
+    )
     return RandomDelay(
-        deviance=held_out["noise"] - held_out["delay"],
-        gain=min(value for name, value in held_out.items() if name != "delay") - held_out["delay"],
-        share=power / (1 + power),
-        std_s=float(np.sqrt(ratio * level)),
+        deviance=noise.deviance - delays.deviance,
+        gain=without.deviance - both.deviance,
+        share=float(both.ratios[-1] / (1 + both.ratios.sum())),
+        std_s=float(np.sqrt(both.ratios[-1] * both.level / delay.scale)),
     )
 
 
@@ -140,78 +135,83 @@ class _Window:
 
 @dataclass(frozen=True, slots=True)
 class _Process:
-    """A random process beside white noise, along each window's own axes.
+    """A random process.
 
     Attributes:
-        power: Variance of the process of unit intensity along each axis, one array per window.
-        squares: The squared residual along it.
+        covariance: Of the windows' residuals, for a mean variance of 1, (W, D, D).
+        scale: Mean variance for an intensity of 1.
     """
 
-    power: Sequence[FloatArray]
-    squares: Sequence[FloatArray]
+    covariance: FloatArray
+    scale: float
 
-    @classmethod
-    def of(
-        cls,
-        windows: Sequence[_Window],
-        name: Literal["delay", "white", "slow"],
-        rms: FloatArray,
-        period_s: float,
-    ) -> _Process:
-        """Return the process of late commands, or that of forces as large as command changes, (A,) rms."""
-        power, squares = [], []
-        for window in windows:
-            A, H, M = window.response.shape
-            later = np.zeros((A, H, H, M))
-            for k in range(H):
-                later[:, k, k:] = window.response[:, : H - k]
-            if name == "delay":
-                moved = np.einsum("ka,akhm->khm", window.change, later)
-            else:
-                moved = rms[:, None, None, None] * later
-            if name == "slow":
-                apart = np.abs(np.subtract.outer(np.arange(H), np.arange(H))) * period_s
-                root = np.linalg.cholesky(np.exp(-apart / SETTINGS.slow_s) + 1e-9 * np.eye(H))
-                moved = np.einsum("lk,alhm->akhm", root, moved)
-            columns = moved.reshape(-1, H * M) @ window.basis
-            values, axes = np.linalg.eigh(columns.T @ columns)
-            power.append(np.maximum(values, 0.0))
-            squares.append((axes.T @ window.residual) ** 2)
-        return cls(power, squares)
 
-    @property
-    def mean_power(self) -> float:
-        """Mean variance of the process of unit intensity."""
-        return float(np.mean(np.concatenate(self.power)))
+def _unit(
+    windows: Sequence[_Window], name: Literal["delay", "white", "slow"], rms: FloatArray, period_s: float
+) -> _Process:
+    """Return the process of late commands, or that of forces as large as command changes, (A,) rms."""
+    covariance = []
+    for window in windows:
+        A, H, M = window.response.shape
+        later = np.zeros((A, H, H, M))
+        for k in range(H):
+            later[:, k, k:] = window.response[:, : H - k]
+        if name == "delay":
+            moved = np.einsum("ka,akhm->khm", window.change, later)
+        else:
+            moved = rms[:, None, None, None] * later
+        if name == "slow":
+            apart = np.abs(np.subtract.outer(np.arange(H), np.arange(H))) * period_s
+            root = np.linalg.cholesky(np.exp(-apart / SETTINGS.slow_s) + 1e-9 * np.eye(H))
+            moved = np.einsum("lk,alhm->akhm", root, moved)
+        columns = moved.reshape(-1, H * M) @ window.basis
+        covariance.append(columns.T @ columns)
+    every = np.stack(covariance)
+    scale = max(float(np.mean(np.einsum("wdd->wd", every))), 1e-300)
+    return _Process(every / scale, scale)
 
-    def held_out(self) -> float:
-        """Return -2 log likelihood of each fold's windows under the parameters most likely in the others."""
-        fold = FOLDS.of(len(self.power))
-        total = 0.0
-        for k in range(FOLDS.parts):
-            ratio, level = self.fitted(fold != k)
-            power, squares = self._of(fold == k)
-            variance = level * (1 + ratio * power)
-            total += float(np.sum(squares / variance + np.log(variance)))
-        return total
 
-    def fitted(self, windows: npt.NDArray[np.bool_]) -> tuple[float, float]:
-        """Return the most likely ratio of intensity to noise variance, and that variance, in some windows."""
-        power, squares = self._of(windows)
-        scale = float(np.mean(power))
-        if scale <= 0:
-            return 0.0, max(float(np.mean(squares)), 1e-300)
+@dataclass(frozen=True, slots=True)
+class _Fitted:
+    """The most likely processes beside white noise.
 
-        def cost(log_ratio: float) -> float:
-            spread = 1 + np.exp(log_ratio) / scale * power
-            return float(len(power) * np.log(np.mean(squares / spread)) + np.sum(np.log(spread)))
+    Attributes:
+        deviance: -2 log likelihood, but for a constant.
+        ratios: Mean variance of each process over that of the noise.
+        level: Variance of the noise.
+    """
 
-        found = minimize_scalar(
-            cost, bounds=(-SETTINGS.most, SETTINGS.most), method="bounded", options={"xatol": 0.01}
-        )
-        ratio = float(np.exp(found.x)) / scale
-        return ratio, max(float(np.mean(squares / (1 + ratio * power))), 1e-300)
+    deviance: float
+    ratios: FloatArray
+    level: float
 
-    def _of(self, windows: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-        rows = np.flatnonzero(windows).tolist()
-        return np.concatenate([self.power[k] for k in rows]), np.concatenate([self.squares[k] for k in rows])
+
+def _fitted(residual: FloatArray, processes: Sequence[_Process]) -> _Fitted:
+    """Return the most likely ratios of processes in residuals (W, D)."""
+    count, (W, D) = residual.size, residual.shape
+    unit = np.broadcast_to(np.eye(D), (W, D, D))
+    covariances = [p.covariance for p in processes]
+
+    def likelihood(log_ratios: FloatArray) -> tuple[float, FloatArray, float]:
+        """Return deviance, its gradient, and the noise's variance."""
+        parts = [ratio * c for ratio, c in zip(np.exp(log_ratios), covariances, strict=True)]
+        total = sum(parts, unit)
+        inverse = np.linalg.inv(total)
+        whitened = np.einsum("wij,wj->wi", inverse, residual)
+        level = max(float(np.sum(residual * whitened)) / count, 1e-300)
+        deviance = count * np.log(level) + float(np.sum(np.linalg.slogdet(total)[1]))
+        slope = [
+            np.sum(inverse * part) - np.einsum("wi,wij,wj->", whitened, part, whitened) / level
+            for part in parts
+        ]
+        return float(deviance), np.array(slope), level
+
+    def cost(log_ratios: FloatArray) -> tuple[float, FloatArray]:
+        return likelihood(log_ratios)[:2]
+
+    least, most = np.log(SETTINGS.ratio)
+    found = np.zeros(len(processes))
+    if processes:
+        found = minimize(cost, found, jac=True, bounds=Bounds(least, most)).x
+    deviance, _, level = likelihood(found)
+    return _Fitted(deviance, np.exp(found), level)

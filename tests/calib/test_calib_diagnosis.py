@@ -224,7 +224,18 @@ def test_random_forces_are_no_delays(slow: bool) -> None:
         return np.asarray(0.35 * drawn * np.ones_like(change))
 
     found = random_delay(*_pushed(force), PERIOD_S)
-    assert found is not None and found.gain < 0
+    assert found is not None and found.gain < 1
+
+
+def test_random_delays_are_found_beside_a_random_force() -> None:
+    """The delays of the first test, and a random force at any time of half their size."""
+
+    def both(change: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return 0.5 * change * rng.standard_normal(change.shape) + 0.18 * rng.standard_normal(change.shape)
+
+    found = random_delay(*_pushed(both), PERIOD_S)
+    assert found is not None and found.gain > MISMATCH.evidence
+    assert found.std_s == pytest.approx(0.5, rel=0.2)
 
 
 def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Problem, Refined]:
