@@ -160,7 +160,7 @@ def _info(config: InfoSettings) -> int:
 
     console = Console()
     if not config.path.is_dir():
-        episode = summarize(config.path, f"episodes/{config.path.name}")
+        episode, _ = summarize(config.path, f"episodes/{config.path.name}")
         if config.json:
             print(json.dumps(asdict(episode), indent=2))
         else:

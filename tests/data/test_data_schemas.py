@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
 from deal_hw.data.recording.schemas import (
+    BODY,
     CHANNELS,
     COMMAND,
     CYCLE,
@@ -60,6 +61,48 @@ def test_mcap_ros2_reads_what_we_write_and_we_read_what_it_writes(
     named = {name: value for (_, name), value in zip(kind.fields, values, strict=True)}
     assert serialize_dynamic(kind.name, kind.definition)[kind.name](named) == data
     assert [plain(value) for value in kind.decode(data)] == [plain(value) for value in values]
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> tuple[RosMessageType, list[list[Any]]]:
+    """Messages of a type without text, whose vectors are as long in each message."""
+    kind = draw(st.sampled_from((STATE, COMMAND, BODY)))
+    number = st.floats(allow_nan=False)
+    columns = {
+        name: st.lists(number, min_size=(n := draw(st.integers(0, 4))), max_size=n)
+        if field == "float64[]"
+        else VALUES.get(field, number)
+        for field, name in kind.fields
+    }
+    count = draw(st.integers(1, 5))
+    return kind, [[draw(columns[name]) for _, name in kind.fields] for _ in range(count)]
+
+
+@settings(max_examples=100, deadline=None)
+@given(tables())
+def test_many_messages_are_read_as_each_of_them(table: tuple[RosMessageType, list[list[Any]]]) -> None:
+    """Every field of every record equals the single message's."""
+    kind, rows = table
+    found = kind.decode_all([kind.encode(*row) for row in rows])
+    assert len(found) == len(rows)
+    for record, row in zip(found, rows, strict=True):
+        assert [plain(record[name]) for _, name in kind.fields] == row
+
+
+@pytest.mark.parametrize(
+    ("other", "what"),
+    [
+        (([1.0], [2.0, 3.0], []), "position is not laid out alike"),
+        (([1.0, 2.0], [3.0], [4.0]), "different lengths"),
+    ],
+)
+def test_many_messages_with_other_vectors_are_refused(other: tuple[list[float], ...], what: str) -> None:
+    """As many numbers in other vectors, or one number more."""
+    first = STATE.encode(1, 2, 3, 4, 5, 6, [1.0, 2.0], [3.0], [])
+    with pytest.raises(ProtocolError, match=what):
+        STATE.decode_all([first, STATE.encode(1, 2, 3, 4, 5, 6, *other)])
+    with pytest.raises(ProtocolError, match="encapsulation"):
+        STATE.decode_all([first, b"\0\0" + first[2:]])
 
 
 def test_bytes_of_one_message() -> None:

@@ -225,12 +225,17 @@ class Dataset:
         self._next += 1
         return path
 
-    def note_episode(self, path: Path, facts: Mapping[str, Any] | None = None) -> EpisodeInfo:
+    def note_episode(
+        self, path: Path, facts: Mapping[str, Any] | None = None
+    ) -> tuple[EpisodeInfo, Episode | None]:
         """Take a finished recording into the index, repairing it where its recorder was killed.
 
         Args:
             path: As :meth:`next_episode_path` gave it.
             facts: Plain JSON values to keep with it: outcome, loop_timing, task, ...
+
+        Returns:
+            What the index says, and the recording; None if there is no sample in it.
 
         Raises:
             DatasetError: It is not in this dataset's folder or cannot be read.
@@ -239,10 +244,10 @@ class Dataset:
         file = f"episodes/{Path(path).name}"
         if Path(path).resolve() != (self.folder / file).resolve():
             raise DatasetError(f"{path} is not in {self.folder / 'episodes'}")
-        info = self._take(file, "", facts)
+        info, episode = self._take(file, "", facts)
         self.episodes = (*self.episodes, info)
         self._save()
-        return info
+        return info, episode
 
     def close(self) -> None:
         """Let other collectors in; idempotent."""
@@ -250,7 +255,9 @@ class Dataset:
             os.close(self._lock)
             self._lock = -1
 
-    def _take(self, file: str, note: str, facts: Mapping[str, Any] | None = None) -> EpisodeInfo:
+    def _take(
+        self, file: str, note: str, facts: Mapping[str, Any] | None = None
+    ) -> tuple[EpisodeInfo, Episode | None]:
         path = self.folder / file
         with contextlib.suppress(EmptyRecordingError):
             report = repair(path)
@@ -266,7 +273,7 @@ class Dataset:
         strays = [f"episodes/{path.name}" for path in found if f"episodes/{path.name}" not in known]
         for file in strays:
             try:
-                info = self._take(file, "taken in after its collector was killed")
+                info, _ = self._take(file, "taken in after its collector was killed")
             except DatasetError as error:
                 self._notify(f"{self.folder / file} is left out: {error}")
                 continue

@@ -82,8 +82,12 @@ def _is_number(value: object) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | None = None) -> EpisodeInfo:
-    """Read an episode and return what the index says of it; one without samples gives zeros and a note.
+def summarize(
+    path: Path, file: str, note: str = "", facts: Mapping[str, Any] | None = None
+) -> tuple[EpisodeInfo, Episode | None]:
+    """Read an episode; return what the index says of it, and the episode.
+
+    One without samples gives zeros and a note, and None.
 
     Args:
         path: The file.
@@ -94,7 +98,7 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
     try:
         episode = read_episode(path)
     except EmptyRecordingError as error:
-        return EpisodeInfo(
+        nothing = EpisodeInfo(
             file=file,
             purpose="",
             policy_digest="",
@@ -109,8 +113,9 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
             note=note or "empty",
             facts=facts or {},
         )
+        return nothing, None
     trajectory = episode.trajectory
-    return EpisodeInfo(
+    info = EpisodeInfo(
         file=file,
         purpose=str(episode.metadata.get("purpose", "")),
         policy_digest=str(episode.metadata.get("policy_digest", "")),
@@ -125,6 +130,7 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
         note=note,
         facts=facts or {},
     )
+    return info, episode
 
 
 def _clock(episode: Episode) -> Mapping[str, Any] | None:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
 
 from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS, STANDARD, message_type
+from deal_hw.data.recording.schemas import BODY, CHANNELS, OLD_TOPICS, STANDARD, RosMessageType, message_type
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -27,6 +28,9 @@ from deal_hw.errors import (
 from deal_hw.schema import read_json
 from deal_hw.transport import Message
 from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
+
+_BLOCK = 4096
+"""So many messages are decoded at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,10 +106,7 @@ def read_episode(path: Path) -> Episode:
         DatasetError: It cannot be read or is not an episode of deal-hw.
     """
     try:
-        preamble, rows = _collect(Path(path))
-        if not rows["/state"]:
-            raise EmptyRecordingError(f"{path} holds no state sample; was the robot silent? Record again")
-        return _episode(Path(path), preamble, rows)
+        return _episode(Path(path), _collect(Path(path)))
     except (KeyError, ValueError, ProtocolError) as error:
         raise _unreadable(path, error) from error
 
@@ -180,9 +181,55 @@ def _channel(channels: Mapping[int, Channel], message: McapMessage) -> Channel:
     return channel
 
 
-def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]]]]:
+@dataclass(frozen=True, slots=True)
+class _Content:
+    """What a recording contains.
+
+    Attributes:
+        preamble: What the recorder was told.
+        state: The state samples, one at least.
+        body: What was sensed of the body; None for robots without one.
+        rows: Values of the other messages, by topic.
+    """
+
+    preamble: Mapping[str, str]
+    state: npt.NDArray[np.void]
+    body: npt.NDArray[np.void] | None
+    rows: Mapping[str, Sequence[tuple[Any, ...]]]
+
+
+class _Table:
+    """The messages of a type that has no text; a long recording has too many to decode each on its own."""
+
+    def __init__(self, kind: RosMessageType) -> None:
+        self._kind = kind
+        self._waiting: list[bytes] = []
+        self._blocks: list[npt.NDArray[np.void]] = []
+
+    def append(self, data: bytes) -> None:
+        """Take the next message."""
+        self._waiting.append(data)
+        if len(self._waiting) == _BLOCK:
+            self._decode()
+
+    def records(self) -> npt.NDArray[np.void] | None:
+        """Return all messages, (N,); None where there are none."""
+        if self._waiting:
+            self._decode()
+        return np.concatenate(self._blocks) if self._blocks else None
+
+    def _decode(self) -> None:
+        self._blocks.append(self._kind.decode_all(self._waiting))
+        self._waiting = []
+        if self._blocks[-1].dtype != self._blocks[0].dtype:
+            raise ProtocolError(f"{self._kind.name}: the messages have different lengths")
+
+
+def _collect(path: Path) -> _Content:
     preamble: dict[str, str] | None = None
-    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in CHANNELS if topic not in STANDARD}
+    tables = {topic: _Table(message_type(topic)) for topic in ("/state", "/body")}
+    wanted = [topic for topic in CHANNELS if topic not in STANDARD and not topic.startswith("/wire/")]
+    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in wanted}
     channels: dict[int, Channel] = {}
     for found in _records(path):
         if isinstance(found.record, Metadata) and found.record.name == METADATA_NAME:
@@ -191,27 +238,31 @@ def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]
         for message in messages(found):
             channel = _channel(channels, message)
             topic = OLD_TOPICS.get(channel.topic, channel.topic)
-            if topic in rows and not topic.startswith("/wire/"):
+            if topic in tables:
+                tables[topic].append(message.data)
+            elif topic in rows:
                 rows[topic].append(message_type(topic).decode(message.data))
     if preamble is None:
         raise DatasetError(
             f"{path} does not say what it holds (no metadata {METADATA_NAME!r}): not by deal-hw"
         )
-    return preamble, rows
+    state, body = (table.records() for table in tables.values())
+    if state is None:
+        raise EmptyRecordingError(f"{path} holds no state sample; was the robot silent? Record again")
+    return _Content(preamble, state, body, rows)
 
 
-def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tuple[Any, ...]]]) -> Episode:
+def _episode(path: Path, content: _Content) -> Episode:
+    preamble, state, rows = content.preamble, content.state, content.rows
     description = read_json(dict[str, Any], preamble["description"])
     check_description(description)
     metadata = read_json(dict[str, Any], preamble["metadata"])
     J, A = len(description["joint_names"]), len(description["actuated"])
-    receive_ns, device_ns, sequence, command_sequence, command_age_ns, status, *kinematics = zip(
-        *rows["/state"], strict=True
-    )
-    start_ns, device_start_ns = receive_ns[0], device_ns[0]
-    numbers = np.array(sequence, dtype=np.int64)
+    start_ns, device_start_ns = int(state["receive_ns"][0]), int(state["device_ns"][0])
+    numbers = state["sequence"].copy()
     cycles = _cycles(rows, start_ns, A)
-    position, velocity, effort = (_table(values, J) for values in kinematics)
+    for name in ("position", "velocity", "effort"):
+        _check_width(state[name].shape[1], J)
     facts = {
         "description": description,
         "lost_frames": lost_frames(numbers),
@@ -221,20 +272,20 @@ def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tu
     trajectory = Trajectory(
         joint_names=tuple(description["joint_names"]),
         actuated=tuple(description["actuated"]),
-        receive_s=_since(receive_ns, start_ns),
-        device_s=_since(device_ns, device_start_ns),
-        position=position,
-        velocity=velocity,
-        effort=effort,
-        status=np.array(status, dtype=np.int64),
-        command_sequence=np.array(command_sequence, dtype=np.int64),
-        command_age_s=_seconds_or_nan(command_age_ns),
+        receive_s=_since(state["receive_ns"], start_ns),
+        device_s=_since(state["device_ns"], device_start_ns),
+        position=state["position"].copy(),
+        velocity=state["velocity"].copy(),
+        effort=state["effort"].copy(),
+        status=state["status"].astype(np.int64),
+        command_sequence=state["command_sequence"].copy(),
+        command_age_s=_seconds_or_nan(state["command_age_ns"]),
         events=tuple(
             Event(stamp, kind, text, read_json(dict[str, Any], data))
             for stamp, kind, text, data in rows["/events"]
         ),
         metadata={**metadata, **facts},
-        body=_body(rows["/body"], receive_ns, numbers),
+        body=None if content.body is None else _body(content.body, state),
         **_commands(rows, start_ns, A),
     )
     return Episode(
@@ -251,24 +302,25 @@ def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tu
     )
 
 
-def _body(
-    table: Sequence[tuple[Any, ...]], receive_ns: Sequence[int], sequence: IntArray
-) -> BodyTrajectory | None:
+def _body(table: npt.NDArray[np.void], state: npt.NDArray[np.void]) -> BodyTrajectory:
     """Return what was sensed of the body at each state sample, found by stamp and number."""
-    if not table:
-        return None
-    row_of = {(row[0], row[1]): row for row in table}
-    found = [row_of.get((stamp, int(number))) for stamp, number in zip(receive_ns, sequence, strict=True)]
-    columns = []
-    for i in range(2, len(table[0])):
-        absent = np.full(np.shape(table[0][i]), np.nan)
-        columns.append(np.stack([absent if row is None else np.asarray(row[i], float) for row in found]))
-    buttons = np.where(np.isfinite(columns[-1]), columns[-1], -1).astype(np.int64)
-    names = [f.name for f in dataclasses.fields(BodyTrajectory)]
-    return BodyTrajectory(**dict(zip(names, [*columns[:-1], buttons], strict=True)))
+    row_of = {key: row for row, key in enumerate(_keys(table))}
+    row = np.array([row_of.get(key, -1) for key in _keys(state)])
+    columns = {}
+    for field, (_, name) in zip(dataclasses.fields(BodyTrajectory), BODY.fields[2:], strict=True):
+        values = table[name].astype(np.float64)[row]
+        values[row < 0] = np.nan
+        columns[field.name] = values
+    buttons = np.where(row < 0, -1, table["buttons"][row])
+    return BodyTrajectory(**{**columns, "buttons": buttons})
 
 
-def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:
+def _keys(table: npt.NDArray[np.void]) -> Iterator[tuple[int, int]]:
+    """Yield stamp and number of each sample."""
+    return zip(table["receive_ns"].tolist(), table["sequence"].tolist(), strict=True)
+
+
+def _commands(rows: Mapping[str, Sequence[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:
     """Return the command fields of a Trajectory."""
     sent = rows["/command"]
     asked = {row[1]: row[3] for row in rows["/command/requested"]}
@@ -285,7 +337,7 @@ def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated
     }
 
 
-def _cycles(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> CycleTable:
+def _cycles(rows: Mapping[str, Sequence[tuple[Any, ...]]], start_ns: int, actuated: int) -> CycleTable:
     table = rows["/cycle"]
     asked = {row[1]: row[3] for row in rows["/command/requested"]}
     width = max((row[7].size for row in table), default=0)
@@ -317,20 +369,23 @@ def hand_over_losses(cycles: CycleTable) -> int:
     return max(missing, int(cycles.lost[-1]))
 
 
-def _since(stamps_ns: Sequence[int], start_ns: int) -> FloatArray:
+def _since(stamps_ns: Sequence[int] | IntArray, start_ns: int) -> FloatArray:
     # Differences in integers first: absolute ns beyond 2^53 would lose their last digits as floats.
     return (np.array(stamps_ns, dtype=np.int64) - start_ns).astype(np.float64) * 1e-9
 
 
-def _seconds_or_nan(ages_ns: Sequence[int]) -> FloatArray:
+def _seconds_or_nan(ages_ns: Sequence[int] | IntArray) -> FloatArray:
     ages_s = np.array(ages_ns, dtype=np.float64) * 1e-9
     ages_s[ages_s < 0] = np.nan
     return ages_s
 
 
 def _table(rows: Sequence[FloatArray], width: int) -> FloatArray:
-    if any(row.size != width for row in rows):
-        raise ValueError(
-            f"a row has {next(r.size for r in rows if r.size != width)} numbers, expected {width}"
-        )
+    for row in rows:
+        _check_width(row.size, width)
     return np.stack(rows) if rows else np.empty((0, width))
+
+
+def _check_width(numbers: int, wanted: int) -> None:
+    if numbers != wanted:
+        raise ValueError(f"a row has {numbers} numbers, expected {wanted}")

@@ -11,11 +11,12 @@ row, whatever is nested in the definition, since CDR writes nested messages with
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.errors import ProtocolError, UnknownNameError
 
@@ -30,6 +31,8 @@ _SCALARS = {
     "float64": struct.Struct("<d"),
 }
 _LENGTH = _SCALARS["uint32"]
+_ALIKE = "alike: "
+"""Before the name of a vector: its length, in :meth:`RosMessageType.decode_all`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +92,39 @@ class RosMessageType:
             return tuple(cursor.value(kind) for kind, _ in self.fields)
         except (struct.error, ValueError) as error:
             raise ProtocolError(f"{self.name}: {len(data)} bytes do not hold the message: {error}") from error
+
+    def decode_all(self, messages: Sequence[bytes]) -> npt.NDArray[np.void]:
+        """Return messages without text as records with the fields' names, (N,); all are laid out alike.
+
+        Raises:
+            ProtocolError: The bytes are not such messages, or they or their vectors differ in length.
+        """
+        layout = self._layout(messages[0])
+        if any(len(data) != layout.itemsize for data in messages):
+            raise ProtocolError(f"{self.name}: the messages have different lengths")
+        found = np.frombuffer(b"".join(messages), dtype=layout)
+        for name in layout.names or ():
+            if name.startswith(_ALIKE) and np.any(found[name] != found[name][0]):
+                what = name.removeprefix(_ALIKE)
+                raise ProtocolError(f"{self.name}: {what} is not laid out alike in all messages")
+        return found
+
+    def _layout(self, data: bytes) -> np.dtype[np.void]:
+        """Return where each field is in messages like this one, and what tells that another is like it."""
+        fields: list[tuple[str, Any, int]] = [(f"{_ALIKE}encapsulation", _LENGTH.format, 0)]
+        at = len(_HEADER)
+        for (kind, name), value in zip(self.fields, self.decode(data), strict=True):
+            vector = kind == "float64[]"
+            layout = _LENGTH if vector else _SCALARS[kind]
+            at += (len(_HEADER) - at) % layout.size
+            fields.append((_ALIKE * vector + name, layout.format, at))
+            at += layout.size
+            if vector:
+                at += (len(_HEADER) - at) % 8 if len(value) else 0
+                fields.append((name, ("<f8", value.shape), at))
+                at += 8 * len(value)
+        names, formats, offsets = zip(*fields, strict=True)
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(data)})
 
 
 class _Reader:

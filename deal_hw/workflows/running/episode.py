@@ -38,7 +38,9 @@ from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.types import Trajectory
 
+_CHECKING = "checking the recording"
 _IN_VAIN = PassiveConfig(timeout_s=1.0)
 """Time of the supervisor's own passive route after the control process failed for its whole time [s]."""
 
@@ -121,40 +123,43 @@ class EpisodeRun:
             try:
                 kept = {name: self._metadata[name] for name in ("task", "motion", "excitation_level")}
                 facts = {**kept, **report.to_json()}
-                moved = self._store.note_episode(self._path, facts).excitation
-                if moved is not None:
-                    report = dataclasses.replace(report, motion=Excitation(**moved))
-                report = dataclasses.replace(
-                    report,
-                    walk=self._walk(self._path),
-                    balance=self._balance(self._path),
-                    replay=self._replayed(self._path),
-                )
+                # Reading a long recording takes many seconds: the operator wants to know how the robot is.
+                phase = f"passive, {_CHECKING}" if report.passive_confirmed else _CHECKING
+                on_beat(Beat(MonotonicClock().now_ns(), 0.0, phase, 0))
+                info, episode = self._store.note_episode(self._path, facts)
+                if info.excitation is not None:
+                    report = dataclasses.replace(report, motion=Excitation(**info.excitation))
+                if episode is not None:
+                    report = dataclasses.replace(
+                        report,
+                        walk=self._walk(episode.trajectory),
+                        balance=self._balance(episode.trajectory),
+                        replay=self._replayed(episode.trajectory),
+                    )
             except (DealHwError, OSError) as err:
                 # Such as a full disk. The report matters more, and the next open indexes the recording.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
 
-    def _walk(self, path: Path) -> VelocityError | None:
+    def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""
         if self._plan.robot not in ODOMETRY:
             return None
-        trajectory = read_trajectory(path)
         wanted, track = wanted_velocity(trajectory), walked(self._plan.robot, trajectory)
         return None if wanted is None or track is None else velocity_error(track, wanted)
 
-    def _balance(self, path: Path) -> BalanceResult | None:
+    def _balance(self, trajectory: Trajectory) -> BalanceResult | None:
         """Return how well a policy held the pole up."""
         if self._plan.robot not in BALANCE or self._plan.motion != "balance":
             return None
-        return balanced(self._plan.robot, read_trajectory(path))
+        return balanced(self._plan.robot, trajectory)
 
-    def _replayed(self, path: Path) -> ReplayError | None:
+    def _replayed(self, trajectory: Trajectory) -> ReplayError | None:
         """Return the distance of a replay's motion from the recorded one."""
         if self._plan.motion != "replay":
             return None
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
-        return replay_error(read_trajectory(Path(self._plan.recording)), read_trajectory(path), before_s)
+        return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
 
     def _make_passive(
         self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]

@@ -202,5 +202,5 @@ def _record(
         warnings=(),
         error=end.error,
     )
-    moved = store.note_episode(path, {**kept, **report.to_json()}).excitation
+    moved = store.note_episode(path, {**kept, **report.to_json()})[0].excitation
     return report if moved is None else dataclasses.replace(report, motion=Excitation(**moved))
