@@ -6,9 +6,9 @@
 Each input is a sound frame with one fault: flipped bits, another byte, a byte lost or too many, an end cut
 off, or a burst of random bytes. A codec accepts it if anything comes out that was not sent. A checksum of n
 bits accepts 1 of 2^n random frames; this is the "expected" of a row, and few flipped bits are always found.
-The C core runs its own fuzzer (firmware/host/fuzz.c) under the address and undefined-behaviour sanitizers.
-CAN frames are not here: their checksum is the adapter's. Damaged frames of every wire, those with a right
-checksum too, are in tools/fuzz_files.py.
+The C core runs its own fuzzers (firmware/host/fuzz.c, fuzz_can.c) under the address and undefined-behaviour
+sanitizers. On CAN a target of three frames loses, repeats, mixes or changes them; a frame's own checksum is
+the adapter's. Damaged frames of every wire, those with a right checksum too, are in tools/fuzz_files.py.
 """
 
 from __future__ import annotations
@@ -158,6 +158,8 @@ CODECS = {
     ),
 }
 CORE = "cart-pole, the firmware's C core"
+CORES = {CORE: "serial", f"{CORE} on CAN": "can"}
+"""Fuzzers of the C core, and the wire of each."""
 
 
 def fuzz(name: str, codec: Codec, inputs: int, seed: int) -> dict[str, Any]:
@@ -187,14 +189,14 @@ def fuzz(name: str, codec: Codec, inputs: int, seed: int) -> dict[str, Any]:
     }
 
 
-def fuzz_core(inputs: int, seed: int) -> dict[str, Any]:
+def fuzz_core(name: str, inputs: int, seed: int) -> dict[str, Any]:
     """Return the row of the firmware's core; an assertion or a sanitizer ends the run with its message."""
-    program, began = native.fuzzer(), time.perf_counter()
+    program, began = native.fuzzer(CORES[name]), time.perf_counter()
     done = subprocess.run([program, str(inputs), str(seed)], stdout=subprocess.PIPE, text=True, check=True)
     found = json.loads(done.stdout)
     corrupt = found["corrupt"] + found["garbage"]
     return {
-        "codec": CORE,
+        "codec": name,
         "inputs": inputs,
         "corrupt": corrupt,
         "accepted": found["accepted"] + found["garbage_accepted"],
@@ -206,9 +208,9 @@ def fuzz_core(inputs: int, seed: int) -> dict[str, Any]:
 def main(config: FuzzFrames) -> int:
     """Print each row; return 1 if a codec accepts more than its checksum may by chance."""
     rows = []
-    for name in config.codecs or (CORE, *CODECS):
-        if name == CORE:
-            row = fuzz_core(config.inputs, config.seed)
+    for name in config.codecs or (*CORES, *CODECS):
+        if name in CORES:
+            row = fuzz_core(name, config.inputs, config.seed)
         else:
             row = fuzz(name, CODECS[name], config.inputs, config.seed)
         print(json.dumps(row), flush=True)

@@ -7,8 +7,13 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink
-from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice, python_firmware
+from deal_hw.drivers.cartpole.controller import Controller, Firmware
+from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.firmwares import CAN_FIRMWARES, usable_firmware
+from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, settings_of
+from deal_hw.drivers.cartpole.mechanics import Mechanics
+from deal_hw.drivers.cartpole.servo import Servo
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
 from deal_hw.drivers.transports.slcan_transport import (
     BITRATES,
@@ -22,6 +27,7 @@ from deal_hw.drivers.transports.slcan_transport import (
     decode_line,
     encode_line,
 )
+from deal_hw.errors import UnknownNameError
 
 _BUFFERED: Final = 3
 """Most frames waiting in the adapter while the first is not acknowledged."""
@@ -175,7 +181,9 @@ class SlcanAdapter:
         return after_s < (self.device_ns - self._armed_ns) / 1e9 <= after_s + length_s
 
 
-def can_device(truth: CartpoleTruth, node: int = NODE, version: int = 1, identity: int = 0) -> CartpoleDevice:
+def can_device(
+    truth: CartpoleTruth, node: int = NODE, version: int = 1, identity: int = 0, firmware: str = "python"
+) -> CartpoleDevice:
     """Return an emulated cart-pole whose bytes are CAN frames.
 
     Args:
@@ -183,18 +191,36 @@ def can_device(truth: CartpoleTruth, node: int = NODE, version: int = 1, identit
         node: Its number.
         version: Version of the protocol that it speaks.
         identity: Changes its serial number.
+        firmware: "python", "host" for the C core, or "auto".
+
+    Raises:
+        ConfigurationError: The node's number is outside the range, or a compiler is missing.
+        UnknownNameError: There is no such firmware on CAN.
     """
     number = unique_id(truth) ^ identity
-    return CartpoleDevice(
-        truth,
-        firmware=lambda truth, mechanics: python_firmware(truth, mechanics, CanLink(node, version, number)),
-    )
+    link = CanLink(node, version, number, device=True)
+
+    def python(truth: CartpoleTruth, mechanics: Mechanics) -> Firmware:
+        servo = Servo(truth.parameters, mechanics.timestep_s)
+        return Controller(servo, number, mechanics.command_delay, link)
+
+    def core(truth: CartpoleTruth, mechanics: Mechanics) -> Firmware:
+        settings = settings_of(truth, 0)
+        settings.unique_id = number
+        return CanHostFirmware(settings, mechanics.command_delay, node, version)
+
+    match usable_firmware(firmware):
+        case "python":
+            return CartpoleDevice(truth, firmware=python)
+        case "host":
+            return CartpoleDevice(truth, firmware=core)
+    raise UnknownNameError("firmware on CAN", firmware, CAN_FIRMWARES)
 
 
-def can_devices(truth: CartpoleTruth, faults: CanFaults) -> list[EmulatedDevice]:
+def can_devices(truth: CartpoleTruth, faults: CanFaults, firmware: str = "python") -> list[EmulatedDevice]:
     """Return the cart-pole on a bus, and the additional devices of its faults."""
     identities = (0, _SECOND_DEVICE) if faults.duplicate_node else (0,)
-    return [can_device(truth, faults.node, faults.dbc_version, identity) for identity in identities]
+    return [can_device(truth, faults.node, faults.dbc_version, identity, firmware) for identity in identities]
 
 
 def adapter_emulator(
@@ -217,14 +243,20 @@ def adapter_emulator(
     )
 
 
-def can_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
-    """Return an emulated cart-pole on a CAN bus behind a serial adapter."""
+def can_emulator(
+    truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "auto"
+) -> CartpoleEmulator:
+    """Return an emulated cart-pole on a CAN bus behind a serial adapter.
+
+    Raises:
+        ConfigurationError: Its firmware needs a compiler, which is missing.
+    """
     faults = hazards.can
     settings = [f"bitrate={faults.bitrate}"] if faults.bitrate != CanFaults().bitrate else []
     settings += [f"node={faults.node}"] if faults.node != NODE else []
     query = "?" + "&".join(settings) if settings else ""
     return adapter_emulator(
-        can_devices(truth, faults), link=link, hazards=hazards, port=lambda path: path + query
+        can_devices(truth, faults, firmware), link=link, hazards=hazards, port=lambda path: path + query
     )
 
 

@@ -109,14 +109,24 @@ class CanLink:
         node: The device's number.
         version: Version of the protocol, for devices under test.
         unique_id: The device's serial number, for its heartbeat; a host has none.
+        device: Whether this is the device's side, which takes frames from the host alone.
     """
 
     resync: ClassVar[bytes] = b""
 
-    def __init__(self, node: int = NODE, version: int = protocol.VERSION, unique_id: int = 0) -> None:
+    def __init__(
+        self,
+        node: int = NODE,
+        version: int = protocol.VERSION,
+        unique_id: int = 0,
+        *,
+        device: bool = False,
+    ) -> None:
         self.errors = self.torn = 0
         self.fault = ""
         self._node, self._version, self._unique_id = check_node(node), version, unique_id
+        # The host's frames have the numbers 0 to 7; a chip filters by the same bits.
+        self._number_bits = 3 if device else _NUMBER_BITS
         self._names = {frame_id(name, node): name for name in database()}
         self._parts: dict[str, list[bytes] | None] = {}
         self._heard: int | None = None
@@ -163,7 +173,7 @@ class CanLink:
             self.errors += 1
             return
         for identifier, length, payload in FRAME.iter_unpack(data):
-            if identifier >> _NUMBER_BITS != self._node:
+            if identifier >> self._number_bits != self._node << _NUMBER_BITS >> self._number_bits:
                 continue
             name = self._names.get(identifier)
             if name is None or length != database()[name].length:

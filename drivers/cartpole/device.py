@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
-from deal_hw.drivers.cartpole.link import Link
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.servo import Servo
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
@@ -38,10 +37,10 @@ class TrueTrajectory:
     setpoint: FloatArray
 
 
-def python_firmware(truth: CartpoleTruth, mechanics: Mechanics, link: Link | None = None) -> Firmware:
-    """Return the firmware in Python, with the truth's servo; on serial frames by default."""
+def python_firmware(truth: CartpoleTruth, mechanics: Mechanics) -> Firmware:
+    """Return the firmware in Python, with the truth's servo, on serial frames."""
     servo = Servo(truth.parameters, mechanics.timestep_s)
-    return Controller(servo, unique_id(truth), mechanics.command_delay, link)
+    return Controller(servo, unique_id(truth), mechanics.command_delay)
 
 
 class EmulatedDevice(abc.ABC):

@@ -13,6 +13,8 @@ FIRMWARES = ("auto", "host", "python", "avr")
 
 "auto" is "host" where the core can be compiled, otherwise "python".
 """
+CAN_FIRMWARES = ("auto", "host", "python")
+"""Those of an emulated cart-pole on CAN: the ATmega328P has no CAN controller."""
 
 
 def usable_firmware(firmware: str) -> str:

@@ -6,7 +6,7 @@ import ctypes
 import functools
 from collections.abc import Callable
 
-from deal_hw.drivers.cartpole import native
+from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.controller import Mode
 from deal_hw.drivers.cartpole.description import (
     DAMPING_NS_M,
@@ -22,6 +22,8 @@ _I32 = 0x7FFF_FFFF
 _MODES = (Mode.IDLE, Mode.HOMING, Mode.ARMED)
 _ONE = 65536
 _DRAW = ctypes.CFUNCTYPE(ctypes.c_uint16)
+_MOST_ANSWERS = 5
+"""Frames of the longest answer on CAN, an info."""
 _INSTALL = "apt-get install gcc libc6-dev, or set CC, or use --firmware python"
 
 
@@ -60,9 +62,15 @@ def library() -> ctypes.CDLL:
     command = (native.compiler(), *native.CFLAGS, "-DCARTPOLE_QUEUE=256", "-shared", "-fPIC")
     core = ctypes.CDLL(str(native.build("core.so", command, (*native.CORE, "host/core.c"), _INSTALL)))
     device, integer, number, data = ctypes.c_char_p, ctypes.c_int32, ctypes.c_uint32, ctypes.c_char_p
+    can = ctypes.c_char_p
     for name, result, arguments in (
         ("host_size", number, []),
+        ("host_can_size", number, []),
         ("host_init", None, [device, ctypes.POINTER(Settings), _DRAW]),
+        ("host_can_init", None, [can, number, number]),
+        ("host_can_receive", number, [device, can, data, number, integer, integer, data]),
+        ("host_can_report", number, [device, can, *[integer] * 5, ctypes.c_int, data]),
+        ("host_can_errors", number, [can]),
         ("host_receive", number, [device, data, number, integer, integer, data]),
         ("host_control", ctypes.c_int, [device, integer, integer, ctypes.POINTER(ctypes.c_int64)]),
         ("host_report", number, [device, *[integer] * 5, ctypes.c_int, data]),
@@ -144,9 +152,7 @@ class HostFirmware:
 
     def report(self, reading: Reading) -> bytes:
         """Return the state frame of the tick that :meth:`control` ran last."""
-        length = self._core.host_report(
-            self._device, *reading[:4], _fit(reading.setpoint * 1e9), reading.at_end_stop, self._frame
-        )
+        length = self._core.host_report(self._device, *_values(reading), self._frame)
         return self._frame.raw[:length]
 
     def finish_homing(self) -> None:
@@ -158,8 +164,54 @@ class HostFirmware:
         self._core.host_look(self._device, self._looked)
 
 
+class CanHostFirmware(HostFirmware):
+    """The C core on CAN frames, in the layout of :data:`~deal_hw.drivers.cartpole.can_link.FRAME`.
+
+    Args:
+        settings: Trims and serial number.
+        command_delay: As for :class:`HostFirmware`.
+        node: Number of the device, 1 to 62.
+        version: Version of the protocol that it speaks.
+
+    Raises:
+        ConfigurationError: There is no compiler, or it refuses the sources.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        command_delay: Callable[[], int],
+        node: int,
+        version: int = protocol.VERSION,
+    ) -> None:
+        super().__init__(settings, command_delay)
+        self._can = ctypes.create_string_buffer(self._core.host_can_size())
+        self._core.host_can_init(self._can, node, version)
+
+    @property
+    def frame_errors(self) -> int:
+        """Corrupt or unknown frames and messages received so far."""
+        return int(self._core.host_can_errors(self._can))
+
+    def receive(self, data: bytes, motor: Motor) -> bytes:
+        """Handle the host's frames before this tick; return the frames of the answers."""
+        out = ctypes.create_string_buffer(_MOST_ANSWERS * len(data))
+        length = self._core.host_can_receive(self._device, self._can, data, len(data), *_integers(motor), out)
+        self._look()
+        return out.raw[:length]
+
+    def report(self, reading: Reading) -> bytes:
+        """Return the frames of the state of the tick that :meth:`control` ran last."""
+        length = self._core.host_can_report(self._device, self._can, *_values(reading), self._frame)
+        return self._frame.raw[:length]
+
+
 def _integers(motor: Motor) -> tuple[int, int]:
     return _fit(motor.position * 1e9), _fit(motor.velocity * 1e6)
+
+
+def _values(reading: Reading) -> tuple[int, ...]:
+    return (*reading[:4], _fit(reading.setpoint * 1e9), reading.at_end_stop)
 
 
 def _fit(value: float) -> int:

@@ -14,8 +14,9 @@ from pathlib import Path
 from deal_hw.errors import ConfigurationError
 
 SOURCES = Path(__file__).parent / "firmware"
-CORE = ("frames.c", "servo.c", "cartpole.c")
-RIG = ("avr/main.c", "rig.c", *CORE)
+SERIAL_CORE = ("frames.c", "servo.c", "cartpole.c")
+CORE = (*SERIAL_CORE, "can_frames.c")
+RIG = ("avr/main.c", "rig.c", *SERIAL_CORE)
 AVR_CC = (
     "avr-gcc",
     "-std=gnu99",
@@ -77,14 +78,15 @@ def compiler() -> str:
     return os.environ.get("CC") or "cc"
 
 
-def fuzzer() -> Path:
-    """Return the core's fuzzer (``host/fuzz.c``: inputs, seed), built with the sanitizers.
+def fuzzer(wire: str = "serial") -> Path:
+    """Return the core's fuzzer for "serial" or "can" (arguments: inputs, seed), built with the sanitizers.
 
     Raises:
         ConfigurationError: There is no C compiler, or it refuses the sources.
     """
+    name = {"serial": "fuzz", "can": "fuzz_can"}[wire]
     command = (compiler(), *CFLAGS, *SANITIZERS)
-    return build("fuzz", command, ("host/fuzz.c", *CORE), "apt-get install gcc libc6-dev")
+    return build(name, command, (f"host/{name}.c", *CORE), "apt-get install gcc libc6-dev")
 
 
 def image() -> Path:

@@ -8,11 +8,17 @@ from collections.abc import Sequence
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage
+from deal_hw.drivers.cartpole.controller import Controller, Firmware
 from deal_hw.drivers.cartpole.dynamixel import packets
 from deal_hw.drivers.cartpole.dynamixel.bus import Bus
 from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BYTES
+from deal_hw.drivers.cartpole.firmwares import usable_firmware
+from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings
 from deal_hw.drivers.cartpole.odrive_frames import Command, pack
 from deal_hw.drivers.cartpole.odrive_link import DRIVE_NODE, ENCODER_NODE, OdriveLink, OdriveSettings
+from deal_hw.drivers.cartpole.sensor import Motor
+from deal_hw.drivers.cartpole.servo import Servo
+from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.slcan_transport import LineReader, decode_line, encode_line
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import FrameError, TransportTimeoutError
@@ -41,6 +47,40 @@ def _read_can(data: bytes) -> None:
     host = CanLink()
     for part in (data, whole, whole[::-1]):
         list(host.decode_all(part))
+
+
+def _host_frames() -> list[bytes]:
+    """Return what a host sends to a node: its requests and two targets."""
+    host = CanLink()
+    messages: list[CanMessage] = [
+        protocol.Hello(1),
+        protocol.Home(2),
+        protocol.Arm(3),
+        protocol.Target(4, 100_000, 80_000, 8_000, 4_000, 1_000_000),
+        protocol.Target(5, -100_000, 80_000, 8_000, 4_000, 1_000_000),
+        protocol.Stop(6),
+    ]
+    return [b"".join(host.encode(message) for message in messages), host.encode(messages[3])]
+
+
+def _hear_host(data: bytes) -> None:
+    """Receive as a node does, in Python and, where there is a compiler, in the firmware's C core.
+
+    Raises:
+        RuntimeError: They differ.
+    """
+    still, number = Motor(0.0, 0.0), 7
+    servo = Servo(nominal_truth().parameters, 0.001)
+    nodes: list[Firmware] = [Controller(servo, number, lambda: 0, CanLink(unique_id=number, device=True))]
+    if usable_firmware("auto") == "host":
+        nodes.append(CanHostFirmware(Settings(65536, 65536, 65536, 65536, number, 0), lambda: 0, 1))
+    parts = (data, data[: len(data) // FRAME.size * FRAME.size])
+    found = [
+        (*(node.receive(part, still) for part in parts), node.mode, node.homings, node.frame_errors)
+        for node in nodes
+    ]
+    if found[-1] != found[0]:
+        raise RuntimeError(f"Python gives {found[0]}, the C core {found[-1]}")
 
 
 def _odrive_frames() -> list[bytes]:
@@ -126,6 +166,7 @@ def _odd_packet(rng: random.Random, data: bytes, others: Sequence[bytes]) -> byt
 
 KINDS: dict[str, Kind] = {
     "wire_can": WireKind(make=_can_frames, read=_read_can, mutations=(damage_bytes,)),
+    "wire_can_node": WireKind(make=_host_frames, read=_hear_host, mutations=(damage_bytes,)),
     "wire_odrive": WireKind(make=_odrive_frames, read=_read_odrive, mutations=(damage_bytes,)),
     "wire_slcan": WireKind(make=_lines, read=_read_lines, mutations=(damage_bytes,)),
     "wire_servo_requests": WireKind(

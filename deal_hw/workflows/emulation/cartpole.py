@@ -20,6 +20,7 @@ from deal_hw.workflows.emulation.settings import (
     CARTPOLE_EMULATORS,
     CARTPOLE_RANGE_RATIO,
     ON_CAN,
+    WITH_FIRMWARE,
     EmulateSettings,
 )
 from deal_hw.workflows.say import Say, silent
@@ -79,7 +80,7 @@ def emulate_cartpole(
     truth = _truth(config)
     own: dict[str, str] = {}
     runs = ""
-    if (config.transport or "serial") == "serial":
+    if (config.transport or "serial") in WITH_FIRMWARE:
         from deal_hw.drivers.cartpole.firmwares import usable_firmware
 
         own["firmware"] = usable_firmware(config.firmware)

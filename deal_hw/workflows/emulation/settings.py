@@ -172,6 +172,8 @@ CARTPOLE_EMULATORS = {
 ``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
 ON_CAN = ("can", "odrive")
 """Wires of the cart-pole with a CAN bus."""
+WITH_FIRMWARE = ("serial", "can")
+"""Wires of the cart-pole with our firmware; their functions also take ``firmware=...``."""
 TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
 """Robots to emulate and their wires; the first wire is the default."""
 CARTPOLE_RANGE_RATIO = 5.0
@@ -210,8 +212,9 @@ class EmulateSettings:
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
     firmware: Annotated[Literal["auto", "host", "python", "avr"], CARTPOLE] = "auto"
-    """Cart-pole: the firmware's C core compiled for this computer (host), a copy in Python, or the image for
-    the ATmega328P under simavr (avr). auto: host, or python without a C compiler."""
+    """Cart-pole on serial or CAN: the firmware's C core compiled for this computer (host), a copy in Python,
+    or the image for the ATmega328P under simavr (avr, serial only). auto: host, or python without a C
+    compiler."""
 
     link: Annotated[File | None, CARTPOLE] = None
     """Make a symbolic link to the port here."""
@@ -279,8 +282,15 @@ class EmulateSettings:
             refuse(given(self.can, CanOptions()), "only `--transport can` and `odrive` have a CAN bus")
         if wire != "dynamixel":
             refuse(given(self.servo, ServoOptions()), "only `--transport dynamixel` has servos")
-        if wire != "serial":
-            refuse(given(self, EmulateSettings, ["firmware"]), "only `--transport serial` has this firmware")
+        if wire not in WITH_FIRMWARE:
+            refuse(
+                given(self, EmulateSettings, ["firmware"]),
+                "only `--transport serial` and `can` have this firmware",
+            )
+        if wire == "can" and self.firmware == "avr":
+            raise ConfigurationError(
+                "the ATmega328P has no CAN controller; use --firmware host or python, or --transport serial"
+            )
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
         if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):

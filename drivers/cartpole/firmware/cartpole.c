@@ -3,7 +3,7 @@
 #define TICKS_PER_STATE (CARTPOLE_CONTROL_HZ / CARTPOLE_STATE_HZ)
 #define MOST_AGE_TICKS 4294968UL /* A larger age in us exceeds its field. */
 
-static uint8_t *put(uint8_t *at, uint32_t value, uint8_t bytes)
+uint8_t *cartpole_put(uint8_t *at, uint32_t value, uint8_t bytes)
 {
     for (; bytes; bytes--, value >>= 8)
         *at++ = (uint8_t)value;
@@ -84,10 +84,10 @@ static uint8_t greet(cartpole *device, uint8_t request, uint8_t *answer)
     *at++ = CARTPOLE_FIRMWARE_MAJOR;
     *at++ = CARTPOLE_FIRMWARE_MINOR;
     *at++ = CARTPOLE_FIRMWARE_PATCH;
-    at = put(at, CARTPOLE_CONTROL_HZ, 2);
-    at = put(at, CARTPOLE_STATE_HZ, 2);
-    at = put(at, device->settings.unique_id, 4);
-    at = put(at, 0, 4);
+    at = cartpole_put(at, CARTPOLE_CONTROL_HZ, 2);
+    at = cartpole_put(at, CARTPOLE_STATE_HZ, 2);
+    at = cartpole_put(at, device->settings.unique_id, 4);
+    at = cartpole_put(at, 0, 4);
     return (uint8_t)(at - answer);
 }
 
@@ -130,7 +130,7 @@ uint8_t cartpole_handle(cartpole *device, const uint8_t *payload, uint8_t length
             result = act(device, type, motor);
             device->last_request = result == CARTPOLE_DONE ? key : 0;
         }
-        put(answer, CARTPOLE_VERSION | (uint32_t)CARTPOLE_ACK << 8 | (uint32_t)payload[2] << 16 |
+        cartpole_put(answer, CARTPOLE_VERSION | (uint32_t)CARTPOLE_ACK << 8 | (uint32_t)payload[2] << 16 |
                         (uint32_t)type << 24, 4);
         answer[4] = result;
         return 5;
@@ -180,9 +180,9 @@ bool cartpole_control(cartpole *device, const cartpole_motor *motor, int64_t *fo
     return due;
 }
 
-uint8_t cartpole_report(cartpole *device, const cartpole_reading *reading, uint8_t *frame)
+uint8_t cartpole_state(cartpole *device, const cartpole_reading *reading, uint8_t *payload)
 {
-    uint8_t payload[41], status = 0, *at = payload;
+    uint8_t status = 0, *at = payload;
     uint64_t device_us = device->device_us - 1000000UL / CARTPOLE_CONTROL_HZ;
     uint32_t age = device->command_age - 1; /* The reported tick has already incremented it. */
     bool clamped;
@@ -208,20 +208,26 @@ uint8_t cartpole_report(cartpole *device, const cartpole_reading *reading, uint8
         status |= CARTPOLE_STATUS_FAULT;
     *at++ = CARTPOLE_VERSION;
     *at++ = CARTPOLE_STATE;
-    at = put(at, device->state_count++, 4);
-    at = put(at, (uint32_t)device_us, 4);
-    at = put(at, (uint32_t)(device_us >> 32), 4);
-    at = put(at, (uint32_t)reading->cart_um, 4);
-    at = put(at, (uint32_t)reading->cart_um_s, 4);
-    at = put(at, (uint32_t)reading->pole_urad, 4);
-    at = put(at, (uint32_t)reading->pole_urad_s, 4);
-    at = put(at, (uint16_t)effort_mn, 2);
+    at = cartpole_put(at, device->state_count++, 4);
+    at = cartpole_put(at, (uint32_t)device_us, 4);
+    at = cartpole_put(at, (uint32_t)(device_us >> 32), 4);
+    at = cartpole_put(at, (uint32_t)reading->cart_um, 4);
+    at = cartpole_put(at, (uint32_t)reading->cart_um_s, 4);
+    at = cartpole_put(at, (uint32_t)reading->pole_urad, 4);
+    at = cartpole_put(at, (uint32_t)reading->pole_urad_s, 4);
+    at = cartpole_put(at, (uint16_t)effort_mn, 2);
     *at++ = status;
-    at = put(at, device->command_sequence, 4);
+    at = cartpole_put(at, device->command_sequence, 4);
     if (device->command_sequence == CARTPOLE_NO_COMMAND)
         age = 0;
     else
         age = age >= MOST_AGE_TICKS ? 0xFFFFFFFFUL : age * 1000;
-    at = put(at, age, 4);
-    return cartpole_frame(payload, (uint8_t)(at - payload), frame);
+    at = cartpole_put(at, age, 4);
+    return (uint8_t)(at - payload);
+}
+
+uint8_t cartpole_report(cartpole *device, const cartpole_reading *reading, uint8_t *frame)
+{
+    uint8_t payload[CARTPOLE_STATE_PAYLOAD];
+    return cartpole_frame(payload, cartpole_state(device, reading, payload), frame);
 }

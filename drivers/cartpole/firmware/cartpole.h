@@ -1,8 +1,9 @@
 /* Firmware of the cart-pole, the part that all chips share: C99, integers only, no heap, no library calls.
  *
- * Protocol: docs/reference/protocol-cartpole-serial.md. Use: docs/how-to/firmware.md. Every millisecond a port calls
- * cartpole_receive() for each received byte, cartpole_control(), and, if that returns true, cartpole_report(). All
- * state is in one struct, so that a host may run several.
+ * Protocols: docs/reference/protocol-cartpole-serial.md and -can.md. Use: docs/how-to/firmware.md. Every millisecond a
+ * port calls cartpole_receive() for each received byte, cartpole_control(), and, if that returns true,
+ * cartpole_report(); on CAN cartpole_can_receive() for each frame, and cartpole_can_report(). All state is in one
+ * struct a wire, so that a host may run several.
  */
 #ifndef CARTPOLE_H
 #define CARTPOLE_H
@@ -24,6 +25,14 @@
 #define CARTPOLE_MAX_BLOCK 64                     /* Longest COBS block, without its delimiter. */
 #define CARTPOLE_MAX_FRAME (CARTPOLE_MAX_BLOCK + 1)
 #define CARTPOLE_MAX_PAYLOAD (CARTPOLE_MAX_BLOCK - 3)
+#define CARTPOLE_STATE_PAYLOAD 41
+
+#define CARTPOLE_CAN_NODE 1                       /* Unless the settings name another, 1 to 62. */
+#define CARTPOLE_CAN_NODES 62
+#define CARTPOLE_CAN_HOST_MASK 0x7F8U             /* Ids from the host: (node << 5) under this mask. */
+#define CARTPOLE_CAN_ANSWER 5                     /* Most frames of an answer, */
+#define CARTPOLE_CAN_REPORT 7                     /* and of a state with heartbeat and errors. */
+#define CARTPOLE_STATES_PER_HEARTBEAT 20
 
 #ifndef CARTPOLE_QUEUE
 #define CARTPOLE_QUEUE 8 /* Targets that wait for their tick; if the queue is full, the newest replaces the last. */
@@ -101,6 +110,23 @@ typedef struct {
     uint32_t errors;
 } cartpole_decoder;
 
+/* A classic CAN frame, as Linux' struct can_frame. */
+typedef struct {
+    uint32_t id;
+    uint8_t length, padding[3], data[8];
+} cartpole_can_frame;
+
+/* A CAN wire. The counters and the controller's error counters are reported to the host; a port counts all but torn
+ * and errors. */
+typedef struct {
+    uint8_t node, version;
+    uint8_t parts; /* Frames of the target so far. */
+    uint8_t target[26];
+    uint32_t torn, errors; /* Messages that lost a frame; frames and messages that are corrupt or unknown. */
+    uint16_t overflows, bus_offs, drops;
+    uint8_t transmit_errors, receive_errors;
+} cartpole_can;
+
 typedef struct {
     cartpole_settings settings;
     uint16_t (*draw_delay)(void); /* Replaces the settings' delay if it is not null. */
@@ -134,6 +160,8 @@ int16_t cartpole_servo_estimate(const cartpole_servo *servo, const cartpole_read
 int32_t cartpole_millinewton(int64_t force_pn);
 
 /* cartpole.c: messages, modes, watchdog. */
+/* Write a number's lowest bytes, little-endian; return what comes after them. */
+uint8_t *cartpole_put(uint8_t *at, uint32_t value, uint8_t bytes);
 void cartpole_init(cartpole *device, const cartpole_settings *settings);
 /* Execute a payload (version, type, body); return the length of the answer's payload, or 0. */
 uint8_t cartpole_handle(cartpole *device, const uint8_t *payload, uint8_t length, const cartpole_motor *motor,
@@ -142,11 +170,22 @@ uint8_t cartpole_handle(cartpole *device, const uint8_t *payload, uint8_t length
 uint8_t cartpole_receive(cartpole *device, uint8_t byte, const cartpole_motor *motor, uint8_t *frame);
 /* Run one tick; return whether a state frame is due in it. */
 bool cartpole_control(cartpole *device, const cartpole_motor *motor, int64_t *force_pn);
-/* Write the state frame of the tick that ran last; return its length. */
+/* Write the state's payload of the tick that ran last; return its length, CARTPOLE_STATE_PAYLOAD. */
+uint8_t cartpole_state(cartpole *device, const cartpole_reading *reading, uint8_t *payload);
+/* Write the same as a frame of the serial wire; return its length. */
 uint8_t cartpole_report(cartpole *device, const cartpole_reading *reading, uint8_t *frame);
 /* The cart is in the middle and the pole upright; nothing happens unless homing. */
 void cartpole_finish_homing(cartpole *device);
 /* Motor off, as by the host's stop. */
 void cartpole_stop(cartpole *device);
+
+/* can_frames.c: frames of the CAN wire. */
+void cartpole_can_init(cartpole_can *can, uint8_t node);
+/* Take a frame from the bus; return the number of frames to answer with, at most CARTPOLE_CAN_ANSWER. */
+uint8_t cartpole_can_receive(cartpole *device, cartpole_can *can, const cartpole_can_frame *frame,
+                             const cartpole_motor *motor, cartpole_can_frame *out);
+/* Write the frames of the tick that ran last, at most CARTPOLE_CAN_REPORT; return their number. */
+uint8_t cartpole_can_report(cartpole *device, const cartpole_can *can, const cartpole_reading *reading,
+                            cartpole_can_frame *out);
 
 #endif

@@ -168,7 +168,7 @@ bool rig_tick(rig *rig, const rig_inputs *inputs, int16_t *pwm)
     return due;
 }
 
-uint8_t rig_report(rig *rig, uint8_t *frame)
+cartpole_reading rig_read(rig *rig)
 {
     cartpole_reading reading;
     uint8_t at = rig->report_at;
@@ -182,5 +182,11 @@ uint8_t rig_report(rig *rig, uint8_t *frame)
     reading.setpoint_nm = rig->device.servo.setpoint_nm;
     reading.at_end_stop = rig->left || rig->right;
     reading.fault = rig->fault;
+    return reading;
+}
+
+uint8_t rig_report(rig *rig, uint8_t *frame)
+{
+    cartpole_reading reading = rig_read(rig);
     return cartpole_report(&rig->device, &reading, frame);
 }

@@ -1,7 +1,8 @@
 /* The part of a port beside the wire: encoder counts to positions, homing against a switch, end stops, the motor.
  *
  * A port calls rig_receive() for each byte. Every millisecond it calls rig_tick(), and, if that returns true,
- * rig_report().
+ * rig_report(). On CAN it gives rig.device and rig.motor to cartpole_can_receive(), and rig_read() to
+ * cartpole_can_report().
  */
 #ifndef RIG_H
 #define RIG_H
@@ -58,6 +59,8 @@ void rig_init(rig *rig, const rig_settings *settings);
 uint8_t rig_receive(rig *rig, uint8_t byte, uint8_t *frame);
 /* Run one tick; return whether a state frame is due. The PWM is from -RIG_PWM_TOP to RIG_PWM_TOP. */
 bool rig_tick(rig *rig, const rig_inputs *inputs, int16_t *pwm);
+/* Return what the state of the tick that ran last reports; call it once for each state. */
+cartpole_reading rig_read(rig *rig);
 uint8_t rig_report(rig *rig, uint8_t *frame);
 
 #endif

@@ -3,30 +3,7 @@
  * Usage: fuzz INPUTS SEED. Prints one line of counts; aborts if the core violates an assertion. Build it with
  * -fsanitize=address,undefined. "accepted" counts corrupt frames whose CRC happened to be right.
  */
-#include <inttypes.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "../cartpole.h"
-
-#define CHECK(what)                                                        \
-    do {                                                                   \
-        if (!(what)) {                                                     \
-            fprintf(stderr, "input %" PRIu64 ": %s\n", number, #what);     \
-            abort();                                                       \
-        }                                                                  \
-    } while (0)
-
-static uint64_t state;
-
-static uint32_t draw(uint32_t below) /* splitmix64 */
-{
-    uint64_t z = (state += 0x9E3779B97F4A7C15ULL);
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9ULL;
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EBULL;
-    return (uint32_t)(((z ^ (z >> 31)) >> 32) * below >> 32);
-}
+#include "fuzz.h"
 
 static uint8_t payload_of(uint8_t *payload)
 {
@@ -70,18 +47,17 @@ static uint8_t mutate(uint8_t *data, uint8_t length, uint32_t kind)
 
 int main(int count, char **words)
 {
-    uint64_t number, inputs = count > 1 ? strtoull(words[1], NULL, 10) : 100000;
-    uint64_t good = 0, corrupt = 0, accepted = 0, garbage = 0, garbage_accepted = 0, armed = 0;
+    fuzz_counts counts = {count > 1 ? strtoull(words[1], NULL, 10) : 100000, 0, 0, 0, 0, 0, 0};
+    uint64_t number;
     cartpole_settings settings = {CARTPOLE_ONE, CARTPOLE_ONE, CARTPOLE_ONE, CARTPOLE_ONE, 1, 2};
     cartpole device;
     state = count > 2 ? strtoull(words[2], NULL, 10) : 1;
     cartpole_init(&device, &settings);
-    for (number = 0; number < inputs; number++) {
+    for (number = 0; number < counts.inputs; number++) {
         uint8_t payload[CARTPOLE_MAX_PAYLOAD], data[160], frame[CARTPOLE_MAX_FRAME], *out;
         cartpole_decoder decoder = {{0}, 0, true, 0};
         cartpole_motor motor = {(int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF)};
-        cartpole_reading reading = {(int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF),
-                                    (int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF), draw(2), draw(2)};
+        cartpole_reading reading = draw_reading();
         uint32_t kind = draw(10);
         uint8_t size = payload_of(payload), length, got, i, first = 0;
         bool same = kind >= 8;
@@ -93,14 +69,14 @@ int main(int count, char **words)
             memcpy(before, data, length);
             length = mutate(data, length, kind);
             same = length == was && memcmp(before, data, length) == 0;
-            corrupt += !same;
+            counts.corrupt += !same;
         } else if (kind < 8) { /* No frame at all; half of them look like one. */
             length = (uint8_t)(1 + draw(140));
             for (i = 0; i < length; i++)
                 data[i] = (uint8_t)(kind == 6 ? draw(256) : 1 + draw(length));
-            garbage++;
+            counts.garbage++;
         } else {
-            good++;
+            counts.good++;
         }
         if (length == 0 || data[length - 1] != 0)
             data[length++] = 0;
@@ -112,9 +88,9 @@ int main(int count, char **words)
                 CHECK(got == size && memcmp(decoder.block, payload, size) == 0);
                 first = 1;
             } else if (kind < 6) {
-                accepted++;
+                counts.accepted++;
             } else {
-                garbage_accepted++;
+                counts.garbage_accepted++;
             }
         }
         CHECK(!same || first);
@@ -127,16 +103,11 @@ int main(int count, char **words)
         free(out);
         if (cartpole_control(&device, &motor, &force_pn))
             CHECK(cartpole_report(&device, &reading, frame) <= 48);
-        CHECK(device.mode == CARTPOLE_ARMED || force_pn == 0);
-        CHECK(force_pn <= device.servo.real.limit_pn && force_pn >= -device.servo.real.limit_pn);
-        CHECK(device.queue_count <= CARTPOLE_QUEUE && device.mode <= CARTPOLE_ARMED);
-        CHECK(device.mode != CARTPOLE_ARMED || device.homed);
-        armed += device.mode == CARTPOLE_ARMED;
+        check_core(number, &device, force_pn);
+        counts.armed += device.mode == CARTPOLE_ARMED;
         if (draw(4) == 0)
             cartpole_finish_homing(&device);
     }
-    printf("{\"inputs\": %" PRIu64 ", \"good\": %" PRIu64 ", \"corrupt\": %" PRIu64 ", \"accepted\": %" PRIu64
-           ", \"garbage\": %" PRIu64 ", \"garbage_accepted\": %" PRIu64 ", \"armed\": %" PRIu64 "}\n",
-           inputs, good, corrupt, accepted, garbage, garbage_accepted, armed);
+    print(&counts);
     return 0;
 }
