@@ -18,7 +18,7 @@ SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test dds-peer avr-tools firmware check dist docs coverage-safety mutation bench typing format clean
+.PHONY: help setup demo test dds-peer avr-tools arm-tools firmware firmware-arm check dist docs coverage-safety mutation bench typing format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -40,11 +40,12 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
-# Tests that need the DDS peer or the AVR's tools are skipped without them, and say what to install. One thread of
+# Tests that need the DDS peer or a chip's tools are skipped without them, and say what to install. One thread of
 # OpenMP a process: with more, the two workers' threads wait for each other on two cores.
 test: $(STAMP) ## all tests that need no robot
 	@tools/build_dds_peer.sh || true
 	@tools/install_avr_tools.sh || true
+	@tools/install_arm_tools.sh || true
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
 dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
@@ -53,8 +54,14 @@ dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 avr-tools: ## install gcc-avr and simavr
 	@tools/install_avr_tools.sh
 
+arm-tools: ## install gcc-arm-none-eabi and qemu-system-arm (60 MB to fetch, 490 MB on the disk)
+	@tools/install_arm_tools.sh
+
 firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
-	@$(BIN)/python -m deal_hw.drivers.cartpole.native build/firmware
+	@$(BIN)/python -m deal_hw.drivers.cartpole.native avr build/firmware
+
+firmware-arm: $(STAMP) arm-tools ## build/firmware/cartpole-stm32.bin for the STM32F103C8, and its memory use
+	@$(BIN)/python -m deal_hw.drivers.cartpole.native stm32 build/firmware
 
 check: $(STAMP) typing coverage-safety docs ## format, lint, types, declared imports, layers, safety coverage, docs, distributions
 	$(BIN)/ruff format --check --output-format concise .

@@ -14,7 +14,9 @@ REAL_TIME = {"cli", "contracts", "control", "drivers", "tools", "workflows"}
 """Folders of tests with processes that run in real time; two of these at once would disturb each other."""
 
 COMPUTING = (
+    "test_cartpole_can_firmware",
     "test_cartpole_protocol",
+    "test_cartpole_stm32",
     "test_cartpole_truth",
     "test_cli_calibrate_",
     "test_cli_every_",

@@ -1,17 +1,22 @@
 """The same inputs for each build of the cart-pole's firmware, and the arithmetic of its servo, written again.
 
-A build is right if it answers bit for bit as the state machine in Python with :class:`IntegerServo` does.
+A build is right if it answers bit for bit as the state machine in Python with :class:`IntegerServo` does. The
+core for a Cortex-M3 is given what :class:`RecordedCore` recorded of the host's.
 """
 
 from __future__ import annotations
 
 import random
+import struct
+import subprocess
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
-from deal_hw.drivers.cartpole import protocol
+from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, CanLink
 from deal_hw.drivers.cartpole.controller import Firmware, Mode
-from deal_hw.drivers.cartpole.host_firmware import Settings
+from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, HostFirmware, Settings
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
 from deal_hw.drivers.cartpole.servo import Servo
@@ -148,3 +153,79 @@ class IntegerServo(Servo):
     @staticmethod
     def _demand(gains: tuple[int, int, int], error_nm: int, velocity_um_s: int) -> int:
         return gains[0] * error_nm - gains[1] * cut(velocity_um_s, 2**25 - 1)
+
+
+MACHINE = ("qemu-system-arm", "-M", "stm32vldiscovery", "-display", "none", "-monitor", "none")
+"""QEMU's nearest chip: an STM32F100, with the same core, memory map, timer SysTick and UART."""
+INSTALL_QEMU = "apt-get install --no-install-recommends qemu-system-arm"
+
+
+class RecordedCore:
+    """The host's core, which keeps each call and its result for another build of the core.
+
+    Attributes:
+        calls: The calls so far, as firmware/host/qemu.c reads them.
+        results: What the calls returned.
+
+    Args:
+        settings: Trims, serial number and delay.
+        can: Whether it is on CAN, as node 1.
+    """
+
+    def __init__(self, settings: Settings, *, can: bool) -> None:
+        ticks = int(settings.delay_ticks)
+        self._core = (
+            CanHostFirmware(settings, lambda: ticks, 1) if can else HostFirmware(settings, lambda: ticks)
+        )
+        self._letters = (b"r", b"s") if can else (b"R", b"S")
+        self.calls = b"I" + bytes(settings) + struct.pack("<2I", 1, protocol.VERSION)
+        self.results = b""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._core, name)
+
+    def receive(self, data: bytes, motor: Motor) -> bytes:
+        """Handle the host's bytes."""
+        self.calls += self._letters[0] + struct.pack("<I", len(data)) + data + _motor(motor)
+        self.results += (out := self._core.receive(data, motor))
+        return out
+
+    def control(self, motor: Motor) -> tuple[float, bool]:
+        """Run one tick."""
+        self.calls += b"C" + _motor(motor)
+        force, due = self._core.control(motor)
+        self.results += struct.pack("<Iq", due, round(force * 1e12)) + bytes(self._core._looked)
+        return force, due
+
+    def report(self, reading: Reading) -> bytes:
+        """Return the frames of a state."""
+        setpoint = round(reading.setpoint * 1e9)
+        self.calls += self._letters[1] + struct.pack("<6i", *reading[:4], setpoint, reading.at_end_stop)
+        self.results += (out := self._core.report(reading))
+        return out
+
+    def finish_homing(self) -> None:
+        """The cart is in the middle and the pole upright."""
+        self.calls += b"F"
+        self._core.finish_homing()
+
+
+def results_under_qemu(calls: bytes, folder: Path) -> bytes:
+    """Return the results of recorded calls of the core on an emulated Cortex-M3.
+
+    Args:
+        calls: What :class:`RecordedCore` recorded.
+        folder: An empty folder for the inputs and outputs.
+
+    Raises:
+        ConfigurationError: The compiler for the Cortex-M3 is missing, or it refuses the sources.
+    """
+    (folder / "inputs").write_bytes(calls)
+    semihosting = ("-semihosting-config", "enable=on,target=native")
+    command = (*MACHINE, "-serial", "none", *semihosting, "-kernel", str(native.qemu_core()))
+    subprocess.run(command, cwd=folder, check=True, timeout=120)
+    return (folder / "outputs").read_bytes()
+
+
+def _motor(motor: Motor) -> bytes:
+    return struct.pack("<2i", round(motor.position * 1e9), round(motor.velocity * 1e6))

@@ -1,4 +1,4 @@
-"""Memory and cycles of the cart-pole's firmware under simavr: the tables of docs/how-to/firmware.md.
+"""Memory of the cart-pole's firmware, and cycles under simavr: the tables of docs/how-to/firmware.md.
 
 python tools/measure_firmware.py
 """
@@ -58,9 +58,10 @@ def row(name: str, period: int, cart: int, pole: int, ticks: int = 1000) -> str:
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     with tempfile.TemporaryDirectory() as folder:
         print(native.write_image(Path(folder)))
+        print(native.write_stm32_image(Path(folder)), end="\n\n")
     print("| situation | with a state frame | without | left of 16 000 | asleep |\n|---|---|---|---|---|")
     print(row("armed, at rest, targets at 50 Hz", 20, 0, 0))
     print(row("armed, at rest, targets at 200 Hz", 5, 0, 0))

@@ -28,6 +28,22 @@ AVR_CC = (
     "-Wextra",
     "-Werror",
 )
+STM32 = ("stm32/startup.c", "stm32/main.c", "rig.c", *CORE)
+QEMU_CORE = ("stm32/startup.c", "host/qemu.c", "host/core.c", *CORE)
+ARM_CC = (
+    "arm-none-eabi-gcc",
+    "-std=gnu99",
+    "-mcpu=cortex-m3",
+    "-mthumb",
+    "-Os",
+    "-flto",
+    "-ffreestanding",
+    "-nostdlib",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+)
+ARM_INSTALL = "apt-get install --no-install-recommends gcc-arm-none-eabi"
 CFLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
@@ -56,7 +72,7 @@ def build(
     if shutil.which(command[0]) is None:
         raise ConfigurationError(f"the firmware needs {command[0]}, which is not installed; {install}")
     digest = hashlib.sha256("\0".join((*command, *sources, *libraries)).encode())
-    for path in sorted(SOURCES.rglob("*.[ch]")):
+    for path in sorted(SOURCES.rglob("*.[chl]*")):
         digest.update(path.read_bytes())
     target = cache() / digest.hexdigest()[:16] / name
     if target.is_file():
@@ -98,6 +114,32 @@ def image() -> Path:
     return build("cartpole.elf", AVR_CC, RIG, "apt-get install gcc-avr avr-libc")
 
 
+def stm32_image(*, qemu: bool = False) -> Path:
+    """Return the firmware of the STM32F103 as an ELF file.
+
+    Args:
+        qemu: Do not wait for the clocks, which QEMU does not have.
+
+    Raises:
+        ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
+    """
+    return _arm_build("cartpole-stm32.elf", STM32, *(("-DQEMU",) if qemu else ()))
+
+
+def qemu_core() -> Path:
+    """Return the core alone for a Cortex-M3 under QEMU (``host/qemu.c``), as an ELF file.
+
+    Raises:
+        ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
+    """
+    return _arm_build("core.elf", QEMU_CORE, "-DCARTPOLE_QUEUE=32")
+
+
+def _arm_build(name: str, sources: Sequence[str], *options: str) -> Path:
+    script = ("-T", str(SOURCES / "stm32" / "link.ld"))
+    return build(name, (*ARM_CC, *options), sources, ARM_INSTALL, (*script, "-lgcc"))
+
+
 def write_image(folder: Path) -> str:
     """Write ``cartpole.elf`` and ``cartpole.hex`` into a folder; return what avr-size says of them.
 
@@ -112,5 +154,25 @@ def write_image(folder: Path) -> str:
     return subprocess.run(size, check=True, capture_output=True, text=True).stdout
 
 
+def write_stm32_image(folder: Path) -> str:
+    """Write ``cartpole-stm32.elf`` and ``.bin`` into a folder; return their memory in words.
+
+    Raises:
+        ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    elf, code = folder / "cartpole-stm32.elf", folder / "cartpole-stm32.bin"
+    shutil.copy(stm32_image(), elf)
+    subprocess.run(["arm-none-eabi-objcopy", "-O", "binary", str(elf), str(code)], check=True)
+    size = ["arm-none-eabi-size", str(elf)]
+    said = subprocess.run(size, check=True, capture_output=True, text=True).stdout
+    code_bytes, data, zero = (int(text) for text in said.splitlines()[1].split()[:3])
+    return (
+        f"STM32F103C8: flash {code_bytes + data} bytes of 65536, RAM {data + zero} bytes of 20480 "
+        "(the stack has the rest of the first 8192)"
+    )
+
+
 if __name__ == "__main__":
-    print(write_image(Path(sys.argv[1])))
+    write = write_stm32_image if sys.argv[1] == "stm32" else write_image
+    print(write(Path(sys.argv[2])))

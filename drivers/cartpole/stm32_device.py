@@ -1,0 +1,177 @@
+"""The firmware's port to the STM32F103 with the chip's registers in memory, on the cart-pole's mechanics.
+
+``stm32/main.c`` is compiled for this host. ``host/stm32.c`` stands in for timers, pins, UART and CAN.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import struct
+
+from fastcrc import crc16
+
+from deal_hw.drivers.cartpole import native
+from deal_hw.drivers.cartpole.can_link import NODE, CanLink
+from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of
+from deal_hw.drivers.cartpole.link import SerialLink
+from deal_hw.drivers.cartpole.rig_device import NOMINAL_RIG, Rig, RigDevice, delay_ticks
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
+
+_BYTES_PER_TICK = 99
+"""One byte less than 1 Mbaud carries in 1 ms, so that no byte is left over."""
+_INSTALL = "apt-get install gcc libc6-dev, or set CC"
+
+
+class _Outputs(ctypes.Structure):
+    _fields_ = [
+        ("pwm", ctypes.c_double),
+        ("armed", ctypes.c_int32),
+        ("set_pole", ctypes.c_int32),
+        ("unserved_ms", ctypes.c_uint32),
+        ("filtered", ctypes.c_uint32),
+        ("bit_rate", ctypes.c_uint32),
+    ]
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """Return the port with its registers, compiled on the first call.
+
+    Raises:
+        ConfigurationError: There is no compiler, or it refuses the sources.
+    """
+    command = (native.compiler(), *native.CFLAGS, "-shared", "-fPIC")
+    chip = ctypes.CDLL(
+        str(native.build("stm32.so", command, ("host/stm32.c", "rig.c", *native.CORE), _INSTALL))
+    )
+    integer, number, data = ctypes.c_int32, ctypes.c_uint32, ctypes.c_char_p
+    chip.chip_start.restype, chip.chip_start.argtypes = None, [data, number, ctypes.c_int]
+    chip.chip_bus.restype, chip.chip_bus.argtypes = None, [ctypes.c_int, number]
+    chip.chip_tick.restype = number
+    chip.chip_tick.argtypes = [
+        integer,
+        integer,
+        ctypes.c_int,
+        ctypes.c_int,
+        data,
+        number,
+        data,
+        ctypes.POINTER(_Outputs),
+    ]
+    return chip
+
+
+def flash_page(settings: Settings, full_force_n: float, node: int = NODE, can_kbit: int = 500) -> bytes:
+    """Return the settings for the last page of the chip's flash, with their CRC, little-endian.
+
+    Args:
+        settings: Trims, serial number, delay.
+        full_force_n: Force on the cart with the PWM fully on [N].
+        node: Number on the CAN bus.
+        can_kbit: Bit rate of the CAN bus: 250, 500 or 1000 [kbit/s].
+    """
+    data = struct.pack(
+        "<5I4H",
+        settings.stiffness_trim,
+        settings.damping_trim,
+        settings.effort_trim,
+        settings.speed_trim,
+        settings.unique_id,
+        settings.delay_ticks,
+        round(full_force_n * 1000),
+        node,
+        can_kbit,
+    )
+    return data + struct.pack("<H", crc16.ibm_3740(data))
+
+
+class Stm32Chip:
+    """The port with its registers in memory; only the one that started last lives.
+
+    Attributes:
+        outputs: Mean PWM, lamps, milliseconds without service of the watchdog, frames that the filter kept
+            out, bit rate [bit/s].
+
+    Args:
+        page: Contents of the last page of its flash.
+        can: Whether the jumper BOOT1 chooses CAN; bytes are then frames of
+            :data:`~deal_hw.drivers.cartpole.can_link.FRAME`.
+
+    Raises:
+        ConfigurationError: There is no C compiler.
+    """
+
+    def __init__(self, page: bytes, *, can: bool) -> None:
+        self.outputs = _Outputs()
+        self._can = can
+        self._library = library()
+        self._library.chip_start(page, len(page), can)
+        self._out = ctypes.create_string_buffer(4096)
+        self._inbox = b""
+
+    def tick(
+        self,
+        cart_counts: int = 0,
+        pole_counts: int = 0,
+        switches: tuple[bool, bool] = (False, False),
+        data: bytes = b"",
+    ) -> bytes:
+        """Run a millisecond; return the bytes or frames sent in it.
+
+        Args:
+            cart_counts: Motion of the cart's encoder.
+            pole_counts: Motion of the pole's encoder.
+            switches: Whether the left and the right limit switch are closed.
+            data: From the host; it comes as fast as the wire carries it, also in later calls.
+        """
+        self._inbox += data
+        most = len(self._inbox) if self._can else _BYTES_PER_TICK
+        data, self._inbox = self._inbox[:most], self._inbox[most:]
+        length = self._library.chip_tick(
+            cart_counts, pole_counts, *switches, data, len(data), self._out, ctypes.byref(self.outputs)
+        )
+        return self._out.raw[:length]
+
+    def bus(self, *, silent: bool = False, errors: int = 0) -> None:
+        """Let the bus fail.
+
+        Args:
+            silent: Nobody acknowledges a frame.
+            errors: The controller's register of errors (ESR).
+        """
+        self._library.chip_bus(silent, errors)
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+
+class Stm32Device(RigDevice):
+    """An STM32F103 on a cart-pole.
+
+    Attributes:
+        chip: The chip.
+
+    Args:
+        truth: Hidden parameters, latency, profile and seed.
+        can: Whether it is on CAN, otherwise serial.
+        start_angle_rad: Pole angle set by hand when homing [rad]; None: within +-0.03 rad, by the seed.
+        build: Dimensions of the cart-pole.
+
+    Raises:
+        ConfigurationError: There is no C compiler.
+    """
+
+    chip: Stm32Chip
+
+    def __init__(
+        self,
+        truth: CartpoleTruth,
+        *,
+        can: bool,
+        start_angle_rad: float | None = None,
+        build: Rig = NOMINAL_RIG,
+    ) -> None:
+        page = flash_page(settings_of(truth, delay_ticks(truth)), build.full_force_n)
+        link = CanLink() if can else SerialLink()
+        super().__init__(truth, Stm32Chip(page, can=can), link, start_angle_rad=start_angle_rad, build=build)
