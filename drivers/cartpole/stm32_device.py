@@ -47,7 +47,7 @@ def library() -> ctypes.CDLL:
     )
     integer, number, data = ctypes.c_int32, ctypes.c_uint32, ctypes.c_char_p
     chip.chip_start.restype, chip.chip_start.argtypes = None, [data, number, ctypes.c_int]
-    chip.chip_bus.restype, chip.chip_bus.argtypes = None, [ctypes.c_int, number]
+    chip.chip_bus.restype, chip.chip_bus.argtypes = None, [ctypes.c_int, number, ctypes.c_int]
     chip.chip_tick.restype = number
     chip.chip_tick.argtypes = [
         integer,
@@ -133,14 +133,15 @@ class Stm32Chip:
         )
         return self._out.raw[:length]
 
-    def bus(self, *, silent: bool = False, errors: int = 0) -> None:
+    def bus(self, *, silent: bool = False, errors: int = 0, overrun: bool = False) -> None:
         """Let the bus fail.
 
         Args:
             silent: Nobody acknowledges a frame.
             errors: The controller's register of errors (ESR).
+            overrun: A frame from the host found the controller full.
         """
-        self._library.chip_bus(silent, errors)
+        self._library.chip_bus(silent, errors, overrun)
 
     def close(self) -> None:
         """Nothing is left behind."""

@@ -303,6 +303,19 @@ def test_frames_of_other_devices_and_nodes_are_not_its_business() -> None:
     assert firmware.frame_errors == 3
 
 
+def test_the_count_of_errors_ends_at_its_largest_value() -> None:
+    """70 000 unknown frames: its 16 bits do not wrap."""
+    firmware = core()
+    firmware.receive(FRAME.pack(0x27, 2, b"\1\1") * 70_000, STILL)
+    firmware.control(STILL)
+    (errors,) = [
+        signals
+        for name, signals, _ in unpacked(firmware.report(Reading(0, 0, 0, 0, 0.0)))
+        if name == "Errors"
+    ]
+    assert errors == {"TornMessages": 65_535, "ReceiveOverflows": 0, "BusOffs": 0, "TransmitDrops": 0}
+
+
 # Equal to the state machine in Python.
 
 

@@ -100,10 +100,16 @@ def test_the_image_starts_under_qemu_and_speaks(tmp_path: Path) -> None:
     """Vectors, variables, SysTick, UART and its interrupt: the page's info and ack come, and states."""
     settings = tmp_path / "settings.bin"
     settings.write_bytes(flash_page(NOMINAL, 16.0))
-    load = f"loader,file={settings},addr=0x0800FC00,force-raw=on"
+    # A chip's memory holds anything at power-on.
+    memory = tmp_path / "memory.bin"
+    memory.write_bytes(bytes(range(256)) * 32)
+    loads = [
+        f"loader,file={file},addr={address:#x},force-raw=on"
+        for file, address in ((settings, 0x0800_FC00), (memory, 0x2000_0000))
+    ]
     image = str(native.stm32_image(qemu=True))
     chip = subprocess.Popen(
-        [*MACHINE, "-serial", "stdio", "-kernel", image, "-device", load],
+        [*MACHINE, "-serial", "stdio", "-kernel", image, "-device", loads[0], "-device", loads[1]],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         bufsize=0,
@@ -359,6 +365,14 @@ def test_bus_off_is_counted_once_and_the_counters_of_the_controller_are_reported
     node.run(110)
     assert node.frames("Heartbeat")[-1][6:8] == bytes((0x1F, 0x2A))
     assert int.from_bytes(node.frames("Errors")[-1][4:6], "little") == 1
+
+
+def test_a_frame_too_many_for_the_controller_is_counted_once(node: Board) -> None:
+    """The flag FOVR0 is cleared; the next heartbeat has one overflow beside it, and requests are answered."""
+    node.bus(overrun=True)
+    assert len(node.say(protocol.Hello(1))) == 1
+    node.run(110)
+    assert [data[2:4] for data in node.frames("Errors")] == [b"\1\0"]
 
 
 # The same on the mechanics of the cart-pole, with the driver in front of it.

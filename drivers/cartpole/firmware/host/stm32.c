@@ -14,6 +14,7 @@
 #define NO_BYTE 0xFFFFFFFFUL
 #define BUS_SIZE 1024 /* Frames; a power of two. */
 #define MAILBOXES 3
+#define UNWRITTEN (1UL << 31) /* A bit of RF0R that the chip does not have: what main.c writes lacks it. */
 
 typedef struct {
     double pwm;               /* Mean over the millisecond, -799 to 799. */
@@ -60,7 +61,7 @@ static void settle_can(void)
         if (CAN_RF0R & FOVR0)
             overflow = false;
     }
-    fifo_shown = CAN_RF0R = fifo_count | (overflow ? FOVR0 : 0);
+    fifo_shown = CAN_RF0R = UNWRITTEN | fifo_count | (overflow ? FOVR0 : 0);
     CAN_RI0R = fifo[0].id << 21;
     CAN_RDT0R = fifo[0].length;
     CAN_RDL0R = word(fifo[0].data);
@@ -145,8 +146,10 @@ static int32_t duration_us(const cartpole_can_frame *frame)
 static void begin_frame(void)
 {
     uint32_t i, first = MAILBOXES;
+    /* Without TXFP the lowest id leaves first, whenever it was asked for. */
     for (i = 0; i < MAILBOXES; i++)
-        if (order[i] != 0 && (first == MAILBOXES || order[i] < order[first]))
+        if (order[i] != 0 && (first == MAILBOXES || (CAN_MCR & TXFP ? order[i] < order[first]
+                                                                     : CAN_TIR(i) < CAN_TIR(first))))
             first = i;
     from_mailbox = -1;
     if (first < MAILBOXES) {
@@ -227,11 +230,12 @@ void chip_start(const uint8_t *page, uint32_t length, int boot1)
     set_up();
 }
 
-/* Faults of the bus: nobody acknowledges; the controller's error register. */
-void chip_bus(int silent, uint32_t errors)
+/* Faults of the bus: nobody acknowledges; the controller's error register; a frame found its FIFO full. */
+void chip_bus(int silent, uint32_t errors, int overrun)
 {
     silent_bus = silent != 0;
     CAN_ESR = errors;
+    overflow = overrun != 0;
 }
 
 /* Run a millisecond; return how many bytes were sent, which out must hold (4096). */
