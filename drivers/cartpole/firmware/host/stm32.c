@@ -1,9 +1,8 @@
-/* stm32/main.c on this host, with the chip's registers in memory: a shared library for tools/stm32_chip.py.
+/* stm32/main.c on this host, with the chip's registers in memory: a shared library for stm32_device.py.
  *
  * Inputs: encoders, limit switches, the host's bytes or frames. Outputs: bytes or frames, the mean of the motor's PWM
  * and the lamps. A millisecond has 100 turns of the main loop; a byte takes one (1 Mbaud), a frame of the bus its bits
- * at 500 kbit/s. Written from the reference manual as main.c is, so an error in reading it can be in both. One chip a
- * process.
+ * at 500 kbit/s. Its author is that of main.c, so one wrong idea of the chip can be in both. One chip a process.
  */
 #include <string.h>
 
