@@ -453,7 +453,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         without_search(weighted.problem, run.budget, weighted.fit),
         weighted.fit,
     )
-    known = dataclasses.replace(found.known, alarms=(mismatch(weighted.chi2), *found.known.alarms))
+    known = dataclasses.replace(found.known, alarms=(*found.known.alarms, mismatch(weighted.chi2)))
     facts = {**found.facts, "channel_weights": scale}
     return dataclasses.replace(found, chi2=weighted.chi2, known=known, facts=facts)
 

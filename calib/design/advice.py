@@ -346,11 +346,14 @@ def _pairs(low: FloatArray, high: FloatArray) -> tuple[tuple[float, float], ...]
     return tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
 
 
-def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]:
+def next_step(
+    advice: Sequence[Mapping[str, Any]], robot: str = "", dataset: str = "runs/first/dataset"
+) -> list[str]:
     """Return the one thing to do next, in words and as commands.
 
     It is the recording that helps most parameters most; without one, the measurement to make. ``advice`` is
-    :meth:`Advice.to_json` of each open parameter. Commands need a robot that `deal-hw` can record.
+    :meth:`Advice.to_json` of each open parameter. Commands need a robot that `deal-hw` can record. They add
+    to ``dataset``: a recording alone would have no held-out one beside it.
     """
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in advice:
@@ -368,7 +371,8 @@ def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]
     if robot and groups[best][0].get("command"):
         found += [
             f"    deal-hw design-excitation {robot} {groups[best][0]['command']} --out next.json",
-            f"    deal-hw collect {robot} --excite next.json --port PORT --out runs/next",
+            f"    deal-hw collect {robot} --excite next.json --port PORT --dataset {dataset}",
+            f"    deal-hw calibrate {dataset}",
         ]
     if hopeless:
         names = ", ".join(row["parameter"] for row in hopeless)

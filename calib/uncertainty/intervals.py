@@ -331,7 +331,8 @@ def _alarms(
             Alarm(
                 f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
                 "The robot has something that the model lacks: a friction law, backlash or a varying delay.",
-                "Free a parameter for it or repair the hardware; trust predictions more than values.",
+                "Free a parameter for it (--parameters) or repair the hardware; trust predictions more than "
+                "values.",
             )
         )
     ended = ended_at_bound(space, theta)

@@ -70,42 +70,43 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     "friction": (
         "a force against slow motion",
         "Friction depends on speed (Stribeck), or creeps where it should hold.",
-        "Free dof_friction_creep, dof_frictionloss and dof_damping of {}.",
+        "Free dof_friction_creep, dof_frictionloss and dof_damping of {} (--parameters).",
     ),
     "backlash": (
         "play in the gear",
         "The joint does not follow its motor at once when the motor turns back.",
-        "Repair the gear of {}, or free servo_play there in the parameters.",
+        "Repair the gear of {}, or free servo_play there (--parameters).",
     ),
     "delay": (
         "a timing error that changes",
         "The delay of commands or sensors varies; the model's is constant.",
-        "Send commands at an even pace, or time-stamp them where they are received{}.",
+        "End other programs on the computer that sends, send at an even pace, or time-stamp commands where "
+        "they are received{}.",
     ),
     "damping": (
         "a force that grows with speed",
         "Damping was not free, or follows another law (the square of speed).",
-        "Free dof_damping or servo_damping of {}; if they are free already, check the law.",
+        "Free dof_damping or servo_damping of {} (--parameters); if they are free already, check the law.",
     ),
     "inertia": (
         "a force in proportion to acceleration",
         "An inertia or a gain was not free, or its range is too narrow.",
-        "Free dof_armature, body_mass or the actuator's gain of {}.",
+        "Free dof_armature, body_mass or the actuator's gain of {} (--parameters).",
     ),
     "load": (
         "a constant force",
         "A mass, its centre or an encoder's zero was not free.",
-        "Free encoder_bias, body_mass or body_ipos of {}.",
+        "Free encoder_bias, body_mass or body_ipos of {} (--parameters).",
     ),
     "mass": (
         "another mass",
         "The ratio of the bodies' masses is not the model's.",
-        "Weigh {}, correct the model, or free body_mass there.",
+        "Weigh {}, correct the model, or free body_mass there (--parameters).",
     ),
     "contact": (
         "bursts",
-        "The robot touches something that the model does not have.",
-        "Leave out {}.",
+        "The robot may touch something that the model does not have.",
+        "Look at {}. If it touched something, record without that, or leave it out (--data, --leave-out).",
     ),
 }
 """For each cause: how the residual looks, what it means, and what to do, with {} for the place."""
@@ -165,6 +166,7 @@ class Evidence:
         answers: Responses of the windows to commands, per episode; empty if unknown.
         period_s: Sampling period [s].
         time_s: Time of each sample in its recording, per episode (W, H) [s].
+        names: Names of the recordings, per episode.
     """
 
     rows: Sequence[WindowRows]
@@ -173,6 +175,7 @@ class Evidence:
     answers: Sequence[SignatureResponse]
     period_s: float
     time_s: Sequence[FloatArray]
+    names: Sequence[str]
 
 
 def diagnose(problem: Problem, refined: Refined) -> tuple[Diagnosis, ...]:
@@ -202,6 +205,7 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
             np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
             for e, d in zip(episodes, data, strict=True)
         ],
+        names=[e.name for e in episodes],
     )
 
 
@@ -451,13 +455,20 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     every = np.concatenate(values)
     kurtosis = float(np.mean(every**4)) / max(float(np.mean(every**2)) ** 2, 1e-300)
     each, time = np.concatenate(power), np.concatenate([t.ravel() for t in known.time_s])
+    source = np.repeat(known.names, [t.size for t in known.time_s])
     most = np.argsort(-each)[: max(round(SETTINGS.burst_part * len(each)), 1)]
     most = most[each[most] > SETTINGS.burst_size * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))
     if kurtosis < SETTINGS.burst_kurtosis or share < SETTINGS.burst_share:
         return None
     unit_s = 10 * known.period_s
-    stretches = _stretches(sorted({round(t / unit_s) for t in time[most].tolist()}), unit_s)
+    stretches = [
+        f"{name} {stretch}".strip()
+        for name in dict.fromkeys(known.names)
+        for stretch in _stretches(
+            sorted({round(t / unit_s) for t in time[most][source[most] == name].tolist()}), unit_s
+        )
+    ]
     where = ", ".join(stretches[:5]) + (" and more" if len(stretches) > 5 else "")
     deviance = -len(each) * float(np.log(max(1 - share, 1e-300)))
     return _finding("contact", share, deviance, (), where)

@@ -140,10 +140,10 @@ def with_step(
 def with_causes(
     problem: Problem, refined: Refined, known: Uncertainty
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
-    """Add alarms for causes of the residual; return all causes as plain JSON values, too."""
+    """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
     found = diagnose(problem, refined)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
-    return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
+    return dataclasses.replace(known, alarms=(*alarms, *known.alarms)), [dataclasses.asdict(f) for f in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +202,8 @@ def trust(result: CalibrationResult) -> Trust:
             "amber",
             f"{gain} {noise}",
             "The model is better than yours, but it lacks something that the robot has.",
-            "Use it, but trust predictions more than single values.",
+            "Use it, but trust predictions more than single values."
+            + (" The first alarm names the likely cause." if result.provenance.get("diagnosis") else ""),
         )
     if result.alarms:
         many = len(result.alarms)

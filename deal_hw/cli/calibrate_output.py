@@ -84,6 +84,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     from rich.table import Table
 
     from deal_hw.calib.design.advice import next_step
+    from deal_hw.calib.uncertainty.intervals import MISMATCH
     from deal_hw.calib.validation.verdict import trust
 
     table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
@@ -117,9 +118,12 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     console.print(f"[bold]{overall.colour}:[/bold] {overall.sentence}")
     for words in result.null_directions:
         console.print(f"the data do not determine: {words}")
-    for number, line in enumerate(next_step(result.advice, name)):
+    dataset = result.provenance.get("dataset", "runs/first/dataset")
+    # What a recording would tell was predicted by a model that does not explain this one.
+    first = "next, after the causes that alarms name" if result.chi2 > MISMATCH.chi2 else "next"
+    for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
-        console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
+        console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))
     for alarm in result.alarms:
         console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
         console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))

@@ -12,12 +12,12 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.uncertainty.intervals import MISMATCH, with_rows
+from deal_hw.calib.uncertainty.intervals import MISMATCH, uncertainty_at, with_rows
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, name_causes
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
-from deal_hw.calib.validation.verdict import trust
+from deal_hw.calib.validation.verdict import trust, with_causes
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
@@ -89,6 +89,7 @@ def _evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Eviden
         answers=(),
         period_s=PERIOD_S,
         time_s=[(np.arange(WINDOWS * SAMPLES, dtype=np.float64) * PERIOD_S).reshape(WINDOWS, SAMPLES)],
+        names=["rec.csv"],
     )
 
 
@@ -152,7 +153,7 @@ def test_contact_comes_in_bursts() -> None:
         wrong[window, sample : sample + 12] = 20 * STD * rng.normal(size=12)
     found = {f.cause: f for f in _named(wrong)}
     assert "contact" in found
-    assert "0.98-1.07 s, 3.18-3.28 s" in found["contact"].alarm.do
+    assert "rec.csv 0.98-1.07 s, rec.csv 3.18-3.28 s" in found["contact"].alarm.do
 
 
 def test_direction_is_kept_where_a_joint_is_still() -> None:
@@ -272,6 +273,8 @@ def test_a_mass_is_named_with_its_size(tmp_path: Path) -> None:
     found = name_causes(evidence(problem, fit))
     assert found[0].cause == "mass" and "fore" in found[0].joints
     assert "Weigh" in found[0].alarm.do and "heavier" in found[0].alarm.seen
+    known = uncertainty_at(problem, fit, fixed_latency=False)
+    assert known.alarms and with_causes(problem, fit, known)[0].alarms[0] == found[0].alarm
 
 
 def test_play_is_found_and_measured(tmp_path: Path) -> None:

@@ -93,7 +93,8 @@ def test_one_step_is_next_with_its_commands() -> None:
     assert next_step(rows, "cartpole") == [
         "record a chirp: b goes from 60 % to 20 %",
         "    deal-hw design-excitation cartpole --family steps --out next.json",
-        "    deal-hw collect cartpole --excite next.json --port PORT --out runs/next",
+        "    deal-hw collect cartpole --excite next.json --port PORT --dataset runs/first/dataset",
+        "    deal-hw calibrate runs/first/dataset",
         "no recording helps with m: measure it by other means, then --known NAME VALUE",
     ]
     assert next_step([*rows, row("d", 0.3, "steps")])[0] == (
@@ -116,8 +117,16 @@ def test_the_command_makes_the_recording_that_was_reckoned_with(tmp_path: Path) 
 
 def test_what_is_printed_names_the_robot(capsys: pytest.CaptureFixture[str]) -> None:
     """The command that follows a calibration is to be copied; it named the table's last column once."""
-    found = dataclasses.replace(result(k9_space(), "weak"), advice=(row("a", 0.3, "steps"),))
+    found = dataclasses.replace(
+        result(k9_space(), "weak"),
+        advice=(row("a", 0.3, "steps"),),
+        provenance={"dataset": "runs/mine/dataset"},
+    )
     print_result(found, "record another motion", "cartpole")
     said = capsys.readouterr().out
-    assert "deal-hw collect cartpole --excite next.json --port PORT --out runs/next" in said
+    assert "deal-hw collect cartpole --excite next.json --port PORT --dataset runs/mine/dataset" in said
+    assert "    deal-hw calibrate runs/mine/dataset" in said
     assert "collect verdict" not in said
+    assert "next: record steps" in said
+    print_result(dataclasses.replace(found, chi2=9.0), "record another motion", "cartpole")
+    assert "next, after the causes that alarms name: record steps" in capsys.readouterr().out

@@ -276,6 +276,11 @@ HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
         ({"heldout_nrmse": {**HELD, "calibrated": float("nan")}}, "red", "model is worse"),
         ({"heldout_nrmse": {**HELD, "calibrated": 0.07}, "chi2": 4.0}, "red", "model is worse"),
         ({"chi2": 4.0}, "amber", "2.0 times the sensor's noise"),
+        (
+            {"chi2": 4.0, "provenance": {"diagnosis": [{}]}},
+            "amber",
+            "The first alarm names the likely cause.",
+        ),
         ({"chi2": 4.0, "heldout_nrmse": {}}, "red", "no held-out recording shows"),
         ({"chi2": float("nan")}, "amber", "does not test"),
         ({"null_directions": ("a and b",)}, "amber", "do not identify all parameters"),
