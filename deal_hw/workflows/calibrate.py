@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.workflows.calibration.model import DEFAULT, Recordings
 from deal_hw.workflows.calibration.recordings import Source
@@ -240,6 +241,15 @@ def calibrate(
         DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     fit, judges = _listed(data), _listed(holdout)
+    try:
+        fixed = tuple((name, float(value)) for name, value in (known or {}).items())
+        searched = tuple((name, float(low), float(high)) for name, (low, high) in (ranges or {}).items())
+        left_out = tuple((name, float(begin), float(end)) for name, begin, end in leave_out)
+    except (AttributeError, TypeError, ValueError) as err:
+        raise ConfigurationError(
+            'write known={"cart.mass": 0.41}, ranges={"cart.mass": (0.1, 1.0)} and '
+            f'leave_out=[("rec.csv", 1.5, 2.0)] like this; one of them is different ({err})'
+        ) from err
     check_source(dataset=dataset, model=model is not None, data=bool(fit))
     with contextlib.ExitStack() as kept:
         path = None
@@ -255,9 +265,9 @@ def calibrate(
                 model=path,
                 columns=None if columns is None else Path(columns),
                 parameters=None if parameters is None else Path(parameters),
-                feet=tuple(feet),
+                feet=(feet,) if isinstance(feet, str) else tuple(feet),
                 holdout_part=holdout_part,
-                leave_out=tuple(leave_out),
+                leave_out=left_out,
                 fit_seconds=fit_seconds,
                 window=window_s,
                 physics_step=physics_step_s,
@@ -270,9 +280,9 @@ def calibrate(
             method=method,
             policy=policy,
             space=space,
-            free=tuple(free),
-            known=tuple((known or {}).items()),
-            range=tuple((name, low, high) for name, (low, high) in (ranges or {}).items()),
+            free=(free,) if isinstance(free, str) else tuple(free),
+            known=fixed,
+            range=searched,
             range_ratio=range_ratio,
             latency=latency_s,
             latency_range=latency_range_s,

@@ -18,6 +18,7 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
+from deal_hw.workflows.calibration.dataset import choose_episodes
 from deal_hw.workflows.calibration.settings import prepare
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
@@ -144,6 +145,11 @@ def test_episode_cannot_be_fitted_and_held_out(dataset: Path) -> None:
     """A held-out episode must not be seen."""
     with pytest.raises(ConfigurationError, match=r"episodes \[0\] are both fitted and held out"):
         calibrate(settings(dataset, episodes=(0,), holdout=(0,)))
+
+
+def test_an_episode_that_is_named_twice_counts_once(dataset: Path) -> None:
+    """Twice the same data would narrow every interval."""
+    assert choose_episodes(Dataset.open(dataset), (0, 0), (1, 1)) == ((0,), (1,))
 
 
 def test_dataset_of_held_out_episodes_only_is_refused(tmp_path: Path) -> None:

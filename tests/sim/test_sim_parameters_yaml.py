@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
-from deal_hw.sim.parameters.template import template
+from deal_hw.sim.parameters.template import left_at_zero, template
 from deal_hw.sim.parameters.yaml_space import parse_space, read_space, write_space
 
 MODEL = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
@@ -156,6 +156,23 @@ def test_every_line_of_the_template_can_be_switched_on() -> None:
     assert len(lines) > 20
     for line in lines:
         assert len(parse_space("parameters:\n" + line.replace("# - {", "- {", 1), MODEL)) == 1
+
+
+def test_what_is_zero_is_not_searched_and_is_named() -> None:
+    """No ratio leads away from 0. A servo's kv is a joint's damping; a plain joint has none."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="knee" armature="0.1"/><geom size="1"/>
+        <body><joint name="foot" damping="0.2" frictionloss="0.1"/><geom size="1"/></body></body></worldbody>
+        <actuator><position name="m" joint="knee" kp="9" kv="1"/></actuator></mujoco>"""
+    )
+    assert left_at_zero(model) == {"dof_frictionloss": ["knee"], "dof_armature": ["foot"]}
+    assert {p.name for p in parse_space(template(model), model)} == {
+        "foot.frictionloss",
+        "foot.damping",
+        "knee.armature",
+        "m.servo_stiffness",
+        "m.servo_damping",
+    }
 
 
 def test_template_of_a_model_with_nothing_to_search_says_so() -> None:

@@ -15,6 +15,8 @@ import deal_hw
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.model import Recordings, searched_space
+from deal_hw.workflows.calibration.run import SpaceOverrides
 
 Arrays = dict[str, FloatArray]
 T = np.arange(400) * 0.01
@@ -101,6 +103,8 @@ def test_models_in_memory(pendulum: tuple[Path, Path, Path], tmp_path: Path) -> 
         deal_hw.calibrate(compiled, data, **settings)
     with pytest.raises(ConfigurationError, match="model is of type int"):
         deal_hw.calibrate(7, data, **settings)
+    with pytest.raises(ConfigurationError, match=r"mujoco.MjSpec.from_string\(text\)"):
+        deal_hw.calibrate(model.read_text(encoding="utf-8"), data, **settings)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +119,10 @@ def test_models_in_memory(pendulum: tuple[Path, Path, Path], tmp_path: Path) -> 
         (
             [{"time": T, "position": np.zeros((400, 1)), "target": np.zeros((399, 1))}],
             "which channel is the time of 'target', which has 399 rows and not those of the time",
+        ),
+        (
+            [{"time": T, "position": np.zeros((1, 400)), "target": np.zeros((1, 400))}],
+            r"data\[0\]\['position'\] has shape \(1, 400\), but there are 400 times; .* its transpose",
         ),
         (
             [{"time": T, "position": np.zeros((400, 3)), "target": np.zeros((400, 3))}],
@@ -140,6 +148,52 @@ def test_recordings_that_are_none_are_refused(
     """Each says which recording, what was given and what is allowed."""
     with pytest.raises(DealHwError, match=words):
         deal_hw.calibrate(pendulum[0], data)
+
+
+def test_what_the_model_has_as_zero_is_said(pendulum: tuple[Path, Path, Path]) -> None:
+    """It is not searched by default; the user's own list of parameters says all by itself."""
+    model = mujoco.MjModel.from_xml_path(str(pendulum[0]))
+    model.dof_frictionloss[:] = 0
+    said: list[str] = []
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=None)
+    searched_space(Recordings(), overrides, model, said.append)
+    assert said == [
+        "not searched, because they are 0 in the model: dof_frictionloss of pivot. If the robot has them, "
+        "write values above 0 into the MJCF"
+    ]
+
+
+def test_a_copy_is_neither_fitted_twice_nor_held_out(
+    pendulum: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    """By its samples, whatever its name and format: a copy would judge itself, and narrow the intervals."""
+    model, fit, _ = pendulum
+    data: dict[str, Any] = dict(arrays_of(fit))
+    copy = tmp_path / "other.npz"
+    np.savez(copy, **data)
+    with pytest.raises(ConfigurationError, match=r"holdout\[0\] is a copy of data\[0\]; .* fitted and held"):
+        deal_hw.calibrate(model, data, holdout=data)
+    with pytest.raises(ConfigurationError, match=r"other.npz is a copy of .*csv; a copy counts twice"):
+        deal_hw.calibrate(model, [fit, copy])
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"known": ["pivot.damping"]}, "known={"),
+        ({"known": {"pivot.damping": "soft"}}, "could not convert string to float: 'soft'"),
+        ({"ranges": {"pivot.damping": (1, 2, 3)}}, "ranges={"),
+        ({"leave_out": ("rec.csv", 1, 2)}, "leave_out="),
+        ({"free": "pivot.dampin"}, "unknown parameter 'pivot.dampin'"),
+        ({"holdout": 1}, "--holdout 1: with --model give recordings; episode numbers go with a dataset"),
+    ],
+)
+def test_arguments_of_another_shape_are_refused(
+    pendulum: tuple[Path, Path, Path], given: dict[str, Any], words: str
+) -> None:
+    """The message shows the right shape."""
+    with pytest.raises(DealHwError, match=words):
+        deal_hw.calibrate(pendulum[0], pendulum[1], **given)
 
 
 def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, Path]) -> None:

@@ -182,7 +182,8 @@ class Dataset:
         """
         if not -len(self.episodes) <= index < len(self.episodes):
             raise DatasetError(
-                f"dataset {self.folder} has {len(self.episodes)} episodes; there is no number {index}"
+                f"dataset {self.folder} has {len(self.episodes)} episodes; there is no number {index} (the "
+                "first is 0)"
             )
         return self.folder / self.episodes[index].file
 

@@ -20,8 +20,12 @@ def mjcf_file(model: Any, folder: Path) -> Path:
         folder: Output folder.
 
     Raises:
-        ConfigurationError: It has another type, or is not the last compiled model.
+        ConfigurationError: It has another type, is XML text, or is not the last compiled model.
     """
+    if isinstance(model, str) and model.lstrip().startswith("<"):
+        raise ConfigurationError(
+            "the model is XML text; give its file's path, or mujoco.MjSpec.from_string(text)"
+        )
     if isinstance(model, str | Path):
         return Path(model)
     path = folder / "model.xml"

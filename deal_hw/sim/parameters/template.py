@@ -27,7 +27,7 @@ _ON = (
     "servo_damping",
     "motor_gain",
 )
-_OFF = ("servo_effort_limit", "encoder_bias", "body_mass")
+_OFF = ("dof_friction_creep", "servo_effort_limit", "encoder_bias", "body_mass")
 
 
 def template(model: Any, title: str = "this model") -> str:
@@ -51,6 +51,22 @@ def template(model: Any, title: str = "this model") -> str:
             "name them in the MJCF and give them values"
         )
     return "".join(lines)
+
+
+def left_at_zero(model: Any) -> dict[str, list[str]]:
+    """Return the joints whose friction, damping or armature is 0: the template does not search these.
+
+    A joint whose servo has a damping above 0 needs no other.
+    """
+    servos = [name for name, value, _ in _rows(model, KIND_TABLE["servo_damping"]) if value > 0]
+    damped = {model.joint(joint_of(model, element_id(model, "actuator", name))).name for name in servos}
+    found = {}
+    for kind in ("dof_frictionloss", "dof_damping", "dof_armature"):
+        served = damped if kind == "dof_damping" else ()
+        found[kind] = [
+            name for name, value, _ in _rows(model, KIND_TABLE[kind]) if value == 0 and name not in served
+        ]
+    return {kind: joints for kind, joints in found.items() if joints}
 
 
 def _section(model: Any, kind: Kind, *, active: bool) -> list[str]:

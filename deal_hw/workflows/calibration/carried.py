@@ -62,7 +62,7 @@ def prepare_carried(
         {i: dataset.read(i).trajectory for i in (*fit, *held)}, source.folder, source.spikes, say
     )
     model = compile_mjcf(description.mjcf)
-    space = searched_space(config, overrides, model)
+    space = searched_space(config, overrides, model, say)
     timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
     rates = sampling(1.0 / description.state_rate_hz, timestep, config.window)
     description = dataclasses.replace(

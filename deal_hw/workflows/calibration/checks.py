@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 GRAVITY_EXPLAINED, GRAVITY_LEAST, GRAVITY_ERRORS = 0.5, 0.01, 4.0
 """Gravity must explain this share of a deviation of at least this size [rad, m], or no gain is reported. A
 contradiction counts from this many standard errors on."""
+REQUIRED_CHECKS = ("size", "finite", "clock", "rate", "commands")
+"""Checks without which a recording has no time grid: --force does not overrule them."""
 MOTOR_CHECKS = (
     "size",
     "finite",
@@ -111,8 +113,10 @@ def examine_recording(
         try:
             require(found, table.name)
         except DatasetError as err:
+            if any(v.severity is Severity.FAIL and v.name in REQUIRED_CHECKS for v in found):
+                raise
             raise DatasetError(
-                f"{err}. Correct the column map, or use the recording all the same with --force"
+                f"{err}. Correct the recording or its column map, or use it all the same with --force"
             ) from err
     return found
 

@@ -167,14 +167,16 @@ def choose_episodes(
     every = range(len(dataset.episodes))
     metadata = [dataset.read(i).metadata for i in every]
     judges = (i for i in every if motion_of(metadata[i]) == HELDOUT_MOTION and i not in episodes)
-    held = tuple(holdout) or tuple(judges)
+    # An episode that is named twice must not count twice.
+    episodes, holdout = tuple(dict.fromkeys(episodes)), tuple(dict.fromkeys(holdout))
+    held = holdout or tuple(judges)
     repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
     if repeated:
         say(
             f"episodes {repeated} hardly moved and were recorded again, so they are not fitted (--episodes "
             "overrides this)"
         )
-    fit = tuple(episodes) or tuple(i for i in every if i not in held and i not in repeated)
+    fit = episodes or tuple(i for i in every if i not in held and i not in repeated)
     both = sorted(set(fit) & set(held))
     if both:
         raise ConfigurationError(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
-from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.errors import ConfigurationError, MissingExtraError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.checks import (
@@ -26,6 +26,7 @@ from deal_hw.workflows.calibration.recordings import (
     divide,
     named_on_grid,
     read_tables,
+    refuse_copies,
     seconds_of,
     without,
 )
@@ -172,13 +173,14 @@ def prepare_model(
         )
 
     model = compile_mjcf(config.model)
-    space = searched_space(config, overrides, model)
+    space = searched_space(config, overrides, model, say)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
     fitted, held = (
         read_tables(sources, columns, facts.names, say, name)
         for name, sources in (("data", data), ("holdout", holdout))
     )
+    refuse_copies([*fitted, *held])
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
@@ -294,17 +296,23 @@ def heldout_share(config: Recordings, holdout: Sequence[object]) -> float:
     return share
 
 
-def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any) -> ParameterSpace:
-    """Return the parameters to search of a user's model.
+def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any, say: Say) -> ParameterSpace:
+    """Return the parameters to search of a user's model; report what is not searched as it is 0 there.
 
     Raises:
         ConfigurationError: The parameter file, or a change of the parameters, cannot be used.
     """
     from deal_hw.sim.parameters import check_space
-    from deal_hw.sim.parameters.template import template
+    from deal_hw.sim.parameters.template import left_at_zero, template
     from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
     if config.parameters is None:
+        zero = [f"{kind} of {short(', '.join(names))}" for kind, names in left_at_zero(model).items()]
+        if zero:
+            say(
+                f"not searched, because they are 0 in the model: {'; '.join(zero)}. If the robot has them, "
+                "write values above 0 into the MJCF"
+            )
         space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
     else:
         space = read_space(config.parameters, model)

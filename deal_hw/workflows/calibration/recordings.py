@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.calibration.checks import REQUIRED_CHECKS
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.columns import ColumnMap
@@ -48,6 +50,22 @@ def read_tables(
     return tables
 
 
+def refuse_copies(tables: Sequence[Table]) -> None:
+    """Refuse recordings that hold the same samples, whatever their names and formats.
+
+    Raises:
+        ConfigurationError: Two of them do.
+    """
+    for this, other in itertools.combinations(tables, 2):
+        if np.array_equal(this.position, other.position, equal_nan=True) and np.array_equal(
+            this.target, other.target, equal_nan=True
+        ):
+            raise ConfigurationError(
+                f"{other.name} is a copy of {this.name}; a copy counts twice, and can be fitted and held out "
+                "at the same time. Leave it out"
+            )
+
+
 def common_rates(
     tables: Sequence[Table], model: Any, physics_step_s: float | None, window_s: float
 ) -> Sampling:
@@ -77,8 +95,7 @@ def common_rates(
                 "separately"
             )
         # An invalid clock has no period; report it before anything else fails on it.
-        early = ("size", "finite", "clock", "rate", "commands")
-        require([v for v in examine(table) if v.name in early], table.name)
+        require([v for v in examine(table) if v.name in REQUIRED_CHECKS], table.name)
     timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
     return sampling(common_period(tables), timestep, window_s)
 

@@ -53,11 +53,13 @@ class CalibrateSettings(Checked):
     recordings: Recordings = field(default_factory=Recordings)
 
     episodes: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
-    """Episodes of the dataset to fit; by default all but the held-out ones."""
+    """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out
+    ones."""
 
     holdout: Annotated[tuple[int | Path, ...], Range(0, 1_000_000)] = ()
-    """Held-out data, which only test the result: episodes of the dataset (by default those collected with
-    --motion chirp), or with --model recordings (by default the last part of each, --holdout-part)."""
+    """Held-out data, which only test the result: numbers of episodes of the dataset (the first is 0), or with
+    --model recordings. By default the episodes collected with --motion chirp; if there is none and the robot
+    is your own, the last part of each recording (--holdout-part)."""
 
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
     """Held-out predictions restart from the measured state after this time [s]."""
@@ -251,9 +253,14 @@ def prepare(
     judges = settings.holdout if holdout is None else holdout
     spikes = SpikeSettings(ratio=settings.spike_ratio)
     if settings.recordings.model is not None:
+        numbers = " ".join(str(one) for one in judges if isinstance(one, int))
+        if numbers:
+            raise ConfigurationError(
+                f"--holdout {numbers}: with --model give recordings; episode numbers go with a dataset"
+            )
         return prepare_model(
             settings.recordings,
-            [Path(str(one)) if isinstance(one, int) else one for one in judges],
+            judges,
             settings.overrides,
             std=settings.known_std,
             data=data,
