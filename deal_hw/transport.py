@@ -133,29 +133,26 @@ class TransportWrapper(Transport):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WireOptions:
-    """How a topic transport reaches its peers, beyond the port.
-
-    Attributes:
-        domain: Number of the DDS domain.
-        listen: Whether to wait for peers at the port (Zenoh) instead of connecting to them.
-        mode: Zenoh session mode, "peer" or "client"; "": peer if it listens, else client. Two clients of one
-        listener receive each other's messages; two peers do not, so another program's commands would stay
-        unnoticed.
-        insecure: Whether plain TCP to another machine is allowed.
-        ca: Authority that signed the peers' certificates (PEM).
-        certificate: This side's certificate (PEM), which the peer checks.
-        key: Its private key (PEM).
-    """
+    """How a topic transport reaches its peers, beyond the port."""
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
     domain: int = 0
+    """Number of the DDS domain."""
     listen: bool = False
+    """Wait for peers at the port instead of connecting to them (zenoh)."""
     mode: str = ""
+    """Zenoh session mode, peer or client; by default peer with --listen, else client. Two clients of one
+    listener receive each other's messages. Two peers do not, so another program's commands would stay
+    unnoticed."""
     insecure: bool = False
+    """Allow plain TCP to another machine (zenoh)."""
     ca: Path | None = None
+    """Authority that signed the peers' certificates (PEM)."""
     certificate: Path | None = None
+    """This side's certificate (PEM), which the peer checks."""
     key: Path | None = None
+    """Private key of the certificate (PEM)."""
 
     def __post_init__(self) -> None:
         if self.mode not in ("", "peer", "client"):

@@ -13,7 +13,7 @@ from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
 from deal_hw.workflows.calibration.recordings import on_grid
 from deal_hw.workflows.options import Checked, Range, given, refuse
-from deal_hw.workflows.robot import load_robot, recorded_robot
+from deal_hw.workflows.robot import is_ours, load_robot, recorded_robot
 from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
@@ -115,6 +115,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     }
     if robot is None and described is None and config.model is not None:
         robot = derived_robot(config.model, config.name, tables)
+    elif facts is None and described is None and not is_ours(config.name or config.paths[0].stem):
+        say(
+            "no model is given, so `calibrate` and `inspect` cannot use the dataset: add --model robot.xml "
+            "or --robot robot.yaml"
+        )
     period = common_period(checked)
     if robot is None:
         recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
@@ -127,7 +132,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         stretch = f", stretch {how['stretch'] + 1} of {how['stretches']}" if how["stretches"] > 1 else ""
         say(
             f"{how['file']}{stretch}: {part.trajectory.duration_s:.4g} s at {1 / period:.6g} Hz, samples "
-            f"{how['method']}, largest shift {how['largest_shift_s'] * 1e3:.3g} ms"
+            f"{how['method']}, largest shift {how['largest_shift_s'] * 1e3:.3f} ms"
         )
     # The source of each new episode, as it is noted in the dataset.
     sources = [_source(e.path.name, digest_of_file(e.path)) for e in episodes]

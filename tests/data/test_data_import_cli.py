@@ -153,11 +153,25 @@ def test_import_refuses_what_is_not_plausible(
     assert "fail assignment" in capsys.readouterr().err
 
 
-def test_import_with_a_description_and_dry_run(recording: Path, tmp_path: Path) -> None:
+def test_force_is_not_advised_where_it_would_not_help(recording: Path, tmp_path: Path) -> None:
+    """A recording of a second has no rate to trust: no option overrules that, and none is named."""
+    lines = recording.read_text(encoding="utf-8").splitlines()
+    recording.write_text("\n".join(lines[:100]) + "\n", encoding="utf-8")
+    (tmp_path / "robot.xml").write_text(MODEL)
+    for force in (False, True):
+        with pytest.raises(DatasetError, match="record at least 2 s") as refused:
+            data(Import(paths=(recording,), out=tmp_path / "out", model=tmp_path / "robot.xml", force=force))
+        assert "--force" not in str(refused.value)
+
+
+def test_import_with_a_description_and_dry_run(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A description orders the joints and is kept as given; a dry run writes nothing."""
     first = tmp_path / "first"
     assert data(Import(paths=(recording,), out=first, dry_run=True)) == 0
     assert not first.exists()
+    assert "`calibrate` and `inspect` cannot use the dataset: add --model" in capsys.readouterr().err
     data(Import(paths=(recording,), out=first, name="leg"))
     description = Dataset.open(first).description
     path = tmp_path / "description.json"

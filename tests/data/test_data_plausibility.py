@@ -242,6 +242,9 @@ def test_wrong_order_names_the_permutation(make_table: MakeTable, order: tuple[i
         named = f"the measurement of {mine} follows the command of {its}"
         assert (named in found.message) == (joint != source)
     assert found.message.startswith("joints seem to be in another order: ")
+    assert found.message.count("the measurement of") == sum(
+        joint != source for joint, source in enumerate(order)
+    )
     assert "sign" not in found.message
 
 

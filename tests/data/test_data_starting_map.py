@@ -40,13 +40,18 @@ def test_unknown_channels_give_a_map_that_is_read_once_its_columns_are_named(tmp
 
 
 def test_an_unknown_time_and_no_model_leave_their_places_open(tmp_path: Path) -> None:
-    """Neither is invented."""
+    """Neither is invented. The joints are filled in although the time is unknown."""
     path = tmp_path / "a.csv"
-    path.write_text("zeit,a_pos\n0,1\n1,5\n", encoding="utf-8")
+    path.write_text("zeit,b\n0,1\n1,5\n", encoding="utf-8")
     assert printed(path, None) == [
         "  time: {column: COLUMN, unit: s}",
         "  joints:",
         '    - {name: "JOINT", position: COLUMN, target: COLUMN, unit: rad}',
+    ]
+    path.write_text("zeit,boom_pos,boom_cmd\n0,1,2\n1,5,6\n", encoding="utf-8")
+    assert printed(path)[2:] == [
+        '    - {name: "boom", position: "boom_pos", target: "boom_cmd", unit: "rad"}',
+        '    - {name: "stick", position: COLUMN, target: COLUMN, unit: rad}',
     ]
 
 

@@ -140,15 +140,15 @@ def _assignment(found: _Match, at: int) -> CheckResult:
         gain = float(np.mean(score - before))
         if gain < CLEAR or float(np.min(score)) < GOOD:
             continue
+        pairs = _pairs(found, C, order, moved)
+        if best is not None and pairs in best[1]:
+            continue
         # Wrong signs alone also explain it. They are simpler, so another order must explain clearly more.
         if best is not None and (kind == "both" or gain < best[0] + CLEAR / 2):
-            best = best[0], f"{best[1]}; or joints are swapped: {_pairs(found, C, order, moved)}"
+            best = best[0], f"{best[1]}; or joints are swapped: {pairs}"
             continue
         if best is None:
-            best = (
-                gain,
-                f"joints seem to be in another order: {_pairs(found, C, order, moved)}",
-            )
+            best = gain, f"joints seem to be in another order: {pairs}"
     if best is not None:
         return CheckResult("assignment", Severity.FAIL, best[1])
     against = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < -GOOD]

@@ -50,7 +50,9 @@ class _Guess:
     unit: str
 
 
-def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> ColumnMap:
+def guess_columns(
+    channels: Channels, joints: Sequence[str] | None = None, time: TimeColumn | None = None
+) -> ColumnMap:
     """Guess what the channels of a file mean.
 
     Known layouts: one channel per joint, with the joint's name and a word such as ``_pos``, ``_target``,
@@ -61,13 +63,16 @@ def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> Co
     Args:
         channels: The file's channels.
         joints: Names of the model's joints; None: the file's names.
+        time: The time; None: guessed, too.
 
     Raises:
         DatasetError: No time or no joint can be found; the message names the channels.
     """
-    time = guess_time(channels)
+    time = time or guess_time(channels)
     if time is None:
-        raise unguessed(channels, "which channel is the time")
+        raise unguessed(
+            channels, "which channel is the time (if there is none, add one with the time of each sample)"
+        )
     guesses = [_read_name(name, joints or ()) for name in channels.arrays]
     arrays = {
         guess.role: guess

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 
 from deal_hw.data.importing.channels import Channels
-from deal_hw.data.importing.columns import ColumnMap, JointColumns
-from deal_hw.data.importing.guess import guess_time
+from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
+from deal_hw.data.importing.guess import guess_columns, guess_time
+from deal_hw.errors import DatasetError
 
 COLUMN = "COLUMN"
 """Stands for a name that the user writes."""
@@ -22,9 +24,13 @@ def starting_map(
     Args:
         channels: The file's channels.
         joints: Names of the model's joints; None: unknown.
-        guessed: The entries that were guessed; None: none but the time.
+        guessed: The entries that were guessed; None: no complete map was.
     """
     time = guess_time(channels) if guessed is None else guessed.time
+    if time is None:
+        # The joints may be known although the time is not.
+        with contextlib.suppress(DatasetError):
+            guessed = guess_columns(channels, joints, TimeColumn(column=COLUMN))
     known = {} if guessed is None else {joint.name: joint for joint in guessed.joints}
     stamps = {"time": time, "command_time": guessed.command_time if guessed else None}
     lines = [
