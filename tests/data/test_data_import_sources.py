@@ -54,7 +54,13 @@ def test_csv_named_like_the_joints_needs_no_map(tmp_path: Path) -> None:
     assert table.velocity is not None and np.isnan(table.velocity[:, 1]).all()
     assert table.velocity[:, 0].tolist() == [7, 8, 9]
     whole = "\n".join(told)
-    for words in ("text are left out: note", "guessed", "time_ms [ms]", "elbow_pos_deg", "[deg]"):
+    for words in (
+        "text are left out: note",
+        "guessed",
+        '"time_ms", unit: ms',
+        "elbow_pos_deg",
+        'unit: "deg"',
+    ):
         assert words in whole
     assert table.source["sha256"] and table.source["columns"] == ["guessed"]
 

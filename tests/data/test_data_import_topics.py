@@ -136,7 +136,7 @@ def test_measured_and_sent_are_found(
     # An array has no header, so its times and those that it is compared with are the recorder's.
     np.testing.assert_allclose(table.command_s, table.time_s, atol=1e-9)
     whole = "\n".join(told)
-    assert "guessed" in whole and TOPICS[kind] in whole and "position: /joint_states.position" in whole
+    assert "guessed" in whole and TOPICS[kind] in whole and 'position: "/joint_states.position"' in whole
 
 
 def states(number: int, topic: str = "/joint_states") -> tuple[str, str, dict[str, Any]]:
@@ -161,7 +161,7 @@ def test_a_controllers_state_comes_before_its_goals(tmp_path: Path) -> None:
     rows = [[states(n), commands(n, CONTROLLER), commands(n, TRAJECTORY)] for n in range(5)]
     told: list[str] = []
     load_tables(bag(tmp_path / "bag.mcap", rows), say=told.append)
-    assert any("target: /jtc/controller_state.reference.positions" in line for line in told)
+    assert any('target: "/jtc/controller_state.reference.positions"' in line for line in told)
 
 
 @pytest.mark.parametrize(

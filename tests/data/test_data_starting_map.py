@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deal_hw.data.importing.columns import read_column_map
@@ -66,3 +67,26 @@ def test_a_joint_that_was_not_found_is_added_to_the_guessed_ones(header: str, tm
     assert table.position[:, 0].tolist() == guessed.position[:, 0].tolist()
     assert table.position[:, 0] == pytest.approx([3.14159265, 1.57079633])
     assert table.position[:, 1].tolist() == [3, 7] and table.time_s.tolist() == [0, 0.01]
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "t_ms,boom_pos_deg,boom_cmd_deg,stick_pos,stick_cmd_deg,boom_vel",
+        "time,stick,boom_actual_deg,boom_cmd_rad,stick_cmd,x",
+    ],
+)
+def test_a_guess_is_printed_as_the_map_that_says_the_same(header: str, tmp_path: Path) -> None:
+    """A user who has to turn one sign saves the lines and changes one entry; units of targets stay."""
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n0,1,2,3,4,5\n10,6,8,7,9,10\n", encoding="utf-8")
+    said: list[str] = []
+    (guessed,) = load_tables(path, joints=JOINTS, say=said.append)
+    assert "no column map given; this one was guessed" in said[0]
+    text = "\n".join(line for line in said if line.startswith("  "))
+    (tmp_path / "columns.yaml").write_text(text, encoding="utf-8")
+    (read,) = load_tables(path, read_column_map(tmp_path / "columns.yaml"), JOINTS)
+    np.testing.assert_array_equal(read.position, guessed.position)
+    np.testing.assert_array_equal(read.target, guessed.target)
+    np.testing.assert_array_equal(read.time_s, guessed.time_s)
+    assert (read.velocity is None) == (guessed.velocity is None)

@@ -84,26 +84,6 @@ def guess_columns(
     return _from_columns(channels, time, guesses, joints)
 
 
-def describe(columns: ColumnMap) -> list[str]:
-    """Return the entries of a column map, one line each, for the operator to check."""
-    lines = [f"time: {columns.time.column} [{columns.time.unit}]"]
-    if columns.command_time is not None:
-        lines.append(f"time of commands: {columns.command_time.column} [{columns.command_time.unit}]")
-    for kind in ("position", "target", "velocity", "effort"):
-        pattern = getattr(columns, kind)
-        if pattern:
-            lines.append(f"{kind}: {pattern}")
-    for joint in columns.joints:
-        own = [f"{kind} {getattr(joint, kind)}" for kind in ("position", "target", "velocity", "effort")]
-        own = [text for text in own if not text.endswith(" None")]
-        if not own:
-            place = "" if joint.index is None else f"column {joint.index} of the arrays, "
-            own = [f"{place}in the file {joint.column or joint.name}"]
-        unit = "normalised" if joint.normalised else joint.unit
-        lines.append(f"joint {joint.name}: {', '.join(own)} [{unit}]")
-    return lines
-
-
 def _read_name(channel: str, joints: Iterable[str]) -> _Guess:
     words = [word for word in _SPLIT.split(channel) if word]
     lower = [word.lower() for word in words]

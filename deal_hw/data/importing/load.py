@@ -13,7 +13,7 @@ from deal_hw.data.importing.columns import ColumnMap
 from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.data.importing.episode_source import read_own
 from deal_hw.data.importing.grid import Gains, Recording, common_period, to_trajectories
-from deal_hw.data.importing.guess import describe, guess_columns
+from deal_hw.data.importing.guess import guess_columns
 from deal_hw.data.importing.guess_topics import guess_topics
 from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 from deal_hw.data.importing.mcap_source import read_mcap
@@ -196,8 +196,18 @@ def _guess(channels: Channels, joints: Sequence[str] | None, say: Say | None) ->
         raise
 
 
-def _say_map(say: Say, channels: Channels, joints: Sequence[str] | None, guessed: ColumnMap | None) -> None:
-    say(f"{channels.path.name}: a column map to start from; save it as columns.yaml, and replace COLUMN:")
+_INCOMPLETE = "a column map to start from; save it as columns.yaml, and replace COLUMN:"
+_GUESSED = "no column map given; this one was guessed (to change it, save it and name it by --columns):"
+
+
+def _say_map(
+    say: Say,
+    channels: Channels,
+    joints: Sequence[str] | None,
+    guessed: ColumnMap | None,
+    title: str = _INCOMPLETE,
+) -> None:
+    say(f"{channels.path.name} {channels.part}".strip() + f": {title}")
     for line in starting_map(channels, joints, guessed):
         say(f"  {line}")
 
@@ -209,12 +219,9 @@ def _tell(
     for note in channels.notes:
         say(f"{name}: {note}")
     if guessed:
-        say(f"{name}: no column map given; guessed:")
-        for line in describe(columns):
-            say(f"  {line}")
-        if not (columns.target or any(joint.target for joint in columns.joints)):
-            say("  no commanded positions found")
         missing = [joint for joint in joints or () if joint not in {known.name for known in columns.joints}]
         if missing:
-            say(f"  not in the file: {', '.join(missing)}; its channels: {channels.listed()}")
-            _say_map(say, channels, joints, columns)
+            say(f"{name}: not in the file: {', '.join(missing)}; its channels: {channels.listed()}")
+        if not (columns.target or any(joint.target for joint in columns.joints)):
+            say(f"{name}: no commanded positions found")
+        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED)

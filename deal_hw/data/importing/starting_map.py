@@ -1,4 +1,4 @@
-"""Writes a column map to start from, for a file whose channels were not guessed, or not all of them."""
+"""Writes a guessed column map as a user would, with places to fill where channels were not guessed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def starting_map(
 def _entries(name: str, joint: JointColumns | None) -> str:
     if joint is None:
         return f"name: {json.dumps(name)}, position: {COLUMN}, target: {COLUMN}, unit: rad"
-    values = {key: getattr(joint, key) for key in ("name", "column", "index", *_QUANTITIES, "unit")}
+    values = {
+        key: getattr(joint, key) for key in ("name", "column", "index", *_QUANTITIES, "unit", "target_unit")
+    }
     return ", ".join(
         f"{key}: {json.dumps(value)}" for key, value in values.items() if value not in (None, "")
     )

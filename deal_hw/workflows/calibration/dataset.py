@@ -102,7 +102,7 @@ def prepare_dataset(
             "episodes": list(fit),
             "holdout": list(holdout),
         },
-        advice="`deal-hw collect --motion chirp` records one",
+        advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {source.folder}",
         balance=balancer(robot.description, None),
         name="" if robot.base is not None else robot.description.name,
         policy=policy,
