@@ -225,13 +225,19 @@ def trust(result: CalibrationResult) -> Trust:
         )
     unidentified = result.verdicts.count("not identifiable")
     if result.null_directions or unidentified:
+        advised = " Or record the motion advised below." if result.advice else ""
+        if not unidentified:
+            return Trust(
+                "amber",
+                f"{gain} {noise}",
+                "The model explains the recordings, but they hardly tell some parameters apart.",
+                f"Use it. To narrow intervals, measure one of the parameters named together below.{advised}",
+            )
         return Trust(
             "amber",
-            f"{gain} {noise}"
-            + (f" {unidentified} of {len(result.space)} parameters have no value." if unidentified else ""),
+            f"{gain} {noise} {unidentified} of {len(result.space)} parameters have no value.",
             "The model explains the recordings, but they do not identify all parameters.",
-            "Use it: training draws these parameters from their whole range. Or record the motion advised "
-            "below.",
+            f"Use it: training draws these parameters from their whole range.{advised}",
         )
     if record:
         return Trust(
