@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,10 +16,11 @@ from deal_hw.cli.calibrate_output import print_files
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
-from deal_hw.workflows.calibration.dataset import choose_episodes
+from deal_hw.testing.simulated_episode import simulated_episode
+from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
 from deal_hw.workflows.calibration.settings import prepare
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
@@ -34,6 +36,21 @@ def record(folder: Path, runs: list[tuple[str, Behaviour, float]]) -> Path:
             )
             store.note_episode(path)
     return folder
+
+
+@pytest.mark.parametrize(("sent", "searched"), [(8.0, False), (1.0, True)])
+def test_a_drive_whose_set_points_the_host_moves_has_no_speed_limit(sent: float, searched: bool) -> None:
+    """Commands of an ODrive carry its own 8 m/s. 20 mm in the device's period of 1 ms are 20 m/s."""
+    made = simulated_episode(DESCRIPTION, k9_space(), k9_space().nominal, seconds=1.0, seed=1)
+    steps = 0.02 * np.arange(len(made.position_target))[:, None]
+    recorded = dataclasses.replace(
+        made, speed_limit=np.full_like(made.speed_limit, sent), position_target=steps
+    )
+    said: list[str] = []
+    space = without_speed_limits(k9_space(), DESCRIPTION, [recorded], said.append)
+    assert ("servo.speed_limit" in space.names) == searched
+    assert space["servo.speed_limit"].nominal == pytest.approx(1.0 if searched else 20.0)
+    assert len(said) == (not searched)
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from deal_hw.calib.methods import CLOSED_LOOP_METHODS
+from deal_hw.calibration import listed
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.description import RobotDescription
@@ -84,6 +87,7 @@ def prepare_dataset(
     recordings, verdicts = sound_recordings(
         {i: episode.trajectory for i, episode in episodes_read.items()}, source.folder, source.spikes, say
     )
+    space = without_speed_limits(space, description, recordings.values(), say)
     names = {i: dataset.path(i).name for i in recordings}
     robot, episodes = _simulation(description, recordings, names, source.sample_hz)
     walks = all_walk(robot, recordings.values())
@@ -108,6 +112,30 @@ def prepare_dataset(
         policy=policy,
         walks=walks,
     )
+
+
+def without_speed_limits(
+    space: ParameterSpace, description: RobotDescription, trajectories: Iterable[Trajectory], say: Say
+) -> ParameterSpace:
+    """Return the space without the speed limits of servos whose set-points the host moves (ODrive).
+
+    The commands to such a drive carry its own limit, which is above the range of a servo's. Its set-point
+    jumps with each command. The known value is so high that the model's does, too.
+    """
+    every = list(trajectories)
+    numbers = {joint: number for number, joint in enumerate(description.actuated)}
+    known = {}
+    for p in space:
+        if p.kind != "servo_speed_limit":
+            continue
+        columns = [numbers[joint] for joint in p.elements]
+        sent = np.concatenate([t.speed_limit[:, columns].ravel() for t in every])
+        if sent.size and np.nanmin(sent) > p.high:
+            steps = [np.abs(np.diff(t.position_target[:, columns], axis=0)).max(initial=0.0) for t in every]
+            known[p.name] = max(float(np.nanmin(sent)), description.device_rate_hz * float(np.nanmax(steps)))
+    if known:
+        say(f"{listed(list(known))}: not searched, because the host limits the speed of these set-points")
+    return space.with_known(known)
 
 
 def sound_recordings(
