@@ -42,7 +42,7 @@ def record(folder: Path, runs: list[tuple[str, Behaviour, float]]) -> Path:
 def test_a_drive_whose_set_points_the_host_moves_has_no_speed_limit(sent: float, searched: bool) -> None:
     """Commands of an ODrive carry its own 8 m/s. 20 mm in the device's period of 1 ms are 20 m/s."""
     made = simulated_episode(DESCRIPTION, k9_space(), k9_space().nominal, seconds=1.0, seed=1)
-    steps = 0.02 * np.arange(len(made.position_target))[:, None]
+    steps = np.linspace(0.0, 0.02 * (len(made.position_target) - 1), len(made.position_target))[:, None]
     recorded = dataclasses.replace(
         made, speed_limit=np.full_like(made.speed_limit, sent), position_target=steps
     )
