@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 import tty
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 
 import can
@@ -378,6 +381,35 @@ def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     trajectory = Dataset.open(tmp_path / "run" / "dataset").read(0).trajectory
     assert trajectory.position.shape[0] >= 180
     assert np.isfinite(trajectory.position).all()
+
+
+def test_python_can_logs_the_bus_and_cantools_decodes_it(tmp_path: Path) -> None:
+    """Other people's programs at the emulator's port: python-can's slcan and logger, cantools' `decode`."""
+    log = tmp_path / "candump.log"
+    with (
+        EmulatorProcess("cartpole", "--transport", "can", "--profile", "ideal", "--nominal") as emulator,
+        can.Bus(
+            interface="slcan",
+            channel=emulator.port.removeprefix("slcan:"),
+            bitrate=500_000,
+            ignore_config=True,
+        ) as bus,
+        can.Logger(log) as logger,
+    ):
+        for _ in range(400):
+            frame = bus.recv(5.0)
+            assert frame is not None
+            logger.on_message_received(frame)
+    dbc = resources.files("deal_hw.drivers.cartpole") / "assets" / "cartpole.dbc"
+    command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)]
+    decoded = subprocess.run(
+        command, input=log.read_text(), capture_output=True, text=True, check=True
+    ).stdout
+    lines = decoded.splitlines()
+    assert len(lines) == 400 and all(" :: " in line for line in lines)
+    numbers = [int(line.split("Sequence: ")[1].split(",")[0]) for line in lines if ":: State1(" in line]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers))) and len(numbers) > 70
+    assert any(":: Heartbeat(" in line for line in lines)
 
 
 def test_only_frames_on_the_bus_have_reached_the_device() -> None:
