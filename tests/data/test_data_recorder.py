@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import resource
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -271,6 +272,27 @@ def test_chunks_close_every_50_ms(write_episode: WriteEpisode) -> None:
     chunks = [list(messages(item)) for item in scan(data) if isinstance(item, FoundRecord) and item.contents]
     assert len(chunks) >= CYCLES / 4
     assert max(len(chunk) for chunk in chunks) <= 4 * 15 + 2
+
+
+def test_a_long_recording_needs_no_more_memory_than_its_index(tmp_path: Path, make_cycle: MakeCycle) -> None:
+    """The library keeps less than 0.4 KiB of a chunk (as objects 1.5), and all chunks are in the index."""
+    clock = VirtualClock()
+    chunks = 600
+    with EpisodeRecorder(tmp_path / "long.mcap", DESCRIPTION.to_json(), {}, clock) as recorder:
+        for number in range(chunks):
+            if number == chunks // 3:
+                tracemalloc.start()
+            recorder.write(make_cycle(number))
+            recorder.flush()
+        of_library = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/mcap/*")])
+        tracemalloc.stop()
+    kept = sum(trace.size for trace in of_library.statistics("filename"))
+    assert 0 < kept / (chunks * 2 // 3) < 400
+    with open(tmp_path / "long.mcap", "rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and len(summary.chunk_indexes) == chunks + 1
+        assert sum(1 for _ in reader.iter_messages(topics=["/cycle"])) == chunks
 
 
 def test_nothing_to_flush_means_no_deadline(tmp_path: Path, make_cycle: MakeCycle) -> None:

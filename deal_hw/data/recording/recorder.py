@@ -14,12 +14,12 @@ import json
 import os
 import time
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, cast
 
 from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer
+from mcap.records import ChunkIndex, DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from typing_extensions import Self
 
@@ -107,6 +107,9 @@ class EpisodeRecorder:
         self._writer = Writer(
             cast(IO[bytes], self._file), compression=CompressionType.ZSTD, enable_data_crcs=True
         )
+        # mcap keeps its index as objects: 1.5 KiB a chunk, 90 MiB an hour. Only memory depends on this line.
+        if hasattr(self._writer, "_Writer__chunk_indices"):
+            setattr(self._writer, "_Writer__chunk_indices", _PackedIndex())  # noqa: B010
         self._writer.start(profile="ros2", library=LIBRARY)
         self._writer.add_metadata(METADATA_NAME, self._preamble())
         self._register_channels()
@@ -328,6 +331,22 @@ class EpisodeRecorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: types.TracebackType | None
     ) -> None:
         self.close()
+
+
+class _PackedIndex:
+    """The index of the chunks as the bytes that end up in the file, 0.2 KiB each; mcap's Writer fills it."""
+
+    def __init__(self) -> None:
+        self._data = RecordBuilder()
+
+    def append(self, entry: ChunkIndex) -> None:
+        entry.write(self._data)
+
+    def __iter__(self) -> Iterator[Self]:
+        yield self
+
+    def write(self, summary: RecordBuilder) -> None:
+        summary.write(self._data.end())
 
 
 class _ChunkFile:
