@@ -1,7 +1,8 @@
 """Advice on the next recording: which excitation is most informative about the open parameters.
 
 Each excitation of a menu is simulated at the estimate, and its Fisher information is added to that of the
-calibration.
+recordings so far. An interval is promised to shrink by as much as that information says. What widened it,
+such as an error of the model, will be in the next recording, too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior
+from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior, information
 from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
 from deal_hw.calibration import CalibrationResult, percent
 from deal_hw.control.behaviours import Behaviour
@@ -152,6 +153,7 @@ def _variants(
 def advise(
     robot: RobotModel,
     result: CalibrationResult,
+    seen: FloatArray,
     *,
     balance: Callable[[], Behaviour] | None = None,
     settings: AdviceSettings = SETTINGS,
@@ -162,6 +164,8 @@ def advise(
     Args:
         robot: The nominal model, with a fixed base.
         result: The calibration's result.
+        seen: Information of its recordings, (K + 1, K + 1), from
+            :func:`~deal_hw.calib.design.experiment_design.information`.
         balance: Makes the balancing policy; None for robots that stand by themselves.
         settings: Which excitations are tried.
         threads: Simulation threads.
@@ -176,13 +180,13 @@ def advise(
         return ()
     designs = menu_designs(robot.description, balance is not None, settings)
     menu = {name: make_plan(robot.description, design) for name, design in designs.items()}
-    predictions = predict_menu(robot, known, menu, balance=balance, threads=threads)
-    # Model error will also be in the next recording: it widens that interval like this one.
-    widened = result.provenance.get("clustered", {}).get("widened", {})
+    # The ranges bound what the recordings leave open.
+    prior = Prior(seen + Prior.of(dataclasses.replace(known, covariance=None)).information)
+    predictions = predict_menu(robot, known, menu, prior, balance=balance, threads=threads)
+    wider = before / np.sqrt(np.diag(np.linalg.inv(prior.information))[:K])
     found = []
     for k in open_:
-        wider = max(widened.get(space.names[k], 1.0), 1.0)
-        one = _advice(space, k, float(before[k]), predictions, wider, settings.worth)
+        one = _advice(space, k, float(before[k]), predictions, float(wider[k]), settings.worth)
         command = options(designs[one.excitation]) if one.excitation else ""
         found.append(dataclasses.replace(one, command=command))
     return tuple(found)
@@ -192,19 +196,14 @@ def predict_menu(
     robot: RobotModel,
     known: ParameterDistribution,
     menu: Mapping[str, ExcitationPlan],
+    prior: Prior,
     *,
     balance: Callable[[], Behaviour] | None = None,
     threads: int | None = None,
 ) -> dict[str, ExpectedInformation]:
     """Predict the information of each excitation of a menu at the estimate; all have one length."""
-    space, one = known.space, np.eye(len(known.space))
-    # The range bounds what the recordings leave open.
-    flat = np.linalg.inv(np.diag(space.width**2 / 12.0))
-    seen = 0.0 * one if known.covariance is None else np.linalg.inv(known.covariance + 1e-12 * one)
-    bounded = np.asarray(np.linalg.inv(seen + flat), dtype=float)
-    prior = Prior.of(dataclasses.replace(known, covariance=bounded))
     # One member, at the estimate: the linearised posterior is about this one robot.
-    there = dataclasses.replace(known, covariance=1e-18 * one)
+    there = dataclasses.replace(known, covariance=1e-18 * np.eye(len(known.space)))
     seconds = max(plan.seconds for plan in menu.values())
     rng = np.random.default_rng(0)
     experiment = Experiment(robot, there, seconds, 1, rng, threads=threads, prior=prior)
@@ -284,7 +283,8 @@ def next_recordings(
     try:
         described = _described(robot, result, episodes, settings, threads)
         known = dataclasses.replace(robot, description=described)
-        found = advise(known, result, balance=balance, settings=settings, threads=threads)
+        seen = information(known, result.space, episodes, result.estimate, result.latency_s, threads=threads)
+        found = advise(known, result, seen, balance=balance, settings=settings, threads=threads)
     except DealHwError as err:
         return _without(open_, str(err))
     # A parameter with the verdict identifiable needs no recording, however wide its interval is.

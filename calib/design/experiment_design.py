@@ -8,14 +8,14 @@ own parameters. Windows, sensor noise, unknown start states and latency are thos
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.design.closed_loop import Scenario, Trial, TrialRunner
-from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.data.problem import Problem, longest_windows
+from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
+from deal_hw.calib.fit.residual import Shooting, States
 from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationPlan
@@ -23,6 +23,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 MakeBehaviour = Callable[[], Behaviour]
@@ -116,21 +117,24 @@ class Prior:
 def information(
     robot: RobotModel,
     space: ParameterSpace,
-    trial: Trial,
+    episodes: Sequence[SampledEpisode],
     theta: FloatArray,
     latency_s: float,
     window_s: float = SETTINGS.window_s,
     threads: int | None = None,
+    states: States | None = None,
 ) -> FloatArray:
-    """Return the Fisher information of a recording with the nominal sensor's noise, start states eliminated.
+    """Return the Fisher information of recordings with the nominal sensor's noise, start states eliminated.
 
-    It is that of parameters in their own scale and latency [s], (K + 1, K + 1), at the trial's true ones.
+    It is that of parameters in their own scale and latency [s], (K + 1, K + 1), at ``theta``, (K,), and
+    ``latency_s``. ``states`` are the true ones; by default the smoothed ones. Windows are shorter where no
+    recording holds one.
     """
     J = len(robot.description.joint_names)
     std = np.concatenate([robot.description.sensor.position_std, np.ones(J)])
-    problem = Problem(robot, space, [trial.episode], threads=threads, known_std=std)
-    shooting = Shooting(problem, samples_in(problem, window_s))
-    states = [(trial.episode.position, trial.episode.velocity)]
+    problem = Problem(robot, space, episodes, threads=threads, known_std=std)
+    data = longest_windows(problem, window_s)
+    shooting = Shooting(problem, data[0].windows.length, data)
     return shooting.normal(shooting.start(theta, latency_s, states)).hessian
 
 
@@ -227,9 +231,17 @@ class Experiment:
         found = nothing
         for n in self._order:
             theta, latency_s = self.scenario.theta[n], float(self.scenario.latency_s[n])
+            episode = trials[n].episode
             try:
                 hessian = information(
-                    self.robot, self.space, trials[n], theta, latency_s, self.settings.window_s, self.threads
+                    self.robot,
+                    self.space,
+                    [episode],
+                    theta,
+                    latency_s,
+                    self.settings.window_s,
+                    self.threads,
+                    [(episode.position, episode.velocity)],
                 )
                 covariances[n] = self.prior.posterior(hessian)
             except InsufficientDataError as err:

@@ -143,7 +143,10 @@ def test_information_of_a_mass_on_a_damper(motor: RobotModel) -> None:
         [ExcitationBehaviour(plan, motor.description)]
     )
     assert not trial.tripped and not trial.clipped
-    found = information(motor, parameters, trial, parameters.nominal, 0.0, threads=1)[:2, :2]
+    states = [(trial.episode.position, trial.episode.velocity)]
+    found = information(
+        motor, parameters, [trial.episode], parameters.nominal, 0.0, threads=1, states=states
+    )[:2, :2]
 
     episode, expected = trial.episode, np.zeros((2, 2))
     point = np.log([MASS, DAMPING])
@@ -326,36 +329,63 @@ def result(parameters: ParameterSpace, std: FloatArray) -> CalibrationResult:
     )
 
 
+def seen(*std: float) -> FloatArray:
+    """Return the information of recordings that leave these standard deviations, and 1 ms of latency."""
+    return np.diag([*(s**-2.0 for s in std), 1e6])
+
+
+def prior(parameters: ParameterSpace, recorded: FloatArray) -> Prior:
+    """Return this information and that of the ranges."""
+    return Prior(recorded + np.diag([*(12 / parameters.width**2), 12 / 2e-3**2]))
+
+
 def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:
     """An effort limit that was never reached needs a recording that reaches it; nothing else is advised."""
     parameters = space("mass", "damping", "effort_limit")
     settings = AdviceSettings(seconds=1.6)
-    designs = menu_designs(servo.description, settings=settings)
-    menu = {name: make_plan(servo.description, design) for name, design in designs.items()}
     found = result(parameters, np.array([0.02, 0.05, 0.6]))
-    (advice,) = advise(servo, found, settings=settings, threads=1)
+    (advice,) = advise(servo, found, seen(0.02, 0.05, 2.0), settings=settings, threads=1)
     assert advice.parameter == "slide.effort_limit"
     assert advice.after < 0.1 * advice.before
     said = f"record {advice.excitation}: slide.effort_limit goes from 60 % to {100 * advice.after:.2g} %"
     assert advice.sentence == said
-    # The figures are those of the excitation alone, too.
-    alone = predict_menu(servo, found.distribution(), menu, threads=1)
-    assert advice.after == min(p.std[2] for p in alone.values() if p.usable)
-    assert sum(p.std[2] > 0.5 for p in alone.values()) > 1
+
+
+def test_an_interval_that_model_error_widened_shrinks_as_if_it_were_noise(servo: RobotModel) -> None:
+    """What the model lacks will be in the next recording, too: the promise is a factor on the interval."""
+    parameters = space("mass", "damping", "effort_limit")
+    settings = AdviceSettings(seconds=1.6)
+    designs = menu_designs(servo.description, settings=settings)
+    menu = {name: make_plan(servo.description, design) for name, design in designs.items()}
+    recorded = seen(0.02, 0.3, 0.1)
+    found = result(parameters, np.array([0.02, 0.3, 0.6]))
+    advice = {one.parameter: one for one in advise(servo, found, recorded, settings=settings, threads=1)}
+    before = prior(parameters, recorded)
+    alone = predict_menu(servo, found.distribution(), menu, before, threads=1)
+    assert sum(p.std[2] > 0.05 for p in alone.values()) > 1
+    for k, name in enumerate(parameters.names):
+        if name in advice:
+            factor = min(p.std[k] for p in alone.values() if p.usable) / np.sqrt(
+                inv(before.information)[k, k]
+            )
+            assert advice[name].after == pytest.approx(factor * advice[name].before)
+            assert factor < 0.7
+    assert set(advice) == {"slide.damping", "slide.effort_limit"}
 
 
 def test_advice_says_where_no_excitation_helps(servo: RobotModel) -> None:
     """Mass and armature of one slide cannot be told apart by any motion; a calibrated robot needs nothing."""
     parameters = space("mass", "armature")
+    settings = AdviceSettings(seconds=1.6)
     open_ = result(parameters, np.array([0.6, 0.7]))
-    advice = {a.parameter: a for a in advise(servo, open_, settings=AdviceSettings(seconds=1.6), threads=1)}
+    advice = {a.parameter: a for a in advise(servo, open_, seen(9.0, 9.0), settings=settings, threads=1)}
     assert advice["slide.armature"].excitation == ""
     assert "measure it by other means" in advice["slide.armature"].sentence
     rows = [one.to_json() for one in advice.values()]
     first, *_, last = next_step(rows, "slides")
     assert first == rows[0]["sentence"]
     assert last.startswith("no recording helps with slide.armature: measure it")
-    assert advise(servo, result(parameters, np.array([0.01, 0.01])), threads=1) == ()
+    assert advise(servo, result(parameters, np.array([0.01, 0.01])), seen(0.01, 0.01), threads=1) == ()
 
 
 def test_knowledge_of_a_calibration_narrows_the_draws(servo: RobotModel) -> None:
