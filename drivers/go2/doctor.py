@@ -94,8 +94,8 @@ class Go2Doctor:
                     "leave --state-check out if the robot's head and checksum are as deal-hw expects",
                 )
             yield from _judge_states(heard, self._seconds)
-            mode = None if self._simulated else (yield from self._ask_mode())
-            yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode or "")
+            mode = "" if self._simulated else (yield from self._ask_mode())
+            yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode)
             if heard.last is not None:
                 if not self._simulated:
                     yield from _judge_supply(heard.last)
@@ -266,8 +266,16 @@ def _judge_refused(refused: Refusals, sound: int) -> Finding:
     return Finding("states", Level.FAIL if share > _FEW_REFUSED else Level.WARN, text, remedy)
 
 
-def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str) -> Iterator[Finding]:
-    if heard.commands and mode:
+def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str | None) -> Iterator[Finding]:
+    if heard.commands and mode is None:
+        yield Finding(
+            "commands",
+            Level.WARN,
+            f"{heard.commands} motor commands came; the robot did not say whether its sport mode sends them",
+            "look for other programs that command the motors; an observer's certificate may not ask the "
+            "robot: run doctor with a controller's",
+        )
+    elif heard.commands and mode:
         yield Finding(
             "commands",
             Level.NOTE,

@@ -107,6 +107,16 @@ def test_sport_modes_own_commands_are_told_from_a_strangers() -> None:
     assert (stranger.level, stranger.remedy) == (Level.FAIL, "stop that program")
 
 
+def test_commands_of_a_robot_that_does_not_say_its_mode_are_nobodys() -> None:
+    """An observer may not ask for the mode: what it hears may be sport mode, which is no fault."""
+    findings = examine(
+        sport="ai",
+        tamper=lambda topic, payload: () if topic == topics.response(topics.SERVICES[0]) else (payload,),
+    )
+    found = only(findings, "commands", "did not say whether its sport mode")
+    assert found.level is Level.WARN and "controller" in found.remedy
+
+
 def test_a_silent_writer_is_named() -> None:
     """Discovery knows somebody who has not said anything yet."""
     assert only(examine(others=("process walk",)), "commands", "process walk").level is Level.WARN
