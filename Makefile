@@ -60,7 +60,7 @@ arm-tools: ## install gcc-arm-none-eabi and qemu-system-arm (60 MB to fetch, 490
 firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
 	@$(BIN)/python -m deal_hw.drivers.cartpole.native avr build/firmware
 
-firmware-arm: $(STAMP) arm-tools ## build/firmware/cartpole-stm32.bin for the STM32F103C8, and its memory use
+firmware-arm: $(STAMP) arm-tools ## cartpole-stm32.bin and pole-encoder-stm32.bin in build/firmware for the STM32F103C8, and their memory use
 	@$(BIN)/python -m deal_hw.drivers.cartpole.native stm32 build/firmware
 
 check: $(STAMP) typing coverage-safety docs ## format, lint, types, declared imports, layers, safety coverage, docs, distributions

@@ -170,15 +170,18 @@ class RecordedCore:
     Args:
         settings: Trims, serial number and delay.
         can: Whether it is on CAN, as node 1.
+        encoder: Whether it is a pole encoder node.
     """
 
-    def __init__(self, settings: Settings, *, can: bool) -> None:
+    def __init__(self, settings: Settings, *, can: bool, encoder: bool = False) -> None:
         ticks = int(settings.delay_ticks)
         self._core = (
-            CanHostFirmware(settings, lambda: ticks, 1) if can else HostFirmware(settings, lambda: ticks)
+            CanHostFirmware(settings, lambda: ticks, 1, encoder=encoder)
+            if can
+            else HostFirmware(settings, lambda: ticks)
         )
         self._letters = (b"r", b"s") if can else (b"R", b"S")
-        self.calls = b"I" + bytes(settings) + struct.pack("<2I", 1, protocol.VERSION)
+        self.calls = b"I" + bytes(settings) + struct.pack("<3I", 1, protocol.VERSION, encoder)
         self.results = b""
 
     def __getattr__(self, name: str) -> Any:

@@ -31,7 +31,8 @@ from deal_hw.errors import UnknownNameError
 
 _BUFFERED: Final = 3
 """Most frames waiting in the adapter while the first is not acknowledged."""
-_SECOND_DEVICE: Final = 0x5EC0_0000
+SECOND_DEVICE: Final = 0x5EC0_0000
+"""Changes the serial number of a second device under the same number."""
 
 
 class SlcanAdapter:
@@ -219,7 +220,7 @@ def can_device(
 
 def can_devices(truth: CartpoleTruth, faults: CanFaults, firmware: str = "python") -> list[EmulatedDevice]:
     """Return the cart-pole on a bus, and the additional devices of its faults."""
-    identities = (0, _SECOND_DEVICE) if faults.duplicate_node else (0,)
+    identities = (0, SECOND_DEVICE) if faults.duplicate_node else (0,)
     return [can_device(truth, faults.node, faults.dbc_version, identity, firmware) for identity in identities]
 
 

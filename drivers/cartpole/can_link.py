@@ -30,7 +30,7 @@ class Angle:
     """One sample of the pole's encoder alone, if a motor drive has the cart.
 
     Attributes:
-        sequence: Low byte of the sample's number.
+        sequence: Number of the sample; a received one has its low byte alone.
         device_us: Low 32 bits of the encoder's time.
         pole_urad: Pole angle, 0 upright, not wrapped.
         pole_urad_s: Pole velocity.

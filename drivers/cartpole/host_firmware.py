@@ -67,7 +67,7 @@ def library() -> ctypes.CDLL:
         ("host_size", number, []),
         ("host_can_size", number, []),
         ("host_init", None, [device, ctypes.POINTER(Settings), _DRAW]),
-        ("host_can_init", None, [can, number, number]),
+        ("host_can_init", None, [device, can, number, number, ctypes.c_int]),
         ("host_can_receive", number, [device, can, data, number, integer, integer, data]),
         ("host_can_report", number, [device, can, *[integer] * 5, ctypes.c_int, data]),
         ("host_can_errors", number, [can]),
@@ -172,6 +172,7 @@ class CanHostFirmware(HostFirmware):
         command_delay: As for :class:`HostFirmware`.
         node: Number of the device, 1 to 62.
         version: Version of the protocol that it speaks.
+        encoder: Whether it is a pole encoder node, without a motor.
 
     Raises:
         ConfigurationError: There is no compiler, or it refuses the sources.
@@ -183,10 +184,12 @@ class CanHostFirmware(HostFirmware):
         command_delay: Callable[[], int],
         node: int,
         version: int = protocol.VERSION,
+        *,
+        encoder: bool = False,
     ) -> None:
         super().__init__(settings, command_delay)
         self._can = ctypes.create_string_buffer(self._core.host_can_size())
-        self._core.host_can_init(self._can, node, version)
+        self._core.host_can_init(self._device, self._can, node, version, encoder)
 
     @property
     def frame_errors(self) -> int:

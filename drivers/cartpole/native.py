@@ -28,7 +28,11 @@ AVR_CC = (
     "-Wextra",
     "-Werror",
 )
-STM32 = ("stm32/startup.c", "stm32/main.c", "rig.c", *CORE)
+STM32 = {
+    "cartpole-stm32": "stm32/main.c",
+    "pole-encoder-stm32": "stm32/encoder.c",
+}
+"""Programs for the STM32F103C8: the cart-pole, and the pole encoder node beside a motor drive."""
 QEMU_CORE = ("stm32/startup.c", "host/qemu.c", "host/core.c", *CORE)
 ARM_CC = (
     "arm-none-eabi-gcc",
@@ -114,16 +118,18 @@ def image() -> Path:
     return build("cartpole.elf", AVR_CC, RIG, "apt-get install gcc-avr avr-libc")
 
 
-def stm32_image(*, qemu: bool = False) -> Path:
-    """Return the firmware of the STM32F103 as an ELF file.
+def stm32_image(program: str = "cartpole-stm32", *, qemu: bool = False) -> Path:
+    """Return a firmware of the STM32F103 as an ELF file.
 
     Args:
+        program: A name in :data:`STM32`.
         qemu: Do not wait for the clocks, which QEMU does not have.
 
     Raises:
         ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
     """
-    return _arm_build("cartpole-stm32.elf", STM32, *(("-DQEMU",) if qemu else ()))
+    sources = ("stm32/startup.c", "stm32/board.c", STM32[program], "rig.c", *CORE)
+    return _arm_build(f"{program}.elf", sources, *(("-DQEMU",) if qemu else ()))
 
 
 def qemu_core() -> Path:
@@ -155,22 +161,25 @@ def write_image(folder: Path) -> str:
 
 
 def write_stm32_image(folder: Path) -> str:
-    """Write ``cartpole-stm32.elf`` and ``.bin`` into a folder; return their memory in words.
+    """Write ``.elf`` and ``.bin`` of each of :data:`STM32` into a folder; return their memory, a line each.
 
     Raises:
         ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    elf, code = folder / "cartpole-stm32.elf", folder / "cartpole-stm32.bin"
-    shutil.copy(stm32_image(), elf)
-    subprocess.run(["arm-none-eabi-objcopy", "-O", "binary", str(elf), str(code)], check=True)
-    size = ["arm-none-eabi-size", str(elf)]
-    said = subprocess.run(size, check=True, capture_output=True, text=True).stdout
-    code_bytes, data, zero = (int(text) for text in said.splitlines()[1].split()[:3])
-    return (
-        f"STM32F103C8: flash {code_bytes + data} bytes of 65536, RAM {data + zero} bytes of 20480 "
-        "(the stack has the rest of the first 8192)"
-    )
+    lines = []
+    for program in STM32:
+        elf, code = folder / f"{program}.elf", folder / f"{program}.bin"
+        shutil.copy(stm32_image(program), elf)
+        subprocess.run(["arm-none-eabi-objcopy", "-O", "binary", str(elf), str(code)], check=True)
+        size = ["arm-none-eabi-size", str(elf)]
+        said = subprocess.run(size, check=True, capture_output=True, text=True).stdout
+        code_bytes, data, zero = (int(text) for text in said.splitlines()[1].split()[:3])
+        lines.append(
+            f"{code.name} for the STM32F103C8: flash {code_bytes + data} bytes of 65536, "
+            f"RAM {data + zero} bytes of 20480 (the stack has the rest of the first 8192)"
+        )
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_emulator import adapter_emulator
+from deal_hw.drivers.cartpole.can_emulator import SECOND_DEVICE, adapter_emulator
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
-from deal_hw.drivers.cartpole.controller import FIRMWARE_VERSION, TICKS_PER_STATE, Mode
+from deal_hw.drivers.cartpole.controller import TICKS_PER_STATE, Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.description import DAMPING_NS_M, DESCRIPTION, EFFORT_LIMIT_N, STIFFNESS_N_M
 from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.firmwares import CAN_FIRMWARES, usable_firmware
+from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, settings_of
+from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.odrive_frames import (
     CLOSED_LOOP,
     IDLE,
@@ -28,8 +31,9 @@ from deal_hw.drivers.cartpole.odrive_frames import (
 )
 from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveSettings
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.servo import Servo
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
-from deal_hw.types import Status
+from deal_hw.errors import UnknownNameError
 
 ENABLE_WATCHDOG, WATCHDOG_TIMEOUT = 437, 438
 """Numbers of the emulated drive's settings; a real one's are in its firmware's flat_endpoints.json."""
@@ -49,53 +53,83 @@ class _Settings:
     turns: float = _TURNS_AT_ZERO
 
 
+class PoleEncoder(Controller):
+    """The pole encoder node's firmware in Python, as the C core has it: a cart-pole without a motor.
+
+    Args:
+        servo: Never used.
+        unique_id: Serial number.
+        link: The node's side of the bus.
+    """
+
+    def __init__(self, servo: Servo, unique_id: int, link: CanLink) -> None:
+        super().__init__(servo, unique_id, lambda: 0, link)
+        self._wire = link
+
+    def handle(self, message: protocol.AnyMessage, motor: Motor) -> protocol.AnyMessage | None:
+        """Handle one message; return the answer, or None."""
+        answer = super().handle(message, motor)
+        return replace(answer, kind=ENCODER_KIND) if isinstance(answer, protocol.Info) else answer
+
+    def report(self, reading: Reading) -> bytes:
+        """Return the frames of the tick that :meth:`control` ran last."""
+        s = self.state(reading)
+        return self._wire.encode(
+            Angle(s.sequence, s.device_us & 0xFFFF_FFFF, s.pole_urad, s.pole_urad_s, s.status)
+        )
+
+    def _act(self, request: protocol.Arm | protocol.Stop | protocol.Home, motor: Motor) -> protocol.Result:
+        if isinstance(request, protocol.Arm) and self.mode is not Mode.HOMING:
+            return protocol.Result.NOT_HOMED
+        return super()._act(request, motor)
+
+
 class OdriveFirmware:
     """Drive and encoder as the firmware of an emulated device.
 
     Attributes:
-        homings: Number of homings that began.
         armings: Number of armings.
         frame_errors: Number of invalid frames to the drive.
 
     Args:
         truth: Hidden factors of gains and effort limit.
         parts: Numbers and mechanics of the parts.
-        identity: The encoder's serial number.
+        encoder: Firmware of the encoder node.
         command_delay: Called for every position target; returns its delay from reception to effect [ticks].
-        version: Of the encoder's protocol.
     """
 
     def __init__(
         self,
         truth: CartpoleTruth,
         parts: OdriveSettings,
-        identity: int,
+        encoder: Firmware,
         command_delay: Callable[[], int],
-        version: int = 1,
     ) -> None:
-        self.homings = self.armings = 0
-        self.frame_errors = 0
+        self.armings = self.frame_errors = 0
         self._parts = parts
         self._stiffness_factor = truth.parameters["servo.stiffness"] / STIFFNESS_N_M
         self._damping_factor = truth.parameters["servo.damping"] / DAMPING_NS_M
         self._effort_factor = truth.parameters["servo.effort_limit"] / EFFORT_LIMIT_N
         self._command_delay = command_delay
-        self._identity = identity
-        self._encoder = CanLink(parts.encoder, version, identity)
+        self._encoder = encoder
         self._mode = Mode.IDLE
-        self._homed = self.watchdog = False
+        self.watchdog = False
         self._axis_errors = AxisError(0)
         self._told, self._acting = _Settings(), _Settings()
         self._due: deque[tuple[int, _Settings]] = deque()
         self._endpoints = {ENABLE_WATCHDOG: bytes(4), WATCHDOG_TIMEOUT: bytes(4)}
         self._tick = self._fed_tick = self._reports = 0
         self._force_n = 0.0
-        self._last_home: int | None = None
+
+    @property
+    def homings(self) -> int:
+        """Number of homings that began."""
+        return self._encoder.homings
 
     @property
     def mode(self) -> Mode:
-        """Mode of the motor."""
-        return self._mode
+        """Mode of the motor, or homing."""
+        return self._mode if self._mode is Mode.ARMED else self._encoder.mode
 
     @property
     def setpoint(self) -> float:
@@ -111,7 +145,7 @@ class OdriveFirmware:
             if identifier >> NODE_SHIFT == self._parts.drive:
                 out += self._take_drive(identifier & 0x1F, payload[:length], motor)
             else:
-                out += b"".join(map(self._take_encoder, self._encoder.decode(frame)))
+                out += self._encoder.receive(frame, motor)
         return out
 
     def control(self, motor: Motor) -> tuple[float, bool]:
@@ -131,6 +165,7 @@ class OdriveFirmware:
             while self._due and self._due[0][0] <= tick:
                 self._acting = self._due.popleft()[1]
             self._force_n = self._force(motor)
+        self._encoder.control(motor)
         return self._force_n, tick % TICKS_PER_STATE == 0
 
     def report(self, reading: Reading) -> bytes:
@@ -145,22 +180,11 @@ class OdriveFirmware:
         if number % _REPORTS_PER_HEARTBEAT == 0:
             state = CLOSED_LOOP if self._mode is Mode.ARMED else IDLE
             out += pack(node, Command.HEARTBEAT, int(self._axis_errors), state, 0, 0)
-        status = Status.HOMED if self._homed else Status.NONE
-        status |= Status.HOMING if self._mode is Mode.HOMING else Status.NONE
-        angle = Angle(
-            number & 0xFF,
-            (self._tick - 1) * 1000 & 0xFFFF_FFFF,
-            reading.pole_urad,
-            reading.pole_urad_s,
-            int(status),
-        )
-        return out + self._encoder.encode(angle)
+        return out + self._encoder.report(reading._replace(at_end_stop=False))
 
     def finish_homing(self) -> None:
         """Note that the cart is in the middle and the pole upright."""
-        if self._mode is Mode.HOMING:
-            self._mode = Mode.IDLE
-            self._homed = True
+        self._encoder.finish_homing()
 
     def _force(self, motor: Motor) -> float:
         parts, now = self._parts, self._acting
@@ -226,7 +250,7 @@ class OdriveFirmware:
     def _set_state(self, state: int, motor: Motor) -> None:
         if state == IDLE:
             self._disarm()
-        elif state == CLOSED_LOOP and self._mode is Mode.IDLE and not self._axis_errors:
+        elif state == CLOSED_LOOP and self.mode is Mode.IDLE and not self._axis_errors:
             # The set-point starts at the present position.
             turns = motor.position / self._parts.metres_per_turn + _TURNS_AT_ZERO
             self._told = self._acting = replace(self._told, turns=turns)
@@ -238,25 +262,13 @@ class OdriveFirmware:
         if self._mode is Mode.ARMED:
             self._mode = Mode.IDLE
 
-    def _take_encoder(self, message: protocol.AnyMessage) -> bytes:
-        match message:
-            case protocol.Hello():
-                rates = (round(DESCRIPTION.device_rate_hz), round(DESCRIPTION.state_rate_hz))
-                info = protocol.Info(message.request, ENCODER_KIND, FIRMWARE_VERSION, *rates, self._identity)
-                self._last_home = None
-                return self._encoder.encode(info)
-            case protocol.Home():
-                if message.request != self._last_home:
-                    self._last_home = message.request
-                    self._disarm()
-                    self._homed, self._mode = False, Mode.HOMING
-                    self.homings += 1
-                return self._encoder.encode(protocol.Ack(message.request, message.TYPE, protocol.Result.DONE))
-        return b""
-
 
 def odrive_device(
-    truth: CartpoleTruth, parts: OdriveSettings, version: int = 1, identity: int = 0
+    truth: CartpoleTruth,
+    parts: OdriveSettings,
+    version: int = 1,
+    identity: int = 0,
+    firmware: str = "python",
 ) -> CartpoleDevice:
     """Return an emulated ODrive with a pole encoder; its bytes are CAN frames.
 
@@ -265,23 +277,45 @@ def odrive_device(
         parts: Numbers and mechanics of the parts.
         version: Of the encoder's protocol.
         identity: Changes the encoder's serial number.
+        firmware: Of the encoder: "python", "host" for the C core, or "auto".
+
+    Raises:
+        ConfigurationError: A compiler is missing.
+        UnknownNameError: There is no such firmware on CAN.
     """
     number = unique_id(truth) ^ identity
-    return CartpoleDevice(
-        truth,
-        firmware=lambda truth, mechanics: OdriveFirmware(
-            truth, parts, number, mechanics.command_delay, version
-        ),
-    )
+    match usable_firmware(firmware):
+        case "python":
+            servo = Servo(truth.parameters, 1 / DESCRIPTION.device_rate_hz)
+            link = CanLink(parts.encoder, version, number, device=True)
+            encoder: Firmware = PoleEncoder(servo, number, link)
+        case "host":
+            settings = settings_of(truth, 0)
+            settings.unique_id = number
+            encoder = CanHostFirmware(settings, lambda: 0, parts.encoder, version, encoder=True)
+        case _:
+            raise UnknownNameError("firmware on CAN", firmware, CAN_FIRMWARES)
+
+    def drive(truth: CartpoleTruth, mechanics: Mechanics) -> Firmware:
+        return OdriveFirmware(truth, parts, encoder, mechanics.command_delay)
+
+    return CartpoleDevice(truth, firmware=drive)
 
 
-def odrive_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
-    """Return an emulated ODrive and pole encoder behind a serial CAN adapter; node is the drive's."""
+def odrive_emulator(
+    truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "auto"
+) -> CartpoleEmulator:
+    """Return an emulated ODrive and pole encoder behind a serial CAN adapter; node is the drive's.
+
+    Raises:
+        ConfigurationError: The encoder's firmware needs a compiler, which is missing.
+    """
     faults = hazards.can
     parts = OdriveSettings(drive=faults.node)
-    devices: list[EmulatedDevice] = [odrive_device(truth, parts, faults.dbc_version)]
-    if faults.duplicate_node:
-        devices.append(odrive_device(truth, parts, faults.dbc_version, 0x5EC0_0000))
+    identities = (0, SECOND_DEVICE) if faults.duplicate_node else (0,)
+    devices: list[EmulatedDevice] = [
+        odrive_device(truth, parts, faults.dbc_version, identity, firmware) for identity in identities
+    ]
     settings = [f"enable_watchdog={ENABLE_WATCHDOG}", f"watchdog_timeout={WATCHDOG_TIMEOUT}"]
     settings += [f"node={faults.node}"]
     settings += [f"bitrate={faults.bitrate}"] if faults.bitrate != CanFaults().bitrate else []

@@ -163,7 +163,7 @@ class OdriveLink:
         self._force_mn = 0
         self._turns = 0.0
         self._zero_m: float | None = None
-        self._homing = False
+        self._homing = self._homed = False
         self._device_us, self._sequence = 0, -1
         self._heartbeat_us: int | None = None
         self._offset, self._echo = ClockOffset(), CommandEcho()
@@ -184,6 +184,8 @@ class OdriveLink:
             return (
                 f"the ODrive reports {names or hex(self._axis_errors)}; look it up in ODrive's documentation"
             )
+        if self._armed and not self._homed:
+            return "the pole encoder is no longer homed: it restarted; check its supply, then home again"
         age_us = 0 if self._heartbeat_us is None else self._device_us - self._heartbeat_us
         if age_us > self._s.heartbeat_age_s * 1e6:
             return f"the ODrive's heartbeat is {age_us / 1e3:.0f} ms old; set its heartbeat_msg_rate_ms to 20"
@@ -290,7 +292,7 @@ class OdriveLink:
         return timeout and self._written.get(s.enable_watchdog, b"\0")[0] == 1
 
     def _arm(self, message: protocol.Arm, idle: bytes) -> bytes:
-        if self._homing or self._zero_m is None:
+        if self._homing or not self._homed or self._zero_m is None:
             result = protocol.Result.HOMING if self._homing else protocol.Result.NOT_HOMED
             self._answers.append(protocol.Ack(message.request, message.TYPE, result))
             return idle
@@ -378,6 +380,7 @@ class OdriveLink:
             return  # Its number is missing from the states, and the gap is counted.
         position_m = cart[0] * self._s.metres_per_turn
         status = Status(angle.status) & (Status.HOMED | Status.HOMING)
+        self._homed = Status.HOMED in status
         if self._homing and status & Status.HOMED and not status & Status.HOMING:
             self._homing, self._zero_m = False, position_m
         if self._zero_m is None:

@@ -1,6 +1,7 @@
 """The firmware's port to the STM32F103 with the chip's registers in memory, on the cart-pole's mechanics.
 
-``stm32/main.c`` is compiled for this host. ``host/stm32.c`` stands in for timers, pins, UART and CAN.
+``stm32/main.c`` or ``encoder.c`` is compiled for this host. ``host/stm32.c`` stands in for timers, pins,
+UART and CAN.
 """
 
 from __future__ import annotations
@@ -35,13 +36,16 @@ class _Outputs(ctypes.Structure):
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def library(*, encoder: bool = False) -> ctypes.CDLL:
     """Return the port with its registers, compiled on the first call.
+
+    Args:
+        encoder: Return the pole encoder node's program.
 
     Raises:
         ConfigurationError: There is no compiler, or it refuses the sources.
     """
-    command = (native.compiler(), *native.CFLAGS, "-shared", "-fPIC")
+    command = (native.compiler(), *native.CFLAGS, "-shared", "-fPIC", *(("-DENCODER",) if encoder else ()))
     chip = ctypes.CDLL(
         str(native.build("stm32.so", command, ("host/stm32.c", "rig.c", *native.CORE), _INSTALL))
     )
@@ -62,7 +66,9 @@ def library() -> ctypes.CDLL:
     return chip
 
 
-def flash_page(settings: Settings, full_force_n: float, node: int = NODE, can_kbit: int = 500) -> bytes:
+def flash_page(
+    settings: Settings, full_force_n: float, node: int = NODE, can_kbit: int = 500, drive: int = 0
+) -> bytes:
     """Return the settings for the last page of the chip's flash, with their CRC, little-endian.
 
     Args:
@@ -70,9 +76,10 @@ def flash_page(settings: Settings, full_force_n: float, node: int = NODE, can_kb
         full_force_n: Force on the cart with the PWM fully on [N].
         node: Number on the CAN bus.
         can_kbit: Bit rate of the CAN bus: 250, 500 or 1000 [kbit/s].
+        drive: Number of the motor drive beside a pole encoder node.
     """
     data = struct.pack(
-        "<5I4H",
+        "<5I5H",
         settings.stiffness_trim,
         settings.damping_trim,
         settings.effort_trim,
@@ -82,6 +89,7 @@ def flash_page(settings: Settings, full_force_n: float, node: int = NODE, can_kb
         round(full_force_n * 1000),
         node,
         can_kbit,
+        drive,
     )
     return data + struct.pack("<H", crc16.ibm_3740(data))
 
@@ -97,15 +105,16 @@ class Stm32Chip:
         page: Contents of the last page of its flash.
         can: Whether the jumper BOOT1 chooses CAN; bytes are then frames of
             :data:`~deal_hw.drivers.cartpole.can_link.FRAME`.
+        encoder: Whether it has the pole encoder node's program, which is always on CAN.
 
     Raises:
         ConfigurationError: There is no C compiler.
     """
 
-    def __init__(self, page: bytes, *, can: bool) -> None:
+    def __init__(self, page: bytes, *, can: bool = True, encoder: bool = False) -> None:
         self.outputs = _Outputs()
         self._can = can
-        self._library = library()
+        self._library = library(encoder=encoder)
         self._library.chip_start(page, len(page), can)
         self._out = ctypes.create_string_buffer(4096)
         self._inbox = b""

@@ -21,6 +21,8 @@ from deal_hw.drivers.cartpole.can_robot import CanFrames
 from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.emulator import CanFaults
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, library, settings_of
+from deal_hw.drivers.cartpole.odrive_emulator import OdriveFirmware, PoleEncoder, odrive_device
+from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
@@ -259,7 +261,7 @@ def test_test_vectors_of_the_protocol_page() -> None:
         for expression, cell in re.findall(r"^\| `(\w+\(.*\))` \| (.*) \|$", PAGE.read_text(), re.MULTILINE)
     }
     frames = {expression.partition("(")[0]: data for expression, data in rows.items()}
-    assert list(frames) == ["Hello", "Info", "Arm", "Stop", "Home", "Ack", "Target", "State"]
+    assert list(frames) == ["Hello", "Info", "Arm", "Stop", "Home", "Ack", "Target", "State", "Angle"]
     firmware = core()
     assert firmware.receive(frames["Hello"], STILL) == frames["Info"]
     assert firmware.receive(frames["Arm"], STILL) == frames["Ack"]
@@ -466,21 +468,29 @@ def test_a_wrong_bus_is_refused(faults: CanFaults, error: type[Exception], words
 
 
 def test_the_chip_without_can_is_no_firmware_here() -> None:
-    """The ATmega328P has no CAN controller; a motor drive has a firmware of its own."""
+    """The ATmega328P has no CAN controller; servos have a firmware of their own."""
     with pytest.raises(UnknownNameError, match="firmware on CAN"):
         can_device(nominal_truth(), firmware="avr")
-    with pytest.raises(ConfigurationError, match="the ATmega328P has no CAN controller"):
-        Emulate(robot="cartpole", transport="can", firmware="avr")
-    with pytest.raises(ConfigurationError, match="only `--transport serial` and `can` have this firmware"):
-        Emulate(robot="cartpole", transport="odrive", firmware="host")
-    Emulate(robot="cartpole", transport="can", firmware="host")
+    with pytest.raises(UnknownNameError, match="firmware on CAN"):
+        odrive_device(nominal_truth(), OdriveSettings(), firmware="avr")
+    for wire in ("can", "odrive"):
+        with pytest.raises(ConfigurationError, match="the ATmega328P has no CAN controller"):
+            Emulate(robot="cartpole", transport=wire, firmware="avr")
+        Emulate(robot="cartpole", transport=wire, firmware="host")
+    with pytest.raises(ConfigurationError, match="`can` and `odrive` have this firmware"):
+        Emulate(robot="cartpole", transport="dynamixel", firmware="host")
 
 
 def test_an_emulated_node_runs_the_core_where_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     """auto: the C core; without a compiler the firmware in Python."""
-    library.cache_clear()
-    assert isinstance(can_device(nominal_truth(), firmware="auto")._firmware, CanHostFirmware)
-    library.cache_clear()
+
+    def nodes() -> list[object]:
+        library.cache_clear()
+        drive = odrive_device(nominal_truth(), OdriveSettings(), firmware="auto")._firmware
+        assert isinstance(drive, OdriveFirmware)
+        return [can_device(nominal_truth(), firmware="auto")._firmware, drive._encoder]
+
+    assert [type(node) for node in nodes()] == [CanHostFirmware, CanHostFirmware]
     monkeypatch.setenv("CC", "no-such-compiler")
-    assert isinstance(can_device(nominal_truth(), firmware="auto")._firmware, Controller)
+    assert [type(node) for node in nodes()] == [Controller, PoleEncoder]
     library.cache_clear()

@@ -55,9 +55,9 @@ def frames_of(data: bytes) -> list[bytes]:
 @pytest.mark.parametrize(("expression", "frames"), vectors())
 def test_the_page_tells_the_truth(expression: str, frames: bytes) -> None:
     """Each of its messages has exactly the frames that stand beside it, in both directions."""
-    message = eval(expression, vars(protocol))
+    message = eval(expression, {**vars(protocol), "Angle": Angle})
     assert CanLink().encode(message) == frames
-    assert list(CanLink().decode(frames)) == [message]
+    assert list(CanLink().decode_all(frames)) == [message]
 
 
 def test_a_state_by_hand(crc_bit_by_bit: Callable[[bytes], int]) -> None:

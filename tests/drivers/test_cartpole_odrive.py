@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 
 import numpy as np
@@ -12,9 +13,14 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import make_robot
-from deal_hw.drivers.cartpole import protocol
+from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
-from deal_hw.drivers.cartpole.odrive_emulator import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT, odrive_device
+from deal_hw.drivers.cartpole.odrive_emulator import (
+    ENABLE_WATCHDOG,
+    WATCHDOG_TIMEOUT,
+    OdriveFirmware,
+    odrive_device,
+)
 from deal_hw.drivers.cartpole.odrive_frames import CLOSED_LOOP, IDLE, AxisError, Command, pack
 from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveLink, OdriveSettings, drive_command
 from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot, odrive_settings
@@ -65,9 +71,11 @@ def encoder_info(kind: str = ENCODER_KIND, version: int = 1) -> bytes:
 class Wire:
     """An emulated drive and encoder, and the driver in front of them."""
 
-    def __init__(self, parts: OdriveSettings = WATCHED, fault: FrameFaults | None = None) -> None:
+    def __init__(
+        self, parts: OdriveSettings = WATCHED, fault: FrameFaults | None = None, firmware: str = "python"
+    ) -> None:
         self.clock = VirtualClock()
-        self.device = odrive_device(nominal_truth("ideal"), parts)
+        self.device = odrive_device(nominal_truth("ideal"), parts, firmware=firmware)
         self.virtual = VirtualTransport(self.device, self.clock)
         self.robot = OdriveRobot(FaultyTransport(self.virtual, received=fault), self.clock, parts)
 
@@ -89,10 +97,12 @@ class Wire:
 
 
 class TestOdriveRobot(RobotSuite):
+    firmware = "python"
+
     @pytest.fixture
     def bench(self) -> RobotBench:
         fault = OneBadFrame(-3)
-        wire = Wire(fault=fault)
+        wire = Wire(fault=fault, firmware=self.firmware)
 
         return RobotBench(
             robot=wire.robot,
@@ -102,6 +112,15 @@ class TestOdriveRobot(RobotSuite):
             unplug=wire.virtual.unplug,
             corrupt=fault.corrupt_next,
         )
+
+
+@pytest.mark.skipif(
+    shutil.which(native.compiler()) is None, reason="no C compiler: apt-get install gcc libc6-dev"
+)
+class TestOdriveRobotWithTheCore(TestOdriveRobot):
+    """The contract with the encoder node's frames from the firmware's C core."""
+
+    firmware = "host"
 
 
 # Frames by hand.
@@ -343,6 +362,27 @@ def test_arming_needs_a_homing_in_this_connection() -> None:
     assert Status.HOMED not in wire.newest().status
     with pytest.raises(SafetyError, match="home"):
         wire.robot.arm(1.0)
+
+
+def test_an_encoder_that_restarts_is_a_fault() -> None:
+    """Its angle begins at pi again: the run ends, and arming needs another homing."""
+    wire = Wire()
+    robot = wire.armed()
+    assert robot.fault == ""
+    drive = wire.device._firmware
+    assert isinstance(drive, OdriveFirmware)
+    fresh = odrive_device(nominal_truth("ideal"), WATCHED)._firmware
+    assert isinstance(fresh, OdriveFirmware)
+    drive._encoder = fresh._encoder
+    wire.clock.advance_ns(20 * MS)
+    assert Status.HOMED not in wire.newest().status
+    assert "the pole encoder is no longer homed" in robot.fault
+    robot.passive()
+    with pytest.raises(SafetyError, match="home"):
+        robot.arm(1.0)
+    robot.home(5.0)
+    robot.arm(2.0)
+    assert robot.fault == ""
 
 
 def test_an_error_of_the_drive_is_decoded() -> None:

@@ -172,7 +172,7 @@ CARTPOLE_EMULATORS = {
 ``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
 ON_CAN = ("can", "odrive")
 """Wires of the cart-pole with a CAN bus."""
-WITH_FIRMWARE = ("serial", "can")
+WITH_FIRMWARE = ("serial", "can", "odrive")
 """Wires of the cart-pole with our firmware; their functions also take ``firmware=...``."""
 TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
 """Robots to emulate and their wires; the first wire is the default."""
@@ -212,9 +212,9 @@ class EmulateSettings:
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
     firmware: Annotated[Literal["auto", "host", "python", "avr"], CARTPOLE] = "auto"
-    """Cart-pole on serial or CAN: the firmware's C core compiled for this computer (host), a copy in Python,
-    or the image for the ATmega328P under simavr (avr, serial only). auto: host, or python without a C
-    compiler."""
+    """Cart-pole on serial or CAN, and an ODrive's pole encoder: the firmware's C core compiled for this
+    computer (host), a copy in Python, or the image for the ATmega328P under simavr (avr, serial only). auto:
+    host, or python without a C compiler."""
 
     link: Annotated[File | None, CARTPOLE] = None
     """Make a symbolic link to the port here."""
@@ -285,9 +285,9 @@ class EmulateSettings:
         if wire not in WITH_FIRMWARE:
             refuse(
                 given(self, EmulateSettings, ["firmware"]),
-                "only `--transport serial` and `can` have this firmware",
+                "only `--transport serial`, `can` and `odrive` have this firmware",
             )
-        if wire == "can" and self.firmware == "avr":
+        if wire in ON_CAN and self.firmware == "avr":
             raise ConfigurationError(
                 "the ATmega328P has no CAN controller; use --firmware host or python, or --transport serial"
             )

@@ -13,7 +13,8 @@ enum {
     HEARTBEAT = 13,
     ACK = 14,
     ERRORS = 15,
-    INFO_1 = 16
+    INFO_1 = 16,
+    ANGLE_1 = 21
 };
 
 static uint8_t *copy(uint8_t *to, const uint8_t *from, uint8_t length)
@@ -127,35 +128,44 @@ uint8_t cartpole_can_receive(cartpole *device, cartpole_can *can, const cartpole
 uint8_t cartpole_can_report(cartpole *device, const cartpole_can *can, const cartpole_reading *reading,
                             cartpole_can_frame *out)
 {
-    uint8_t state[CARTPOLE_STATE_PAYLOAD], bytes[41], i, *at = bytes;
+    uint8_t state[CARTPOLE_STATE_PAYLOAD], bytes[41], i, *at = bytes, count = 5, first = STATE_1;
     bool beat = device->state_count % CARTPOLE_STATES_PER_HEARTBEAT == 0;
     uint32_t torn = can->torn + can->errors;
     cartpole_state(device, reading, state);
     *at++ = can->version;
-    at = copy(at, state + 2, 4);   /* Sequence, */
-    at = copy(at, state + 33, 4);  /* of the command; */
-    at = copy(at, state + 6, 6);   /* time, */
-    *at++ = state[32];             /* status, */
-    *at++ = state[2];              /* low byte of the sequence; */
-    at = copy(at, state + 14, 18); /* positions, velocities; effort, */
-    at = copy(at, state + 37, 4);  /* age of the command. */
-    cartpole_put(at, cartpole_crc(bytes, 39), 2);
-    for (i = 0; i < 5; i++)
-        fill(can, (uint8_t)(STATE_1 + i), bytes + 1 + 8 * i, 8, out + i);
+    if (device->encoder) {
+        count = 2;
+        first = ANGLE_1;
+        at = copy(at, state + 22, 8);  /* Angle, velocity; */
+        at = copy(at, state + 6, 4);   /* time, */
+        *at++ = state[2];              /* low byte of the sequence, */
+        *at++ = state[32];             /* status. */
+    } else {
+        at = copy(at, state + 2, 4);   /* Sequence, */
+        at = copy(at, state + 33, 4);  /* of the command; */
+        at = copy(at, state + 6, 6);   /* time, */
+        *at++ = state[32];             /* status, */
+        *at++ = state[2];              /* low byte of the sequence; */
+        at = copy(at, state + 14, 18); /* positions, velocities; effort, */
+        at = copy(at, state + 37, 4);  /* age of the command. */
+    }
+    cartpole_put(at, cartpole_crc(bytes, (uint8_t)(at - bytes)), 2);
+    for (i = 0; i < count; i++)
+        fill(can, (uint8_t)(first + i), bytes + 1 + 8 * i, 8, out + i);
     if (!beat)
-        return 5;
+        return count;
     cartpole_put(bytes, device->settings.unique_id, 4);
     bytes[4] = can->version;
     bytes[5] = state[32];
     bytes[6] = can->transmit_errors;
     bytes[7] = can->receive_errors;
-    fill(can, HEARTBEAT, bytes, 8, out + 5);
+    fill(can, HEARTBEAT, bytes, 8, out + count++);
     if (torn == 0 && can->overflows == 0 && can->bus_offs == 0 && can->drops == 0)
-        return 6;
+        return count;
     cartpole_put(bytes, torn > 0xFFFF ? 0xFFFF : torn, 2);
     cartpole_put(bytes + 2, can->overflows, 2);
     cartpole_put(bytes + 4, can->bus_offs, 2);
     cartpole_put(bytes + 6, can->drops, 2);
-    fill(can, ERRORS, bytes, 8, out + 6);
-    return 7;
+    fill(can, ERRORS, bytes, 8, out + count++);
+    return count;
 }

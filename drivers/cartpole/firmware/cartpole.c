@@ -71,7 +71,7 @@ static void take_target(cartpole *device, const uint8_t *body)
 
 static uint8_t greet(cartpole *device, uint8_t request, uint8_t *answer)
 {
-    static const char kind[] = "cartpole";
+    const char *kind = device->encoder ? "pole-encoder" : "cartpole";
     uint8_t i, *at = answer;
     cartpole_stop(device);
     device->command_sequence = CARTPOLE_NO_COMMAND;
@@ -80,7 +80,7 @@ static uint8_t greet(cartpole *device, uint8_t request, uint8_t *answer)
     *at++ = CARTPOLE_INFO;
     *at++ = request;
     for (i = 0; i < 16; i++)
-        *at++ = i < sizeof kind ? (uint8_t)kind[i] : 0;
+        *at++ = *kind ? (uint8_t)*kind++ : 0;
     *at++ = CARTPOLE_FIRMWARE_MAJOR;
     *at++ = CARTPOLE_FIRMWARE_MINOR;
     *at++ = CARTPOLE_FIRMWARE_PATCH;
@@ -103,7 +103,7 @@ static uint8_t act(cartpole *device, uint8_t type, const cartpole_motor *motor)
     } else {
         if (device->mode == CARTPOLE_HOMING)
             return CARTPOLE_STILL_HOMING;
-        if (!device->homed)
+        if (!device->homed || device->encoder)
             return CARTPOLE_NOT_HOMED;
         device->watchdog = false;
         if (device->mode != CARTPOLE_ARMED) {
@@ -183,7 +183,7 @@ bool cartpole_control(cartpole *device, const cartpole_motor *motor, int64_t *fo
 uint8_t cartpole_state(cartpole *device, const cartpole_reading *reading, uint8_t *payload)
 {
     uint8_t status = 0, *at = payload;
-    uint64_t device_us = device->device_us - 1000000UL / CARTPOLE_CONTROL_HZ;
+    uint64_t device_us = device->device_us - 1000000UL / CARTPOLE_CONTROL_HZ + reading->late_us;
     uint32_t age = device->command_age - 1; /* The reported tick has already incremented it. */
     bool clamped;
     int16_t effort_mn = cartpole_servo_estimate(&device->servo, reading, &clamped);

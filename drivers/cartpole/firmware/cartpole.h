@@ -83,6 +83,7 @@ typedef struct {
     int32_t cart_um, cart_um_s, pole_urad, pole_urad_s;
     int32_t setpoint_nm;
     bool at_end_stop, fault;
+    uint16_t late_us; /* From the start of the tick to the reading. */
 } cartpole_reading;
 
 typedef struct {
@@ -142,6 +143,7 @@ typedef struct {
     uint8_t mode;
     uint8_t until_state;
     bool homed, watchdog;
+    bool encoder; /* A pole encoder node on CAN, without a motor: never armed; its states are Angle frames. */
 } cartpole;
 
 /* frames.c: bytes of the serial wire. */

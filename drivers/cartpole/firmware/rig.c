@@ -5,16 +5,16 @@ static int32_t magnitude(int32_t value)
     return value < 0 ? -value : value;
 }
 
-static int32_t pole_urad(const rig *rig)
+int32_t rig_pole_urad(int32_t counts)
 {
-    return (int32_t)((rig->pole_counts * (int64_t)RIG_URAD_PER_COUNT_Q20) >> 20);
+    return (int32_t)((counts * (int64_t)RIG_URAD_PER_COUNT_Q20) >> 20);
 }
 
 static void remember_pole(rig *rig)
 {
     uint8_t i;
     for (i = 0; i < RIG_VELOCITY_REPORTS; i++)
-        rig->pole_urad_before[i] = pole_urad(rig);
+        rig->pole_urad_before[i] = rig_pole_urad(rig->pole_counts);
 }
 
 void rig_init(rig *rig, const rig_settings *settings)
@@ -77,7 +77,7 @@ static int64_t home(rig *rig)
         rig->fault = false;
         shift(rig, -rig->cart_counts); /* The middle is unknown: begin at 0, so that 0.9 m of travel fit. */
         cartpole_servo_reset(&rig->homing, 0);
-        enter(rig, RIG_SEEK);
+        enter(rig, rig->device.encoder ? RIG_POLE : RIG_SEEK);
     }
     if (rig->device.mode != CARTPOLE_HOMING) {
         rig->phase = RIG_REST;
@@ -117,7 +117,7 @@ static int64_t home(rig *rig)
         turned = rig->pole_counts & (RIG_COUNTS_PER_TURN - 1);
         if (turned >= RIG_COUNTS_PER_TURN / 2)
             turned -= RIG_COUNTS_PER_TURN;
-        if (magnitude(turned) > RIG_UPRIGHT_COUNTS)
+        if (magnitude(turned) > RIG_UPRIGHT_COUNTS || (rig->device.encoder && !rig->left))
             rig->phase_ticks = 0;
         if (rig->phase_ticks >= RIG_STILL_TICKS) {
             rig->pole_counts = turned;
@@ -173,7 +173,7 @@ cartpole_reading rig_read(rig *rig)
     cartpole_reading reading;
     uint8_t at = rig->report_at;
     reading.cart_um = rig->cart_counts * (RIG_NM_PER_COUNT / 1000);
-    reading.pole_urad = pole_urad(rig);
+    reading.pole_urad = rig_pole_urad(rig->pole_counts);
     reading.cart_um_s = (reading.cart_um - rig->cart_um_before[at]) * (CARTPOLE_STATE_HZ / RIG_VELOCITY_REPORTS);
     reading.pole_urad_s = (reading.pole_urad - rig->pole_urad_before[at]) * (CARTPOLE_STATE_HZ / RIG_VELOCITY_REPORTS);
     rig->cart_um_before[at] = reading.cart_um;
@@ -182,6 +182,7 @@ cartpole_reading rig_read(rig *rig)
     reading.setpoint_nm = rig->device.servo.setpoint_nm;
     reading.at_end_stop = rig->left || rig->right;
     reading.fault = rig->fault;
+    reading.late_us = 0;
     return reading;
 }
 

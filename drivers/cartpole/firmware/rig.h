@@ -55,6 +55,9 @@ typedef struct {
     bool fault, left, right;
 } rig;
 
+int32_t rig_pole_urad(int32_t counts);
+/* Set device.encoder after this where there is no motor: homing then ends while the left switch, a button, is held and
+ * the pole is upright. */
 void rig_init(rig *rig, const rig_settings *settings);
 uint8_t rig_receive(rig *rig, uint8_t byte, uint8_t *frame);
 /* Run one tick; return whether a state frame is due. The PWM is from -RIG_PWM_TOP to RIG_PWM_TOP. */

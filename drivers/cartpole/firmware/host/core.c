@@ -18,10 +18,11 @@ void host_init(cartpole *device, const cartpole_settings *settings, uint16_t (*d
 }
 
 /* The version differs from the protocol's in tests. */
-void host_can_init(cartpole_can *can, uint32_t node, uint32_t version)
+void host_can_init(cartpole *device, cartpole_can *can, uint32_t node, uint32_t version, int encoder)
 {
     cartpole_can_init(can, (uint8_t)node);
     can->version = (uint8_t)version;
+    device->encoder = encoder != 0;
 }
 
 /* A frame has at least 5 bytes, so that out needs CARTPOLE_MAX_FRAME for each 5 bytes and the rest from before. */
@@ -63,7 +64,7 @@ int host_control(cartpole *device, int32_t position_nm, int32_t velocity_um_s, i
 uint32_t host_report(cartpole *device, int32_t cart_um, int32_t cart_um_s, int32_t pole_urad, int32_t pole_urad_s,
                      int32_t setpoint_nm, int at_end_stop, uint8_t *out)
 {
-    cartpole_reading reading = {cart_um, cart_um_s, pole_urad, pole_urad_s, setpoint_nm, at_end_stop != 0, false};
+    cartpole_reading reading = {cart_um, cart_um_s, pole_urad, pole_urad_s, setpoint_nm, at_end_stop != 0, false, 0};
     return cartpole_report(device, &reading, out);
 }
 
@@ -71,7 +72,7 @@ uint32_t host_can_report(cartpole *device, const cartpole_can *can, int32_t cart
                          int32_t pole_urad, int32_t pole_urad_s, int32_t setpoint_nm, int at_end_stop,
                          cartpole_can_frame *out)
 {
-    cartpole_reading reading = {cart_um, cart_um_s, pole_urad, pole_urad_s, setpoint_nm, at_end_stop != 0, false};
+    cartpole_reading reading = {cart_um, cart_um_s, pole_urad, pole_urad_s, setpoint_nm, at_end_stop != 0, false, 0};
     return cartpole_can_report(device, can, &reading, out) * (uint32_t)sizeof *out;
 }
 

@@ -30,7 +30,8 @@ static uint32_t draw(uint32_t below) /* splitmix64 */
 static cartpole_reading draw_reading(void)
 {
     cartpole_reading drawn = {(int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF),
-                              (int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF), draw(2), draw(2)};
+                              (int32_t)draw(0xFFFFFFFF), (int32_t)draw(0xFFFFFFFF), draw(2), draw(2),
+                              (uint16_t)draw(1000)};
     return drawn;
 }
 

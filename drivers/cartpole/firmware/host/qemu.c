@@ -13,7 +13,7 @@
 #define APPLICATION_EXIT 0x20026
 
 void host_init(cartpole *device, const cartpole_settings *settings, uint16_t (*draw_delay)(void));
-void host_can_init(cartpole_can *can, uint32_t node, uint32_t version);
+void host_can_init(cartpole *device, cartpole_can *can, uint32_t node, uint32_t version, int encoder);
 uint32_t host_receive(cartpole *device, const uint8_t *data, uint32_t length, int32_t position_nm,
                       int32_t velocity_um_s, uint8_t *out);
 uint32_t host_can_receive(cartpole *device, cartpole_can *can, const uint8_t *data, uint32_t length,
@@ -26,7 +26,6 @@ uint32_t host_can_report(cartpole *device, const cartpole_can *can, int32_t cart
                          cartpole_can_frame *out);
 void host_look(const cartpole *device, int32_t look[6]);
 uint32_t host_can_errors(const cartpole_can *can);
-void usart1_interrupt(void);
 int main(void);
 
 static cartpole device;
@@ -59,10 +58,6 @@ static void give(const void *from, uint32_t length)
     ask(SYS_WRITE, block);
 }
 
-void usart1_interrupt(void)
-{
-}
-
 int main(void)
 {
     static uint8_t data[256];
@@ -79,9 +74,9 @@ int main(void)
         switch (call) {
         case 'I':
             take(&settings, sizeof settings);
-            take(v, 8);
+            take(v, 12);
             host_init(&device, &settings, 0);
-            host_can_init(&can, (uint32_t)v[0], (uint32_t)v[1]);
+            host_can_init(&device, &can, (uint32_t)v[0], (uint32_t)v[1], v[2]);
             break;
         case 'R':
         case 'r':

@@ -1,4 +1,4 @@
-/* stm32/main.c on this host, with the chip's registers in memory: a shared library for stm32_device.py.
+/* stm32/main.c or encoder.c on this host, with the chip's registers in memory: a shared library for stm32_device.py.
  *
  * Inputs: encoders, limit switches, the host's bytes or frames. Outputs: bytes or frames, the mean of the motor's PWM
  * and the lamps. A millisecond has 100 turns of the main loop; a byte takes one (1 Mbaud), a frame of the bus its bits
@@ -7,7 +7,26 @@
 #include <string.h>
 
 #define HOST
+#include "../stm32/board.c"
+#ifdef ENCODER
+#include "../stm32/encoder.c"
+
+void usart1_interrupt(void)
+{
+}
+
+static void forget(void)
+{
+    memset(counts_before, 0, sizeof counts_before);
+}
+#else
 #include "../stm32/main.c"
+
+static void forget(void)
+{
+    rx_in = rx_out = tx_in = tx_out = 0;
+}
+#endif
 
 #define TURNS 100
 #define NO_BYTE 0xFFFFFFFFUL
@@ -129,10 +148,15 @@ static void receive_byte(uint8_t byte)
 
 static bool passes_filter(const cartpole_can_frame *frame)
 {
-    uint32_t mask = CAN_F0R2, id = frame->id << 21;
-    bool active = CAN_FA1R == 1 && CAN_FS1R == 1 && CAN_FM1R == 0 &&
-                  CAN_FFA1R == 0 && !(CAN_FMR & FINIT);
-    return active && ((id ^ CAN_F0R1) & mask) == 0;
+    uint32_t bank, id = frame->id << 21;
+    bool passes = false;
+    for (bank = 0; bank < 14; bank++) {
+        uint32_t bit = 1UL << bank;
+        /* Only banks as these programs use them: an id under a mask of 32 bits, for FIFO 0. */
+        bool active = (CAN_FA1R & bit) && (CAN_FS1R & bit) && !(CAN_FM1R & bit) && !(CAN_FFA1R & bit);
+        passes |= active && ((id ^ CAN_FR1(bank)) & CAN_FR2(bank)) == 0;
+    }
+    return passes && !(CAN_FMR & FINIT);
 }
 
 /* Worst case, with a stuff bit after every four bits. */
@@ -223,7 +247,8 @@ void chip_start(const uint8_t *page, uint32_t length, int boot1)
     overflow = silent_bus = byte_waits = false;
     wire_us = 0;
     byte_out = NO_BYTE;
-    rx_in = rx_out = tx_in = tx_out = queue_in = queue_out = 0;
+    forget();
+    queue_in = queue_out = 0;
     was_off = false;
     GPIO_IDR(GPIOB) = 0xFFFF & ~(boot1 ? 0UL : 1UL << BOOT1);
     set_up();
@@ -246,6 +271,7 @@ uint32_t chip_tick(int32_t cart_counts, int32_t pole_counts, int left, int right
     sent_length = 0;
     GPIO_IDR(GPIOB) |= 1UL << LEFT_SWITCH | 1UL << RIGHT_SWITCH;
     GPIO_IDR(GPIOB) &= ~(left ? 1UL << LEFT_SWITCH : 0) & ~(right ? 1UL << RIGHT_SWITCH : 0);
+    bool on_can = RCC_APB1ENR & CANEN;
     if (on_can)
         for (; length >= sizeof *bus; length -= sizeof *bus, data += sizeof *bus) {
             memcpy(bus + bus_in, data, sizeof *bus);
@@ -265,6 +291,7 @@ uint32_t chip_tick(int32_t cart_counts, int32_t pole_counts, int left, int right
             receive_byte(*data++);
             length--;
         }
+        SYST_CVR = SYST_RVR - SYST_RVR / TURNS * (uint32_t)turn;
         run_bus();
         step();
         settle();

@@ -6,7 +6,6 @@
 extern uint32_t stack_top, data_load, data_start, data_end, bss_start, bss_end;
 
 int main(void);
-void usart1_interrupt(void);
 void reset(void);
 
 /* A reset switches the motor off: its pins float then. */
@@ -15,6 +14,11 @@ static void fail(void)
     SCB_AIRCR = SCB_RESET;
     for (;;)
         ;
+}
+
+__attribute__((weak)) void usart1_interrupt(void)
+{
+    fail();
 }
 
 typedef void (*vector)(void);
