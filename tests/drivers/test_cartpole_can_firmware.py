@@ -378,20 +378,23 @@ TICKS = st.lists(
 
 
 @settings(deadline=None, max_examples=300)
-@given(TICKS, st.tuples(*[U32 | st.just(65536)] * 4), NODES, st.integers(1, 2), st.booleans())
+@given(TICKS, st.tuples(*[U32 | st.just(65536)] * 4), NODES, st.integers(1, 2), st.booleans(), st.booleans())
 def test_any_inputs_give_the_same_frames(
     ticks: list[tuple[list[bytes], Motor, Reading, int, int]],
     trims: tuple[int, int, int, int],
     node: int,
     version: int,
     homed: bool,
+    encoder: bool,
 ) -> None:
     """Any frames, lost and moved ones, of two versions; positions, gains and trims of any size."""
     sent = Settings(*trims, 7, 0)
     link = CanLink(node, version, 7, device=True)
     both: list[Firmware] = [
-        Controller(IntegerServo(sent), 7, lambda: 2, link),
-        CanHostFirmware(sent, lambda: 2, node, version),
+        PoleEncoder(IntegerServo(sent), 7, link)
+        if encoder
+        else Controller(IntegerServo(sent), 7, lambda: 2, link),
+        CanHostFirmware(sent, lambda: 2, node, version, encoder=encoder),
     ]
     ours = CanLink(node, version)
     found: list[list[object]] = [[], []]
