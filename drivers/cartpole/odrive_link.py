@@ -163,7 +163,7 @@ class OdriveLink:
         self._force_mn = 0
         self._turns = 0.0
         self._zero_m: float | None = None
-        self._homing = self._homed = False
+        self._homing = self._homed = self._home_taken = False
         self._device_us, self._sequence = 0, -1
         self._heartbeat_us: int | None = None
         self._offset, self._echo = ClockOffset(), CommandEcho()
@@ -235,6 +235,7 @@ class OdriveLink:
                 return idle + self._watchdog_frames() + self._encoder.encode(message)
             case protocol.Home():
                 self._homing, self._zero_m, self._armed = True, None, False
+                self._home_taken = False
                 return idle + self._encoder.encode(message)
             case protocol.Arm():
                 return self._arm(message, idle)
@@ -364,6 +365,7 @@ class OdriveLink:
                 found.version,
             )
         elif isinstance(found, protocol.Ack):
+            self._home_taken |= found.of is protocol.MessageType.HOME
             yield found
 
     def _take_angle(self, angle: Angle) -> Iterator[protocol.State]:
@@ -381,7 +383,8 @@ class OdriveLink:
         position_m = cart[0] * self._s.metres_per_turn
         status = Status(angle.status) & (Status.HOMED | Status.HOMING)
         self._homed = Status.HOMED in status
-        if self._homing and status & Status.HOMED and not status & Status.HOMING:
+        # Samples from before the request may still say homed, with the cart anywhere.
+        if self._homing and self._home_taken and status & Status.HOMED and not status & Status.HOMING:
             self._homing, self._zero_m = False, position_m
         if self._zero_m is None:
             status &= ~Status.HOMED

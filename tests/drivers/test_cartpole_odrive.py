@@ -364,6 +364,20 @@ def test_arming_needs_a_homing_in_this_connection() -> None:
         wire.robot.arm(1.0)
 
 
+def test_samples_from_before_a_second_homing_do_not_end_it() -> None:
+    """100 ms of samples wait that say homed, with the cart 0.1 m off the middle."""
+    wire = Wire()
+    robot = wire.armed()
+    for _ in range(50):
+        robot.send_command(default_command(robot, 0.1))
+        wire.clock.advance_ns(20 * MS)
+    robot.passive()
+    assert wire.newest().position[0] > 0.09
+    wire.clock.advance_ns(100 * MS)
+    robot.home(5.0)
+    assert wire.newest().position[0] == pytest.approx(wire.device.true_position[0], abs=1e-3)
+
+
 def test_an_encoder_that_restarts_is_a_fault() -> None:
     """Its angle begins at pi again: the run ends, and arming needs another homing."""
     wire = Wire()
