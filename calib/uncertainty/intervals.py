@@ -18,6 +18,7 @@ from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
 from deal_hw.calibration import Z90, Alarm, Identifiability, listed
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.parameters import find_kind
 from deal_hw.types import FloatArray
 
 
@@ -335,7 +336,9 @@ def _alarms(
                 "values.",
             )
         )
-    ended = ended_at_bound(space, theta)
+    # A mass or a play of 0 is an answer: there is no wider range.
+    least = np.array([p.low <= find_kind(p.kind).least for p in space.free])
+    ended = ended_at_bound(space, theta) & ~(least & (theta < space.center))
     for which, means in (
         (
             pressed,

@@ -48,6 +48,28 @@ def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in at.alarms)
 
 
+@pytest.mark.parametrize(("kind", "alarms"), [("servo_play", False), ("encoder_bias", True)])
+def test_the_least_value_that_a_parameter_can_have_is_an_answer(kind: str, alarms: bool) -> None:
+    """No play: there is no wider range to ask for. An encoder's zero can be below the range's 0."""
+    space = ParameterSpace(
+        [
+            Parameter(
+                name="p",
+                kind=kind,
+                elements=("b",),
+                unit="m",
+                nominal=0.01,
+                low=0.0,
+                high=0.05,
+                scale="linear",
+            )
+        ]
+    )
+    told = _told(space, [0.0], np.array([[1e8]]), gradient=np.array([50.0, 0.0]))
+    assert told.interval[0, 0] == 0.0
+    assert any("bound of the search range" in alarm.seen for alarm in told.alarms) == alarms
+
+
 def test_the_interval_at_a_bound_lies_on_one_side() -> None:
     """Without a slope it is the half normal's 90 %, 1.645 std; with a steep one ln 10 over the slope."""
     flat = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]))

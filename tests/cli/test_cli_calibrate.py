@@ -21,6 +21,7 @@ from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
+from deal_hw.workflows.calibration.model import Recordings
 from deal_hw.workflows.calibration.settings import prepare
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
@@ -71,6 +72,20 @@ def settings(folder: Path, **changes: object) -> Calibrate:
         "quiet": True,
     }
     return Calibrate(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_a_file_adds_parameters_to_a_robots_own_set(dataset: Path, tmp_path: Path) -> None:
+    """Alarms advise to free an encoder's zero or a gear's play: also for robots with a driver."""
+    extra = tmp_path / "extra.yaml"
+    extra.write_text("parameters:\n  - {kind: encoder_bias, elements: cart}\n")
+    chosen = Recordings(parameters=extra)
+    space = prepare(settings(dataset, free=(), recordings=chosen)).space
+    assert space.names == (*k9_space().names, "cart.encoder_bias")
+    freed = prepare(settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)).space
+    assert freed.names == ("cart.mass", "cart.encoder_bias")
+    extra.write_text("parameters:\n  - {kind: dof_damping, elements: pole, name: twice}\n")
+    with pytest.raises(ConfigurationError, match="both set dof_damping of 'pole'"):
+        prepare(settings(dataset, free=(), recordings=chosen))
 
 
 def test_writes_everything_a_user_needs(dataset: Path, tmp_path: Path) -> None:

@@ -214,7 +214,7 @@ SETTINGS: Lines = [
 ]
 NO_EFFECT = "would have no effect: a dataset defines it; use that option with --model and --data"
 REVIEWED: Lines = [
-    ("calibrate run/dataset --parameters nothere.yaml", f"--parameters {NO_EFFECT}"),
+    ("calibrate run/dataset --columns nothere.yaml", f"--columns {NO_EFFECT}"),
     ("calibrate run/dataset --columns nothere.yaml", f"--columns {NO_EFFECT}"),
     ("calibrate run/dataset --leave-out nosuch 0 99", f"--leave-out {NO_EFFECT}"),
     ("calibrate run/dataset --fit-seconds 2", f"--fit-seconds {NO_EFFECT}"),

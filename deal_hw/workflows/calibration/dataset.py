@@ -44,6 +44,7 @@ class DatasetRecordings:
         folder: The dataset.
         episodes: Fitted episodes; empty: all but the held-out ones.
         holdout: Held-out episodes; empty: those of the motion `chirp`.
+        parameters: File of parameters that are searched beside the robot's set; None for none.
         policy: File of the policy that moved the robot; None: the copy in the dataset.
         sample_hz: Rate of the fitted states; None: four per control period.
         spikes: Definition of a spike.
@@ -52,6 +53,7 @@ class DatasetRecordings:
     folder: Path
     episodes: Sequence[int] = ()
     holdout: Sequence[int] = ()
+    parameters: Path | None = None
     policy: Path | None = None
     sample_hz: float | None = None
     spikes: SpikeSettings = DEFAULT_SPIKES
@@ -78,7 +80,11 @@ def prepare_dataset(
     robot_name = dataset.description["name"]
     description = recorded_robot(dataset.description, source.folder)
     fit, holdout = choose_episodes(dataset, source.episodes, source.holdout, say)
-    space = overrides.apply(named_space(robot_name, space_name))
+    robot = _model(description)
+    space = named_space(robot_name, space_name)
+    if source.parameters is not None:
+        space = _extended(space, source.parameters, robot)
+    space = overrides.apply(space)
     episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
     if method in CLOSED_LOOP_METHODS:
@@ -89,7 +95,7 @@ def prepare_dataset(
     )
     space = without_speed_limits(space, description, recordings.values(), say)
     names = {i: dataset.path(i).name for i in recordings}
-    robot, episodes = _simulation(description, recordings, names, source.sample_hz)
+    episodes = _simulation(robot, recordings, names, source.sample_hz)
     walks = all_walk(robot, recordings.values())
     if walks:
         space = weighed(space, robot, recordings[fit[0]], say)
@@ -219,6 +225,24 @@ def choose_episodes(
     return fit, held
 
 
+def _model(description: RobotDescription) -> RobotModel:
+    try:
+        from deal_hw.sim.engine.model import load_model
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+
+    return load_model(description)
+
+
+def _extended(space: ParameterSpace, file: Path, robot: RobotModel) -> ParameterSpace:
+    from deal_hw.sim.parameters import check_space
+    from deal_hw.sim.parameters.yaml_space import read_space
+
+    found = ParameterSpace([*space.parameters, *read_space(file, robot.model).parameters])
+    check_space(robot.model, found)
+    return found
+
+
 def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
     """Return whether a recording repeats the one before with a stronger motion, by their metadata."""
     same = all(one.get(key) == former.get(key) for key in ("seed", "seconds"))
@@ -227,23 +251,18 @@ def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
 
 
 def _simulation(
-    description: RobotDescription,
+    robot: RobotModel,
     recordings: Mapping[int, Trajectory],
     names: Mapping[int, str],
     sample_hz: float | None,
-) -> tuple[RobotModel, dict[int, SampledEpisode]]:
-    try:
-        from deal_hw.sim.engine.model import load_model
-        from deal_hw.sim.recordings.episode import align, thin
-        from deal_hw.sim.recordings.standing import with_sensed_base
-    except ModuleNotFoundError as err:
-        raise MissingExtraError(str(err.name), "calib") from err
+) -> dict[int, SampledEpisode]:
+    from deal_hw.sim.recordings.episode import align, thin
+    from deal_hw.sim.recordings.standing import with_sensed_base
 
-    robot = load_model(description)
     episodes = {}
     for i, trajectory in recordings.items():
         episodes[i] = align(trajectory, robot.description, names[i])
         if robot.base is not None and trajectory.body is not None:
             episodes[i] = while_walking(with_sensed_base(episodes[i], robot, trajectory), trajectory)
         episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)
-    return robot, episodes
+    return episodes

@@ -60,7 +60,8 @@ class Recordings(Checked):
 
     parameters: Path | None = None
     """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
-    of every joint and gain of every actuator of the model."""
+    of every joint and gain of every actuator of the model. With a dataset of a robot with a driver: what to
+    search beside its set."""
 
     write_parameters: Path | None = None
     """Write a --parameters file for --model, to edit, and end."""

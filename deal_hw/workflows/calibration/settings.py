@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 OF_DATASETS = ("episodes", "space", "sample_hz")
 """Settings for datasets only."""
+OF_OWN_ROBOTS = tuple(f.name for f in fields(Recordings) if f.name != "parameters")
+"""Settings without effect for datasets of robots with a driver."""
 FROM_FILES = ("data", "columns", "feet", "leave_out", "force")
 """Settings on reading files, which have no effect for a dataset with its own robot.yaml."""
 
@@ -150,7 +152,7 @@ class CalibrateSettings(Checked):
             object.__setattr__(self, "dataset", dataset_of(self.dataset))
         if self.recordings.model is None:
             carries = carries_robot(self.dataset)
-            foreign = given(self.recordings, Recordings(), FROM_FILES if carries else None)
+            foreign = given(self.recordings, Recordings(), FROM_FILES if carries else OF_OWN_ROBOTS)
             if carries:
                 refuse(
                     given(self, CalibrateSettings(), ("space",)), "this robot has one set; use --parameters"
@@ -279,6 +281,7 @@ def prepare(
         folder=Path(settings.dataset),
         episodes=settings.episodes,
         holdout=[int(str(one)) for one in judges],
+        parameters=settings.recordings.parameters,
         policy=None if settings.policy is None else Path(settings.policy),
         sample_hz=settings.sample_hz,
         spikes=spikes,
