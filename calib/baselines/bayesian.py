@@ -248,6 +248,9 @@ def _largest_improvement(
     from deal_hw.calib.search.critic import torch_threads
 
     x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
+    # From 20 coordinates on BoTorch moves a part of them, and leaves the others where a good point has them,
+    # also outside the box: then it refuses its own starts.
+    moved = {"sample_around_best_prob_perturb": 1.0} if points.shape[1] >= 20 else {}
     # BoTorch draws its starts from torch's global generator; the fork restores it.
     with warnings.catch_warnings(), torch_threads(1), torch.random.fork_rng(devices=[]):
         warnings.simplefilter("ignore")
@@ -269,6 +272,7 @@ def _largest_improvement(
                     "maxiter": settings.acquisition_iterations,
                     "seed": seed,
                     "sample_around_best": True,
+                    **moved,
                 },
             )
         except (ModelFittingError, NanError, NotPSDError):

@@ -12,6 +12,7 @@ from deal_hw.calib.baselines.bayesian import (
     BoSettings,
     GaussianProcessSearch,
     TrustRegion,
+    _largest_improvement,
     critic_return,
 )
 from deal_hw.calib.data.problem import Problem
@@ -65,6 +66,17 @@ def test_finds_the_top_of_a_hill() -> None:
     assert np.max(np.abs(search.points[search.order[0]] - 0.3)) < 0.05
     assert search.best == hill(search.points).max()
     assert search.fallbacks == 0
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_many_coordinates_and_good_points_outside_the_trust_region(seed: int) -> None:
+    """From 20 coordinates on, BoTorch made starts of such points and then refused them."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((80, 24))
+    value = -np.sum((points - 0.5) ** 2, axis=1) + 0.05 * rng.standard_normal(80)
+    batch = _largest_improvement(points, value, 4, 0.2, seed, BoSettings())
+    assert batch is not None and batch.shape == (4, 24)
+    assert np.all((batch >= 0.0) & (batch <= 1.0))
 
 
 def test_scores_earlier_points_again_where_the_fitness_changes() -> None:
