@@ -271,12 +271,12 @@ def prepare(
             say=say,
         )
     wrong = [str(one) for one in judges if not isinstance(one, int)]
-    if settings.dataset is None or wrong:
+    if wrong:
         raise ConfigurationError(
             f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
-            if wrong
-            else "no dataset was named"
         )
+    if settings.dataset is None:
+        raise ConfigurationError("no dataset was named")
     source = DatasetRecordings(
         folder=Path(settings.dataset),
         episodes=settings.episodes,
