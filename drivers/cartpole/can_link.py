@@ -11,9 +11,9 @@ from __future__ import annotations
 import functools
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import cantools
 from fastcrc import crc16
@@ -53,7 +53,6 @@ FRAME: Final = struct.Struct("<IB3x8s")
 """One frame as bytes: Linux' ``struct can_frame``, id, length and eight data bytes."""
 _NUMBER_BITS: Final = 5
 _DEVICE_TIME: Final = 2**48 - 1
-_DBC_NODE: Final = 1
 _GROUPS: Final[dict[str, type[CanMessage]]] = {
     "Stop": protocol.Stop,
     "Target": protocol.Target,
@@ -66,6 +65,23 @@ _GROUPS: Final[dict[str, type[CanMessage]]] = {
     "Angle": Angle,
 }
 _LENGTHS: Final = {"Target": 3, "State": 5, "Info": 5, "Angle": 2}
+_SIGNALS: Final[dict[type[CanMessage], dict[str, str]]] = {
+    kind: dict(zip((field.name for field in fields(kind)), signals.split(), strict=True))
+    for kind, signals in (
+        (
+            protocol.State,
+            "Sequence DeviceTime CartPosition CartVelocity PolePosition PoleVelocity Effort Status "
+            "CommandSequence CommandAge",
+        ),
+        (protocol.Target, "Sequence Position Stiffness Damping EffortLimit SpeedLimit"),
+        (Angle, "SequenceByte DeviceTimeLow PoleAngle PoleRate Status"),
+        (protocol.Ack, "Request Of Result"),
+        (protocol.Hello, "Request Version"),
+        *((kind, "Request") for kind in (protocol.Arm, protocol.Stop, protocol.Home)),
+    )
+}
+"""Signal of each field; an info is laid out by hand."""
+_FIRMWARE: Final = ("Major", "Minor", "Patch")
 
 
 @functools.cache
@@ -261,111 +277,41 @@ def _pack(name: str, values: dict[str, int]) -> bytes:
 
 
 def _to_values(message: CanMessage, version: int) -> dict[str, int]:
-    match message:
-        case protocol.State():
-            return {
-                "Sequence": message.sequence,
-                "CommandSequence": message.command_sequence,
-                "DeviceTime": message.device_us & _DEVICE_TIME,
-                "Status": message.status,
-                "SequenceLow": message.sequence & 0xFF,
-                "CartPosition": message.cart_um,
-                "CartVelocity": message.cart_um_s,
-                "PolePosition": message.pole_urad,
-                "PoleVelocity": message.pole_urad_s,
-                "Effort": message.effort_mn,
-                "CommandAge": message.command_age_us,
-                "Crc": 0,
-            }
-        case Angle():
-            return {
-                "PoleAngle": message.pole_urad,
-                "PoleRate": message.pole_urad_s,
-                "DeviceTimeLow": message.device_us & 0xFFFF_FFFF,
-                "SequenceByte": message.sequence & 0xFF,
-                "Status": message.status,
-                "Crc": 0,
-            }
-        case protocol.Target():
-            return {
-                "Sequence": message.sequence,
-                "Position": message.position_um,
-                "Stiffness": message.stiffness_mn_m,
-                "Damping": message.damping_mns_m,
-                "EffortLimit": message.effort_limit_mn,
-                "SpeedLimit": message.speed_limit_um_s,
-                "Crc": 0,
-            }
-        case protocol.Info():
-            kind = message.kind.encode("ascii")
-            if len(kind) > 16:
-                raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
-            major, minor, patch = message.firmware
-            # A device of another version reports its own version.
-            told = version if message.version == protocol.VERSION else message.version
-            return {
-                "Request": message.request,
-                "Version": told,
-                "DeviceRate": message.device_rate_hz,
-                "StateRate": message.state_rate_hz,
-                "Kind1": int.from_bytes(kind[:8], "little"),
-                "Kind2": int.from_bytes(kind[8:], "little"),
-                "UniqueId": message.unique_id,
-                "Major": major,
-                "Minor": minor,
-                "Patch": patch,
-                "Crc": 0,
-            }
-        case protocol.Ack():
-            return {
-                "Request": message.request,
-                "Of": message.of,
-                "Result": message.result,
-                "Version": version,
-            }
-        case protocol.Hello():
-            return {"Request": message.request, "Version": message.version}
-        case _:
-            return {"Request": message.request, "Version": version}
+    values = {"Version": version, "Crc": 0}
+    if isinstance(message, protocol.Info):
+        kind = message.kind.encode("ascii")
+        if len(kind) > 16:
+            raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
+        # A device of another version reports its own version.
+        told = version if message.version == protocol.VERSION else message.version
+        return values | {
+            "Request": message.request,
+            "Version": told,
+            "DeviceRate": message.device_rate_hz,
+            "StateRate": message.state_rate_hz,
+            "Kind1": int.from_bytes(kind[:8], "little"),
+            "Kind2": int.from_bytes(kind[8:], "little"),
+            "UniqueId": message.unique_id,
+            **dict(zip(_FIRMWARE, message.firmware, strict=True)),
+        }
+    values |= {signal: getattr(message, name) for name, signal in _SIGNALS[type(message)].items()}
+    if isinstance(message, protocol.State | Angle):
+        low, time = message.sequence & 0xFF, message.device_us
+        values |= {"SequenceLow": low, "DeviceTime": time & _DEVICE_TIME}
+        values |= {"SequenceByte": low, "DeviceTimeLow": time & 0xFFFF_FFFF}
+    return values
 
 
 def _from_values(kind: type[CanMessage], v: dict[str, int]) -> CanMessage:
-    if kind is protocol.State:
-        if v["SequenceLow"] != v["Sequence"] & 0xFF:
-            raise FrameError("State: its frames have different numbers")
-        return protocol.State(
-            v["Sequence"],
-            v["DeviceTime"],
-            v["CartPosition"],
-            v["CartVelocity"],
-            v["PolePosition"],
-            v["PoleVelocity"],
-            v["Effort"],
-            v["Status"],
-            v["CommandSequence"],
-            v["CommandAge"],
-        )
-    if kind is protocol.Target:
-        return protocol.Target(
-            v["Sequence"], v["Position"], v["Stiffness"], v["Damping"], v["EffortLimit"], v["SpeedLimit"]
-        )
-    if kind is Angle:
-        return Angle(v["SequenceByte"], v["DeviceTimeLow"], v["PoleAngle"], v["PoleRate"], v["Status"])
+    if kind is protocol.State and v["SequenceLow"] != v["Sequence"] & 0xFF:
+        raise FrameError("State: its frames have different numbers")
     if kind is protocol.Info:
         text = v["Kind1"].to_bytes(8, "little") + v["Kind2"].to_bytes(8, "little")
-        return protocol.Info(
-            v["Request"],
-            text.rstrip(b"\0").decode("ascii"),
-            (v["Major"], v["Minor"], v["Patch"]),
-            v["DeviceRate"],
-            v["StateRate"],
-            v["UniqueId"],
-            v["Version"],
-        )
+        firmware = v["Major"], v["Minor"], v["Patch"]
+        rates = v["DeviceRate"], v["StateRate"]
+        name = text.rstrip(b"\0").decode("ascii")
+        return protocol.Info(v["Request"], name, firmware, *rates, v["UniqueId"], v["Version"])
     if kind is protocol.Ack:
         return protocol.Ack(v["Request"], protocol.MessageType(v["Of"]), protocol.Result(v["Result"]))
-    if kind is protocol.Hello:
-        return protocol.Hello(v["Request"], v["Version"])
-    if kind is protocol.Arm:
-        return protocol.Arm(v["Request"])
-    return protocol.Stop(v["Request"]) if kind is protocol.Stop else protocol.Home(v["Request"])
+    found: list[Any] = [v[signal] for signal in _SIGNALS[kind].values()]
+    return kind(*found)

@@ -13,9 +13,11 @@ compute the same bits.
 from __future__ import annotations
 
 import enum
+import operator
 import struct
-from dataclasses import dataclass
-from typing import ClassVar, Final
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Final
 
 from cobs import cobs
 from fastcrc import crc16
@@ -193,9 +195,12 @@ AnyMessage = Hello | Info | Arm | Stop | Home | Ack | Target | State
 _BY_TYPE: Final[dict[int, type[AnyMessage]]] = {
     int(kind.TYPE): kind for kind in (Hello, Info, Arm, Stop, Home, Ack, Target, State)
 }
-_STRUCTS: Final = {number: struct.Struct(kind.FORMAT) for number, kind in _BY_TYPE.items()}
-_STATE = struct.Struct("<BB" + State.FORMAT[1:])
-_TARGET = struct.Struct("<BB" + Target.FORMAT[1:])
+_STRUCTS: Final = {number: struct.Struct("<BB" + kind.FORMAT[1:]) for number, kind in _BY_TYPE.items()}
+_PLAIN: Final[dict[type[AnyMessage], tuple[Callable[..., bytes], Callable[[Any], tuple[Any, ...]]]]] = {
+    kind: (_STRUCTS[kind.TYPE].pack, operator.attrgetter("TYPE", *(field.name for field in fields(kind))))
+    for kind in (Arm, Stop, Home, Ack, Target, State)
+}
+"""Messages whose body is their fields in order: how to pack one, and its type and values."""
 _TIMELESS: Final = (MessageType.HELLO, MessageType.INFO)
 
 
@@ -213,52 +218,17 @@ def encode(message: AnyMessage) -> bytes:
 
 
 def _encode_payload(message: AnyMessage) -> bytes:
-    match message:
-        case State():
-            return _STATE.pack(
-                VERSION,
-                MessageType.STATE,
-                message.sequence,
-                message.device_us,
-                message.cart_um,
-                message.cart_um_s,
-                message.pole_urad,
-                message.pole_urad_s,
-                message.effort_mn,
-                message.status,
-                message.command_sequence,
-                message.command_age_us,
-            )
-        case Target():
-            return _TARGET.pack(
-                VERSION,
-                MessageType.TARGET,
-                message.sequence,
-                message.position_um,
-                message.stiffness_mn_m,
-                message.damping_mns_m,
-                message.effort_limit_mn,
-                message.speed_limit_um_s,
-            )
-        case Info():
-            kind = message.kind.encode("ascii")
-            if len(kind) > 16:
-                raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
-            body = _STRUCTS[MessageType.INFO].pack(
-                message.request,
-                kind,
-                *message.firmware,
-                message.device_rate_hz,
-                message.state_rate_hz,
-                message.unique_id,
-            )
-            return bytes((message.version, MessageType.INFO)) + body
-        case Ack():
-            return bytes((VERSION, MessageType.ACK, message.request, message.of, message.result))
-        case Hello():
-            return struct.pack("<BBB", message.version, MessageType.HELLO, message.request)
-        case _:
-            return struct.pack("<BBB", VERSION, message.TYPE, message.request)
+    if isinstance(message, Hello):
+        return _STRUCTS[MessageType.HELLO].pack(message.version, MessageType.HELLO, message.request)
+    if not isinstance(message, Info):
+        pack, values = _PLAIN[type(message)]
+        return pack(VERSION, *values(message))
+    kind = message.kind.encode("ascii")
+    if len(kind) > 16:
+        raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
+    rates = message.device_rate_hz, message.state_rate_hz
+    numbers = message.request, kind, *message.firmware, *rates, message.unique_id
+    return _STRUCTS[MessageType.INFO].pack(message.version, MessageType.INFO, *numbers)
 
 
 def decode(payload: bytes) -> AnyMessage:
@@ -278,28 +248,18 @@ def decode(payload: bytes) -> AnyMessage:
             f"unknown message type 0x{number:02x}; known: {', '.join(t.name for t in MessageType)}"
         )
     layout = _STRUCTS[number]
-    if len(payload) != 2 + layout.size:
-        raise FrameError(f"{kind.__name__}: the payload has {len(payload)} bytes, expected {2 + layout.size}")
-    values = layout.unpack_from(payload, 2)
-    if kind is State:
-        return State(*values)
-    if kind is Target:
-        return Target(*values)
-    if kind is Hello:
-        return Hello(values[0], version)
+    if len(payload) != layout.size:
+        raise FrameError(f"{kind.__name__}: the payload has {len(payload)} bytes, expected {layout.size}")
+    values = layout.unpack(payload)[2:]
     try:
         if kind is Info:
             name = values[1].rstrip(b"\0").decode("ascii")
-            return Info(
-                values[0], name, (values[2], values[3], values[4]), values[5], values[6], values[7], version
-            )
+            return Info(values[0], name, values[2:5], values[5], values[6], values[7], version)
         if kind is Ack:
             return Ack(values[0], MessageType(values[1]), Result(values[2]))
     except ValueError as error:
         raise FrameError(f"{kind.__name__}: {error}") from error
-    if kind is Arm:
-        return Arm(values[0])
-    return Stop(values[0]) if kind is Stop else Home(values[0])
+    return Hello(values[0], version) if kind is Hello else kind(*values)
 
 
 class FrameDecoder:
