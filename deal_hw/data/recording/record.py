@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import enum
 import json
+import operator
 import struct
 import zlib
 from dataclasses import dataclass, fields
@@ -46,6 +47,17 @@ _WIRE = struct.Struct("<qHI")
 _CRC = struct.Struct("<I")
 _HAS_REQUESTED, _HAS_SENT = 1, 2
 _COMMAND_FIELDS = tuple(field.name for field in fields(JointCommand))
+_SCALARS = (
+    "flags",
+    "cycle",
+    "deadline_ns",
+    "start_ns",
+    "sent_sequence",
+    "sent_ns",
+    "state_age_ns",
+    "lost",
+)
+_scalars = operator.attrgetter(*_SCALARS)
 
 
 class CycleFlag(enum.IntFlag):
@@ -150,14 +162,7 @@ def _encode_body(record: CycleRecord) -> bytes:
             action_size,
             present,
             len(safety_state),
-            record.flags,
-            record.cycle,
-            record.deadline_ns,
-            record.start_ns,
-            record.sent_sequence,
-            record.sent_ns,
-            record.state_age_ns,
-            record.lost,
+            *_scalars(record),
             feet,
         )
     ]
@@ -198,53 +203,21 @@ def decode(datagram: bytes) -> CycleRecord:
 
 
 def _decode_body(body: bytes) -> CycleRecord:
-    (
-        _,
-        _,
-        joints,
-        state_count,
-        actuated,
-        event_count,
-        wire_count,
-        action_size,
-        present,
-        text_size,
-        flags,
-        cycle,
-        deadline_ns,
-        start_ns,
-        sent_sequence,
-        sent_ns,
-        state_age_ns,
-        lost,
-        feet,
-    ) = _HEAD.unpack_from(body)
+    _, _, joints, states, actuated, events, wire, action, present, text, *rest = _HEAD.unpack_from(body)
+    *scalars, feet = rest
     cursor = _Cursor(body, _HEAD.size)
-    states = tuple(_decode_state(cursor, joints, feet) for _ in range(state_count))
-    action = cursor.floats(action_size) if action_size >= 0 else None
-    asked = _decode_command(cursor, actuated) if present & _HAS_REQUESTED else None
-    sent = _decode_command(cursor, actuated) if present & _HAS_SENT else None
-    safety_state = cursor.text(text_size)
-    events = tuple(_decode_event(cursor) for _ in range(event_count))
-    wire = tuple(_decode_message(cursor) for _ in range(wire_count))
-    cursor.finish()
-    return CycleRecord(
-        cycle=cycle,
-        deadline_ns=deadline_ns,
-        start_ns=start_ns,
-        states=states,
-        action=action,
-        requested=asked,
-        sent=sent,
-        sent_sequence=sent_sequence,
-        sent_ns=sent_ns,
-        state_age_ns=state_age_ns,
-        safety_state=safety_state,
-        flags=flags,
-        events=events,
-        wire=wire,
-        lost=lost,
+    record = CycleRecord(
+        **dict(zip(_SCALARS, scalars, strict=True)),
+        states=tuple(_decode_state(cursor, joints, feet) for _ in range(states)),
+        action=cursor.floats(action) if action >= 0 else None,
+        requested=_decode_command(cursor, actuated) if present & _HAS_REQUESTED else None,
+        sent=_decode_command(cursor, actuated) if present & _HAS_SENT else None,
+        safety_state=cursor.text(text),
+        events=tuple(_decode_event(cursor) for _ in range(events)),
+        wire=tuple(_decode_message(cursor) for _ in range(wire)),
     )
+    cursor.finish()
+    return record
 
 
 class _Cursor:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import operator
 import os
 import time
 import types
@@ -53,6 +54,10 @@ END_NAME = "deal-hw.end"
 LOG_LEVELS = {"velocity": 1, "clipped": 3, "warning": 3}
 """Level of foxglove.Log by an event's kind: 1 debug, 3 warning; others 2, info."""
 LIBRARY = f"deal-hw/{__version__}"
+_state_of = operator.attrgetter(*(name for _, name in STATE.fields))
+_command_of = operator.attrgetter(*(name for _, name in COMMAND.fields[3:]))
+_body_of = operator.attrgetter(*(name for _, name in BODY.fields[2:]))
+"""Values of a state, command or body in the order of their messages' fields."""
 
 
 class EpisodeRecorder:
@@ -130,18 +135,7 @@ class EpisodeRecorder:
                 f"/wire/{message.channel}", message.stamp_ns, WIRE.encode(message.stamp_ns, message.payload)
             )
         for state in record.states:
-            data = STATE.encode(
-                state.receive_ns,
-                state.device_ns,
-                state.sequence,
-                state.command_sequence,
-                state.command_age_ns,
-                int(state.status),
-                state.position,
-                state.velocity,
-                state.effort,
-            )
-            self._add("/state", state.receive_ns, data, state.sequence)
+            self._add("/state", state.receive_ns, STATE.encode(*_state_of(state)), state.sequence)
             self._add_joints("/joint_states", state.receive_ns, self._joints, state)
             self._add_body(state)
         self._add_command("/command/requested", "/joint_commands/requested", record, record.requested)
@@ -259,21 +253,7 @@ class EpisodeRecorder:
         body = state.body
         if body is None:
             return
-        data = BODY.encode(
-            state.receive_ns,
-            state.sequence,
-            body.orientation,
-            body.angular_velocity,
-            body.acceleration,
-            body.foot_force,
-            body.temperature,
-            body.lost,
-            body.battery,
-            body.voltage,
-            body.current,
-            body.sticks,
-            body.buttons,
-        )
+        data = BODY.encode(state.receive_ns, state.sequence, *_body_of(body))
         self._add("/body", state.receive_ns, data, state.sequence)
         w, x, y, z = body.orientation
         frames = 1, *self._wall(state.receive_ns), "world", "base"
@@ -300,18 +280,7 @@ class EpisodeRecorder:
         if command is None:
             return
         stamp_ns = record.sent_ns if record.sent_ns >= 0 else record.start_ns
-        data = COMMAND.encode(
-            stamp_ns,
-            record.cycle,
-            record.sent_sequence,
-            command.position_target,
-            command.velocity_target,
-            command.stiffness,
-            command.damping,
-            command.effort,
-            command.effort_limit,
-            command.speed_limit,
-        )
+        data = COMMAND.encode(stamp_ns, record.cycle, record.sent_sequence, *_command_of(command))
         self._add(topic, stamp_ns, data, record.cycle)
         self._add_joints(standard, stamp_ns, self._actuated, command)
 
