@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from deal_hw.control.behaviours import position_command
 from deal_hw.errors import (
     SafetyError,
     TransportError,
@@ -50,16 +51,7 @@ class RobotBench:
 def default_command(robot: Robot, target: float = 0.0) -> JointCommand:
     """Return a command with the description's gains and limits and this target for every actuated joint."""
     facts = robot.description
-    count = len(facts.actuated)
-    return JointCommand(
-        position_target=np.full(count, target),
-        velocity_target=np.zeros(count),
-        stiffness=np.array(facts.stiffness),
-        damping=np.array(facts.damping),
-        effort=np.zeros(count),
-        effort_limit=np.array(facts.effort_limit),
-        speed_limit=np.array(facts.speed_limit),
-    )
+    return position_command(facts, np.full(len(facts.actuated), target))
 
 
 class RobotSuite:

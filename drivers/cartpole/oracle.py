@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.clock import VirtualClock
+from deal_hw.control.behaviours import position_command
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.lqr import TARGET_LIMIT_M, LqrController, design_lqr
@@ -14,7 +15,6 @@ from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportTimeoutError
-from deal_hw.types import JointCommand
 
 BALANCE_S = 6.0
 FALLEN_RAD = 0.3
@@ -74,24 +74,11 @@ def balances(
         deadline_ns += period_ns
         position = _newest_position(robot, clock, deadline_ns)
         if position is not None:
-            robot.send_command(default_command(controller.act(position)))
+            robot.send_command(position_command(DESCRIPTION, np.array([controller.act(position)])))
         cart, pole = device.true_position
         if abs(pole) >= FALLEN_RAD or abs(cart) >= TARGET_LIMIT_M:
             return False
     return True
-
-
-def default_command(target_m: float) -> JointCommand:
-    """Return a position target with the description's gains and limits."""
-    return JointCommand(
-        position_target=np.array([target_m]),
-        velocity_target=np.zeros(1),
-        stiffness=np.array(DESCRIPTION.stiffness),
-        damping=np.array(DESCRIPTION.damping),
-        effort=np.zeros(1),
-        effort_limit=np.array(DESCRIPTION.effort_limit),
-        speed_limit=np.array(DESCRIPTION.speed_limit),
-    )
 
 
 def _newest_position(robot: CartpoleRobot, clock: VirtualClock, deadline_ns: int) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 from deal_hw.errors import MissingExtraError
 from deal_hw.workflows.emulation.common import (
@@ -26,36 +26,8 @@ from deal_hw.workflows.emulation.settings import (
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
-    from deal_hw.drivers.cartpole.emulator import Hazards
+    from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
     from deal_hw.drivers.cartpole.truth import CartpoleTruth
-
-
-class CartpoleOnAWire(Protocol):
-    """Interface of an emulated cart-pole on any wire."""
-
-    slips: int
-    dropped: int
-    changes: list[tuple[int, int, str]]
-
-    def open(self) -> str:
-        """Make the port; return the value of a host's ``--port``."""
-        ...
-
-    def close(self) -> None:
-        """Remove the port."""
-        ...
-
-    def step(self) -> bool:
-        """Run until the next tick; return whether the port still exists."""
-        ...
-
-    def cut(self) -> None:
-        """Cut the wire from now on, for the time in the hazards."""
-        ...
-
-    def report(self) -> dict[str, Any]:
-        """Return the events, as plain JSON values."""
-        ...
 
 
 def emulate_cartpole(
@@ -86,7 +58,7 @@ def emulate_cartpole(
         own["firmware"] = usable_firmware(config.firmware)
         runs = f", firmware {own['firmware']}"
     link = None if config.link is None else Path(config.link)
-    emulator: CartpoleOnAWire = make(truth, link=link, hazards=_hazards(config), **own)
+    emulator: CartpoleEmulator = make(truth, link=link, hazards=_hazards(config), **own)
     try:
         announce(f"port {emulator.open()}")
         announce(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.control.behaviours import position_command
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.dynamixel.registers import (
     PULSES,
@@ -17,7 +19,6 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
 from deal_hw.drivers.cartpole.dynamixel.servos import PoleAngle, Servos
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.errors import SafetyError, TransportTimeoutError
-from deal_hw.types import JointCommand
 
 _PERIOD_NS = 10_000_000
 """Time between two requests; short enough for the belt servo's watchdog."""
@@ -123,13 +124,9 @@ class Homing:
                 self._servos.send(goal._replace(position=target))
 
     def _goal(self, position: int) -> Goal:
-        d, s = self._description, self._settings
-        command = JointCommand(
-            position_target=np.zeros(1),
-            velocity_target=np.zeros(1),
-            stiffness=np.array(d.stiffness),
-            damping=np.array(d.damping),
-            effort=np.zeros(1),
+        s = self._settings
+        command = dataclasses.replace(
+            position_command(self._description, np.zeros(1)),
             effort_limit=np.array([s.homing_effort_n]),
             speed_limit=np.array([s.homing_speed_m_s]),
         )
