@@ -12,16 +12,15 @@ expired. Programs without claims are detected by their commands ( :mod:`takeover
 from __future__ import annotations
 
 import contextlib
-import json
 import threading
 import uuid
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages.rpc import Request, decode_request, encode_request
+from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
 from deal_hw.drivers.go2.messages.topics import CLAIM
-from deal_hw.errors import FrameError, PortBusyError, TransportError, TransportTimeoutError
+from deal_hw.errors import PortBusyError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 
 LISTEN_S: Final = 0.8
@@ -88,7 +87,7 @@ class WireClaim:
                 next_ns += round(_ASK_S * 1e9)
             self._listen((min(next_ns, end_ns) - now_ns) * 1e-9, self._yield_to)
 
-    def _yield_to(self, claim: dict[str, Any]) -> None:
+    def _yield_to(self, claim: dict[str, str]) -> None:
         if claim["state"] == HELD or (claim["state"] == ASKING and claim["id"] < self._identity):
             raise PortBusyError(
                 f"go2: the robot is in use: {claim['who']} commands it, or is about to. Two programs that "
@@ -111,35 +110,21 @@ class WireClaim:
                 with contextlib.suppress(TransportError):
                     self._transport.reopen()
 
-    def _answer(self, claim: dict[str, Any]) -> None:
+    def _answer(self, claim: dict[str, str]) -> None:
         if claim["state"] == ASKING:
             self._say(HELD)
 
-    def _listen(self, timeout_s: float, handle: Callable[[dict[str, Any]], None]) -> None:
+    def _listen(self, timeout_s: float, handle: Callable[[dict[str, str]], None]) -> None:
         """Pass another claim's message to ``handle``; return after one message or the time [s]."""
         try:
             message = self._transport.receive(timeout_s)
         except TransportTimeoutError:
             return
-        claim = read_claim(message.payload) if message.channel == CLAIM else None
+        claim = read_note(message.payload, CLAIM_TEXTS) if message.channel == CLAIM else None
         if claim is not None and claim["id"] != self._identity:
             handle(claim)
 
     def _say(self, state: str) -> None:
-        text = json.dumps({"id": self._identity, "who": self._holder, "state": state})
-        payload = encode_request(Request(identity=0, api=0, parameter=text, no_reply=True))
+        payload = encode_note({"id": self._identity, "who": self._holder, "state": state})
         with contextlib.suppress(TransportTimeoutError):
             self._transport.send(Message(CLAIM, payload, self._clock.now_ns()))
-
-
-def read_claim(payload: bytes) -> dict[str, Any] | None:
-    """Return the claim in a message, its ``id``, ``who`` and ``state`` as text; None where it is none."""
-    try:
-        values = json.loads(decode_request(payload).parameter)
-    except (FrameError, ValueError, RecursionError):
-        return None
-    if not isinstance(values, dict) or not all(
-        isinstance(values.get(k), str) for k in ("id", "who", "state")
-    ):
-        return None
-    return {**values, "who": values["who"][:200]}

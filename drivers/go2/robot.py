@@ -11,7 +11,6 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.go2.bridge.status import read_status
 from deal_hw.drivers.go2.command_sender import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.go2.connect import await_robot
 from deal_hw.drivers.go2.descriptions import on_stand
@@ -21,6 +20,7 @@ from deal_hw.drivers.go2.messages.body import body_state, is_damped
 from deal_hw.drivers.go2.messages.protocol import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.remote import decode_remote, parse_combination
+from deal_hw.drivers.go2.messages.rpc import STATUS_TEXTS, read_note
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.go2.takeover import Takeover
@@ -334,7 +334,7 @@ class Go2Robot(Robot):
         Raises:
             SafetyError: Another controller has it, and this one has just begun to take it over.
         """
-        status = read_status(message.payload)
+        status = read_note(message.payload, STATUS_TEXTS)
         if status is None:
             return
         self._bridged = True

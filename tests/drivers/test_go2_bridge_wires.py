@@ -11,11 +11,10 @@ from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.bridge.admission import Control
 from deal_hw.drivers.go2.bridge.bridge import Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
-from deal_hw.drivers.go2.bridge.status import read_status
 from deal_hw.drivers.go2.fake import STIFF, FakeGo2, FakeTopics
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.messages.rpc import Request, encode_request
+from deal_hw.drivers.go2.messages.rpc import STATUS_TEXTS, Request, encode_request, read_note
 from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
 from deal_hw.drivers.transports.zenoh_stamps import Echo, read_stamp
 from deal_hw.errors import TransportError, TransportLostError
@@ -149,12 +148,12 @@ def test_clients_hear_states_with_stamps_and_who_has_the_robot(make_bench: Calla
     stamps = [read_stamp(message.attachment) for message in states]
     assert [stamp.time_ns for stamp in stamps if stamp] == [message.stamp_ns for message in states]
     assert len({stamp.session for stamp in stamps if stamp}) == 1
-    told = [read_status(message.payload) for message in bench.heard(topics.BRIDGE)]
+    told = [read_note(message.payload, STATUS_TEXTS) for message in bench.heard(topics.BRIDGE)]
     assert 5 <= len(told) <= 7
     before = len(told)
     bench.say(topics.LOW_COMMAND, DAMPING, 0)
     bench.run(4)
-    status = read_status(bench.heard(topics.BRIDGE)[before].payload)
+    status = read_note(bench.heard(topics.BRIDGE)[before].payload, STATUS_TEXTS)
     assert status == {"control": "controlled", "reason": "a controller took the robot over"}
 
 
@@ -223,12 +222,12 @@ def test_it_damps_when_it_ends_and_when_its_thread_fails(make_bench: Callable[[s
     bench.bridge.close()
     assert len(bench.go2.heard) >= count + 10
     assert not bench.network.is_open
-    last = read_status(bench.heard(topics.BRIDGE)[-1].payload)
+    last = read_note(bench.heard(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
     assert last == {"control": "damping", "reason": "the bridge ends"}
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"control": 1, "reason": "x"}', "rubbish"])
 def test_what_is_no_status_is_passed_over(text: str) -> None:
     """Whatever stands on the topic."""
-    assert read_status(encode_request(Request(0, 0, text))) is None
-    assert read_status(text.encode()) is None
+    assert read_note(encode_request(Request(0, 0, text)), STATUS_TEXTS) is None
+    assert read_note(text.encode(), STATUS_TEXTS) is None

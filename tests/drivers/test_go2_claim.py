@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2 import claim as module
-from deal_hw.drivers.go2.claim import ASKING, HELD, RELEASED, WireClaim, read_claim
-from deal_hw.drivers.go2.messages.rpc import Request, encode_request
+from deal_hw.drivers.go2.claim import ASKING, HELD, RELEASED, WireClaim
+from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, Request, encode_request, read_note
 from deal_hw.drivers.go2.messages.topics import CLAIM
 from deal_hw.drivers.transports.interfaces import list_interfaces
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
@@ -83,7 +83,7 @@ class End(TopicTransport):
             raise TransportLostError("gone")
         if self.cut:
             return
-        if (claim := read_claim(message.payload)) is not None:
+        if (claim := read_note(message.payload, CLAIM_TEXTS)) is not None:
             self._bus.said.append((claim["id"], claim["state"]))
         for end in list(self._bus.ends):
             if end is not self:
@@ -216,7 +216,7 @@ def test_a_wire_that_cannot_be_opened_leaves_nothing_open(bus: Bus) -> None:
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_claim_or_none(payload: bytes) -> None:
     """Nothing that is heard raises."""
-    assert read_claim(payload) is None or isinstance(read_claim(payload), dict)
+    assert read_note(payload, CLAIM_TEXTS) is None or isinstance(read_note(payload, CLAIM_TEXTS), dict)
 
 
 KEYS = st.sampled_from(["id", "who", "state", "x"])
@@ -226,7 +226,7 @@ LEAVES = st.none() | st.booleans() | st.floats() | st.text()
 @given(st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(KEYS, inner), max_leaves=8))
 def test_any_json_is_a_claim_or_none(values: object) -> None:
     """Text in the three fields, and no more than 200 characters of a name."""
-    claim = read_claim(encode_request(Request(0, 0, json.dumps(values))))
+    claim = read_note(encode_request(Request(0, 0, json.dumps(values))), CLAIM_TEXTS)
     sound = isinstance(values, dict) and all(isinstance(values.get(k), str) for k in ("id", "who", "state"))
     assert (claim is not None) == sound
     assert claim is None or len(claim["who"]) <= 200
@@ -234,7 +234,7 @@ def test_any_json_is_a_claim_or_none(values: object) -> None:
 
 def test_a_text_nested_too_deep_is_no_claim() -> None:
     """Python's parser gives up with an error of its own kind."""
-    assert read_claim(encode_request(Request(0, 0, "[" * 100_000))) is None
+    assert read_note(encode_request(Request(0, 0, "[" * 100_000)), CLAIM_TEXTS) is None
 
 
 # Real wires.

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2.bridge.status import encode_status
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.fake import RESTING, STIFF, FakeBench, FakeGo2
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import decode_low_command, decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.rpc import encode_note
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.errors import (
     FrameError,
@@ -466,7 +466,7 @@ def test_make_passive_reports_what_the_robot_shows() -> None:
 
 def status(control: str, reason: str = "no admissible command") -> bytes:
     """Return what a bridge says."""
-    return encode_status({"control": control, "reason": reason})
+    return encode_note({"control": control, "reason": reason})
 
 
 def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:

@@ -15,12 +15,11 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.go2.bridge.admission import Admission, Control
 from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits
-from deal_hw.drivers.go2.bridge.status import encode_status
-from deal_hw.drivers.go2.claim import read_claim
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.refusals import StateCheck
+from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
 from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, ServiceClient
 from deal_hw.drivers.transports.zenoh_stamps import Stamp
 from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
@@ -167,7 +166,7 @@ class Go2Bridge:
                 # Encoded again, so that other fields of a LowCmd (battery switch, lights) do not pass.
                 self._to_robot(topics.LOW_COMMAND, self._encoder.encode(command))
         elif message.channel == topics.CLAIM:
-            if read_claim(message.payload) is not None:
+            if read_note(message.payload, CLAIM_TEXTS) is not None:
                 self._to_robot(message.channel, message.payload)
         elif self.admission.request(message, now_ns):
             self._to_robot(message.channel, message.payload)
@@ -196,7 +195,7 @@ class Go2Bridge:
             self._say_status()
 
     def _say_status(self) -> None:
-        payload = encode_status(self.admission.status())
+        payload = encode_note(self.admission.status())
         self._send(self._network, Message(topics.BRIDGE, payload, self._clock.now_ns()))
 
     def _send(self, side: TopicTransport, message: Message) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -95,6 +96,27 @@ def decode_request(payload: bytes) -> Request:
     _, identity, api, lease, priority, no_reply = _REQUEST.unpack_from(payload)
     parameter, binary = _text_of(payload, "Request", _REQUEST.size)
     return Request(identity, api, parameter, lease, priority, no_reply, binary)
+
+
+CLAIM_TEXTS: Final = {"id": 200, "who": 200, "state": 200}
+STATUS_TEXTS: Final = {"control": 40, "reason": 400}
+"""Texts of a claim, and of the bridge's status (who controls the robot, and why) -> most characters."""
+
+
+def encode_note(values: Mapping[str, Any]) -> bytes:
+    """Return a message between deal-hw's own programs: JSON in a request that nobody answers."""
+    return encode_request(Request(identity=0, api=0, parameter=json.dumps(dict(values)), no_reply=True))
+
+
+def read_note(payload: bytes, texts: Mapping[str, int]) -> dict[str, str] | None:
+    """Return texts of such a message, each cut to its most characters; None where one is missing."""
+    try:
+        values = json.loads(decode_request(payload).parameter)
+    except (FrameError, ValueError, RecursionError):
+        return None
+    if not isinstance(values, dict) or not all(isinstance(values.get(name), str) for name in texts):
+        return None
+    return {name: values[name][:most] for name, most in texts.items()}
 
 
 def encode_response(response: Response) -> bytes:
