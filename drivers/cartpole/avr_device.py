@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import struct
-
-from fastcrc import crc16
 
 from deal_hw.drivers.cartpole import native
-from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of
+from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of, stored
 from deal_hw.drivers.cartpole.link import SerialLink
-from deal_hw.drivers.cartpole.rig_device import NOMINAL_RIG, Rig, RigDevice, delay_ticks
+from deal_hw.drivers.cartpole.rig_device import (
+    BYTES_PER_TICK,
+    NOMINAL_RIG,
+    ChipOutputs,
+    Rig,
+    RigChip,
+    RigDevice,
+    delay_ticks,
+)
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError
 
-_BYTES_PER_TICK = 99
-"""One byte less than 1 Mbaud carries in 1 ms, so that no byte is left over."""
 _INSTALL = "apt-get install gcc libc6-dev gcc-avr avr-libc libsimavr-dev libelf-dev, or use --firmware python"
 
 
-class _Outputs(ctypes.Structure):
-    _fields_ = [
-        ("pwm", ctypes.c_double),
-        ("armed", ctypes.c_int32),
-        ("set_pole", ctypes.c_int32),
+class _Outputs(ChipOutputs):
+    _fields_ = (
         ("longest_step", ctypes.c_uint32),
         ("asleep", ctypes.c_uint32),
         ("complaints", ctypes.c_uint32),
         ("crashed", ctypes.c_int32),
-    ]
+    )
 
 
 @functools.cache
@@ -45,41 +45,20 @@ def library() -> ctypes.CDLL:
         board = ctypes.CDLL(str(path))
     except OSError as error:
         raise ConfigurationError(f"the simulator of the AVR cannot be loaded: {error}; {_INSTALL}") from error
-    integer, number = ctypes.c_int32, ctypes.c_uint32
     board.board_open.restype = ctypes.c_void_p
-    board.board_open.argtypes = [ctypes.c_char_p, ctypes.c_char_p, number]
+    board.board_open.argtypes = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32]
     board.board_close.argtypes = [ctypes.c_void_p]
-    board.board_tick.restype = number
-    board.board_tick.argtypes = [
-        ctypes.c_void_p,
-        integer,
-        integer,
-        ctypes.c_int,
-        ctypes.c_int,
-        ctypes.c_char_p,
-        number,
-        ctypes.c_char_p,
-        ctypes.POINTER(_Outputs),
-    ]
+    board.board_tick.restype = ctypes.c_uint32
+    board.board_tick.argtypes = [ctypes.c_void_p, *RigChip.ARGUMENTS]
     return board
 
 
 def eeprom(settings: Settings, full_force_n: float) -> bytes:
     """Return the contents of the chip's EEPROM: the settings with their CRC, little-endian."""
-    data = struct.pack(
-        "<5I2H",
-        settings.stiffness_trim,
-        settings.damping_trim,
-        settings.effort_trim,
-        settings.speed_trim,
-        settings.unique_id,
-        settings.delay_ticks,
-        round(full_force_n * 1000),
-    )
-    return data + struct.pack("<H", crc16.ibm_3740(data))
+    return stored(settings, round(full_force_n * 1000))
 
 
-class Chip:
+class Chip(RigChip):
     """An ATmega328P with the firmware's image: pins and bytes, one millisecond per call.
 
     Attributes:
@@ -95,39 +74,19 @@ class Chip:
         ConfigurationError: avr-gcc, a C compiler or simavr is missing, or the image cannot be read.
     """
 
+    outputs: _Outputs
+
     def __init__(self, memory: bytes) -> None:
-        self.outputs = _Outputs()
         self.longest_step = self.asleep = self.complaints = 0
         self._library = library()
         self._board = self._library.board_open(str(native.image()).encode(), memory, len(memory))
         if not self._board:
             raise ConfigurationError(f"simavr cannot run {native.image()}; remove that folder and try again")
-        self._out = ctypes.create_string_buffer(1024)
-        self._inbox = b""
+        run = functools.partial(self._library.board_tick, self._board)
+        super().__init__(run, _Outputs(), BYTES_PER_TICK)
 
-    def tick(
-        self,
-        cart_counts: int = 0,
-        pole_counts: int = 0,
-        switches: tuple[bool, bool] = (False, False),
-        data: bytes = b"",
-    ) -> bytes:
-        """Run a millisecond; return the bytes sent in it.
-
-        Args:
-            cart_counts: Motion of the cart's encoder.
-            pole_counts: Motion of the pole's encoder.
-            switches: Whether the left and the right limit switch are closed.
-            data: Bytes from the host; they come as fast as 1 Mbaud carries them, also in later calls.
-
-        Raises:
-            ConfigurationError: The chip's program ended.
-        """
-        outputs, self._inbox = self.outputs, self._inbox + data
-        rx, self._inbox = self._inbox[:_BYTES_PER_TICK], self._inbox[_BYTES_PER_TICK:]
-        length = self._library.board_tick(
-            self._board, cart_counts, pole_counts, *switches, rx, len(rx), self._out, ctypes.byref(outputs)
-        )
+    def _note(self) -> None:
+        outputs = self.outputs
         if outputs.crashed:
             raise ConfigurationError(
                 "the chip's program ended, which is an error of the firmware; report "
@@ -136,7 +95,6 @@ class Chip:
         self.longest_step = max(self.longest_step, outputs.longest_step)
         self.asleep += outputs.asleep
         self.complaints += outputs.complaints
-        return self._out.raw[:length]
 
     def close(self) -> None:
         """Free the simulator's memory."""

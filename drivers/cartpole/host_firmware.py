@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import struct
 from collections.abc import Callable
+
+from fastcrc import crc16
 
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.controller import Mode
@@ -50,6 +53,13 @@ def settings_of(truth: CartpoleTruth, delay_ticks: int) -> Settings:
     }
     trims = [round(truth.parameters[f"servo.{name}"] / value * _ONE) for name, value in nominal.items()]
     return Settings(*trims, unique_id(truth), delay_ticks)
+
+
+def stored(settings: Settings, *more: int) -> bytes:
+    """Return settings and more 16-bit numbers with their CRC, little-endian, as a chip keeps them."""
+    known = [getattr(settings, name) for name, *_ in Settings._fields_]
+    data = struct.pack(f"<5I{1 + len(more)}H", *known, *more)
+    return data + struct.pack("<H", crc16.ibm_3740(data))
 
 
 @functools.cache

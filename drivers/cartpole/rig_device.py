@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Any, ClassVar, Final
 
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import EmulatedDevice
@@ -37,8 +39,8 @@ class Rig:
 NOMINAL_RIG: Final = Rig()
 
 
-class ChipOutputs(Protocol):
-    """What a chip's pins did in the last millisecond.
+class ChipOutputs(ctypes.Structure):
+    """What a chip's pins did in the last millisecond; the chips add fields of their own.
 
     Attributes:
         pwm: Mean of the motor's PWM, negative to the left.
@@ -46,18 +48,41 @@ class ChipOutputs(Protocol):
         set_pole: Whether the lamp "set the pole upright" is on.
     """
 
-    pwm: float
-    armed: int
-    set_pole: int
+    _fields_: ClassVar[Sequence[Any]] = (
+        ("pwm", ctypes.c_double),
+        ("armed", ctypes.c_int32),
+        ("set_pole", ctypes.c_int32),
+    )
 
 
-class RigChip(Protocol):
-    """A chip, one millisecond for each call."""
+BYTES_PER_TICK: Final = 99
+"""One byte less than 1 Mbaud carries in 1 ms, so that no byte is left over."""
 
-    @property
-    def outputs(self) -> ChipOutputs:
-        """Its outputs in the last millisecond."""
-        ...
+
+class RigChip:
+    """A chip that a C library runs, one millisecond for each call.
+
+    Attributes:
+        outputs: Its outputs in the last millisecond.
+
+    Args:
+        run: The library's function for a millisecond.
+        outputs: Where that function writes them.
+        most: Bytes that the wire carries in a millisecond; None: all at once.
+    """
+
+    ARGUMENTS: ClassVar[Sequence[Any]] = (
+        *[ctypes.c_int32] * 2,
+        *[ctypes.c_int] * 2,
+        *(ctypes.c_char_p, ctypes.c_uint32, ctypes.c_char_p, ctypes.c_void_p),
+    )
+    """Types of the function's arguments."""
+
+    def __init__(self, run: Callable[..., int], outputs: ChipOutputs, most: int | None) -> None:
+        self.outputs = outputs
+        self._run, self._most = run, most
+        self._out = ctypes.create_string_buffer(4096)
+        self._inbox = b""
 
     def tick(
         self,
@@ -66,12 +91,31 @@ class RigChip(Protocol):
         switches: tuple[bool, bool] = (False, False),
         data: bytes = b"",
     ) -> bytes:
-        """Run a millisecond with this motion of the encoders; return the bytes sent in it."""
-        ...
+        """Run a millisecond; return the bytes or frames sent in it.
+
+        Args:
+            cart_counts: Motion of the cart's encoder.
+            pole_counts: Motion of the pole's encoder.
+            switches: Whether the left and the right limit switch are closed.
+            data: From the host; it comes as fast as the wire carries it, also in later calls.
+
+        Raises:
+            ConfigurationError: The chip's program ended.
+        """
+        inbox = self._inbox + data
+        most = len(inbox) if self._most is None else self._most
+        data, self._inbox = inbox[:most], inbox[most:]
+        length = self._run(
+            cart_counts, pole_counts, *switches, data, len(data), self._out, ctypes.byref(self.outputs)
+        )
+        self._note()
+        return self._out.raw[:length]
+
+    def _note(self) -> None:
+        """Take note of the outputs."""
 
     def close(self) -> None:
         """Free its memory."""
-        ...
 
 
 def delay_ticks(truth: CartpoleTruth) -> int:

@@ -8,31 +8,31 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import struct
-
-from fastcrc import crc16
 
 from deal_hw.drivers.cartpole import native
 from deal_hw.drivers.cartpole.can_link import NODE, CanLink
-from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of
+from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of, stored
 from deal_hw.drivers.cartpole.link import SerialLink
-from deal_hw.drivers.cartpole.rig_device import NOMINAL_RIG, Rig, RigDevice, delay_ticks
+from deal_hw.drivers.cartpole.rig_device import (
+    BYTES_PER_TICK,
+    NOMINAL_RIG,
+    ChipOutputs,
+    Rig,
+    RigChip,
+    RigDevice,
+    delay_ticks,
+)
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
-_BYTES_PER_TICK = 99
-"""One byte less than 1 Mbaud carries in 1 ms, so that no byte is left over."""
 _INSTALL = "apt-get install gcc libc6-dev, or set CC"
 
 
-class _Outputs(ctypes.Structure):
-    _fields_ = [
-        ("pwm", ctypes.c_double),
-        ("armed", ctypes.c_int32),
-        ("set_pole", ctypes.c_int32),
+class _Outputs(ChipOutputs):
+    _fields_ = (
         ("unserved_ms", ctypes.c_uint32),
         ("filtered", ctypes.c_uint32),
         ("bit_rate", ctypes.c_uint32),
-    ]
+    )
 
 
 @functools.cache
@@ -49,20 +49,10 @@ def library(*, encoder: bool = False) -> ctypes.CDLL:
     chip = ctypes.CDLL(
         str(native.build("stm32.so", command, ("host/stm32.c", "rig.c", *native.CORE), _INSTALL))
     )
-    integer, number, data = ctypes.c_int32, ctypes.c_uint32, ctypes.c_char_p
-    chip.chip_start.restype, chip.chip_start.argtypes = None, [data, number, ctypes.c_int]
+    number = ctypes.c_uint32
+    chip.chip_start.restype, chip.chip_start.argtypes = None, [ctypes.c_char_p, number, ctypes.c_int]
     chip.chip_bus.restype, chip.chip_bus.argtypes = None, [ctypes.c_int, number, ctypes.c_int]
-    chip.chip_tick.restype = number
-    chip.chip_tick.argtypes = [
-        integer,
-        integer,
-        ctypes.c_int,
-        ctypes.c_int,
-        data,
-        number,
-        data,
-        ctypes.POINTER(_Outputs),
-    ]
+    chip.chip_tick.restype, chip.chip_tick.argtypes = number, RigChip.ARGUMENTS
     return chip
 
 
@@ -78,23 +68,10 @@ def flash_page(
         can_kbit: Bit rate of the CAN bus: 250, 500 or 1000 [kbit/s].
         drive: Number of the motor drive beside a pole encoder node.
     """
-    data = struct.pack(
-        "<5I5H",
-        settings.stiffness_trim,
-        settings.damping_trim,
-        settings.effort_trim,
-        settings.speed_trim,
-        settings.unique_id,
-        settings.delay_ticks,
-        round(full_force_n * 1000),
-        node,
-        can_kbit,
-        drive,
-    )
-    return data + struct.pack("<H", crc16.ibm_3740(data))
+    return stored(settings, round(full_force_n * 1000), node, can_kbit, drive)
 
 
-class Stm32Chip:
+class Stm32Chip(RigChip):
     """The port with its registers in memory; only the one that started last lives.
 
     Attributes:
@@ -112,35 +89,9 @@ class Stm32Chip:
     """
 
     def __init__(self, page: bytes, *, can: bool = True, encoder: bool = False) -> None:
-        self.outputs = _Outputs()
-        self._can = can
         self._library = library(encoder=encoder)
         self._library.chip_start(page, len(page), can)
-        self._out = ctypes.create_string_buffer(4096)
-        self._inbox = b""
-
-    def tick(
-        self,
-        cart_counts: int = 0,
-        pole_counts: int = 0,
-        switches: tuple[bool, bool] = (False, False),
-        data: bytes = b"",
-    ) -> bytes:
-        """Run a millisecond; return the bytes or frames sent in it.
-
-        Args:
-            cart_counts: Motion of the cart's encoder.
-            pole_counts: Motion of the pole's encoder.
-            switches: Whether the left and the right limit switch are closed.
-            data: From the host; it comes as fast as the wire carries it, also in later calls.
-        """
-        self._inbox += data
-        most = len(self._inbox) if self._can else _BYTES_PER_TICK
-        data, self._inbox = self._inbox[:most], self._inbox[most:]
-        length = self._library.chip_tick(
-            cart_counts, pole_counts, *switches, data, len(data), self._out, ctypes.byref(self.outputs)
-        )
-        return self._out.raw[:length]
+        super().__init__(self._library.chip_tick, _Outputs(), None if can else BYTES_PER_TICK)
 
     def bus(self, *, silent: bool = False, errors: int = 0, overrun: bool = False) -> None:
         """Let the bus fail.
@@ -151,9 +102,6 @@ class Stm32Chip:
             overrun: A frame from the host found the controller full.
         """
         self._library.chip_bus(silent, errors, overrun)
-
-    def close(self) -> None:
-        """Nothing is left behind."""
 
 
 class Stm32Device(RigDevice):
