@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 import tyro
+from fakes.go2 import FakeGo2
 
 from deal_hw.bench.rows import describe_call
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
-from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,

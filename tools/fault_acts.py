@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from fakes.faulty_proxy import FaultyProxy, State
 from fault_rig import (
     ANY,
     ARMING,
@@ -24,8 +25,6 @@ from fault_rig import (
     Rig,
     headline,
 )
-
-from deal_hw.testing.faulty_proxy import FaultyProxy, State
 
 
 def signal_run(number: signal.Signals) -> Callable[[Rig], None]:

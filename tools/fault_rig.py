@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from fakes.faulty_policy import RARE_M_S, faulty_policy
+from fakes.faulty_proxy import FaultyProxy
 
 from deal_hw.description import RobotDescription
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
-from deal_hw.testing.faulty_proxy import FaultyProxy
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
 UNDER_TEST = os.environ.get("DEAL_HW_PYTHON", sys.executable)

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from fakes.go2 import FakeGo2
 from fuzz.cartpole_wires import blocks, read_answer
 from rich.console import Console
 from rich.progress import track
@@ -32,7 +33,6 @@ from rich.progress import track
 from deal_hw.bench.rows import write_rows
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.dynamixel import packets
-from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.wire import without_padding

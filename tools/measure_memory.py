@@ -27,6 +27,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from fakes.recorded_commands import RecordedCommands
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.bench.rows import describe_call
 from deal_hw.calib.data.problem import Problem
@@ -35,8 +37,6 @@ from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
-from deal_hw.testing.recorded_commands import RecordedCommands
-from deal_hw.testing.simulated_episode import simulated_episode
 
 Unit = Literal["generation", "run"]
 

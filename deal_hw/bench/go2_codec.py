@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.bench.rows import describe_machine, write_rows
-from deal_hw.drivers.go2.fake import FakeGo2
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,
@@ -63,8 +64,8 @@ def _calls() -> dict[str, Callable[[], object]]:
     rng = np.random.default_rng(0)
     parts = rng.normal(size=(5, 12))
     command = LowCommand(*parts)
-    encoder, state = LowCommandEncoder(), FakeGo2(pose=rng.normal(size=12)).state()
-    command_bytes, state_bytes = encoder.encode(command), encode_low_state(state)
+    encoder, (_, state_bytes) = LowCommandEncoder(), Go2Device(nominal_truth(), sport="").tick()[0]
+    command_bytes, state = encoder.encode(command), decode_low_state(state_bytes).values()
     return {
         "encode LowCmd with CRC": lambda: encoder.encode(command),
         "decode LowState": lambda: decode_low_state(state_bytes, strict=False),

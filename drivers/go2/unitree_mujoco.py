@@ -1,6 +1,6 @@
 """The vendor's simulator unitree_mujoco in the place of a Go2, and the checks for its states.
 
-It uses the Go2's topics, and fills less of them (:mod:`deal_hw.drivers.go2.emulator.unitree_mujoco` has the
+It uses the Go2's topics, and fills less of them (:mod:`fakes.unitree_mujoco` has the
 facts). An option must name the simulator. A state with a head or a battery is from a real robot, and is
 refused.
 

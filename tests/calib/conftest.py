@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from fakes.recorded_commands import RecordedCommands
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
@@ -17,8 +19,6 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
-from deal_hw.testing.recorded_commands import RecordedCommands
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
 Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]

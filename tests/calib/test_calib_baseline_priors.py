@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings
 from deal_hw.calib.baselines.least_squares import LeastSquaresBaseline
@@ -15,7 +16,6 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
-from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")
 METHODS = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.data.checks import check_delays
 from deal_hw.calib.data.problem import Problem
@@ -13,7 +14,6 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
-from deal_hw.testing.simulated_episode import simulated_episode
 
 TICKS = 7
 """Device periods of 1 ms by which the robot acts late."""

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fakes.fixed_search import FixedSearch
 
 from deal_hw.bench.tasks import Case
 from deal_hw.calib.data.problem import Problem
@@ -16,7 +17,6 @@ from deal_hw.calib.pipeline import CalibrationPipeline
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
 from deal_hw.calib.validation.verdict import Validation, unexplained
 from deal_hw.calibration import Budget
-from deal_hw.testing.fixed_search import FixedSearch
 
 
 def test_folds_are_disjoint_and_cover_everything(noisy_problem: Problem) -> None:

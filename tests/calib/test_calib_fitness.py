@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fakes.recorded_commands import RecordedCommands
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
@@ -23,8 +25,6 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
-from deal_hw.testing.recorded_commands import RecordedCommands
-from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")
 SETTINGS = FitnessSettings(critic=CriticSettings(hidden=(32, 32)))

@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings, Innovations
 from deal_hw.calib.data.problem import Problem
@@ -16,7 +17,6 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
 TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}

@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 import pytest
+from fakes.recorded_commands import RecordedCommands
 
 from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
@@ -28,7 +29,6 @@ from deal_hw.calibration import Budget
 from deal_hw.errors import InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
-from deal_hw.testing.recorded_commands import RecordedCommands
 
 FREE = ("cart.frictionloss", "servo.damping")
 SECONDS = 1.2

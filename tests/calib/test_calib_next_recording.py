@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.design.advice import menu_designs, next_recordings, next_step, options
 from deal_hw.calib.report.gather import ReportInputs
@@ -21,7 +22,6 @@ from deal_hw.drivers.go2.descriptions.floor import parameter_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
-from deal_hw.testing.simulated_episode import simulated_episode
 
 
 def result(space: ParameterSpace, verdict: str, std: float = 0.3) -> CalibrationResult:

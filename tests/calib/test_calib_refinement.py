@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from fakes.fixed_search import FixedSearch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
@@ -39,7 +40,6 @@ from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
-from deal_hw.testing.fixed_search import FixedSearch
 from deal_hw.types import FloatArray
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,7 +37,6 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.sim.recordings.parts import part, stretches
-from deal_hw.testing.simulated_episode import simulated_episode
 
 HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"
 

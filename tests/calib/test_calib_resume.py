@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
@@ -20,7 +21,6 @@ from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Pr
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
-from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")
 

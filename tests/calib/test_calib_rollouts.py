@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fakes.recorded_commands import RecordedCommands
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.innovations import Members, explained, linearise, predict
@@ -20,7 +21,6 @@ from deal_hw.calib.deal_paper.rollouts import (
 from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.eki import logistic, logit
 from deal_hw.errors import InsufficientDataError
-from deal_hw.testing.recorded_commands import RecordedCommands
 from deal_hw.types import FloatArray
 
 

@@ -10,6 +10,7 @@ import types
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.baselines.sysid import MujocoSysid, SysidSettings, with_delay
 from deal_hw.calib.data.problem import Problem
@@ -23,7 +24,6 @@ from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.sim.recordings.sysid_adapter import SysidRecording, identify, require_sysid
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
 TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5, "servo.speed_limit": 0.5}

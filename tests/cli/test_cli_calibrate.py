@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calibration import read_result
 from deal_hw.cli.calibrate import Calibrate, calibrate
@@ -19,7 +20,6 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
 from deal_hw.workflows.calibration.model import Recordings
 from deal_hw.workflows.calibration.settings import prepare

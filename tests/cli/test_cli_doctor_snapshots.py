@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.go2 import STIFF
+from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.cli.main import main
 from deal_hw.clock import VirtualClock
@@ -28,8 +30,6 @@ from deal_hw.drivers.cartpole.truth import nominal_truth as nominal_cartpole
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
-from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
-from deal_hw.drivers.go2.fake import STIFF
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.transports import interfaces
 from deal_hw.drivers.transports.dds_discovery import DdsEndpoint, DdsPeer, DdsSurvey

@@ -9,6 +9,7 @@ from typing import Any
 
 import onnx
 import pytest
+from fakes.faulty_policy import faulty_policy
 
 from deal_hw.cli.main import main
 from deal_hw.cli.show import Terminal
@@ -17,7 +18,6 @@ from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.policy import VERDICT
-from deal_hw.testing.faulty_policy import faulty_policy
 from deal_hw.workflows.running.plan import RunPlan, check_plan
 from deal_hw.workflows.shipped import shipped_policy
 

@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from fakes.linear_policy import feedback_spec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +25,6 @@ from deal_hw.policy import (
     PolicySpec,
     Quantity,
 )
-from deal_hw.testing.linear_policy import feedback_spec
 
 SPEC = PolicySpec(
     robot="cartpole",

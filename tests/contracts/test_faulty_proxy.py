@@ -6,8 +6,7 @@ import socket
 from collections.abc import Iterator
 
 import pytest
-
-from deal_hw.testing.faulty_proxy import FaultyProxy
+from fakes.faulty_proxy import FaultyProxy
 
 SHORT_S = 0.2
 LONG_S = 10.0

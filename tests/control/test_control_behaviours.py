@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.linear_policy import LinearPolicy, feedback_spec
 
 from deal_hw.control.behaviours import HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
-from deal_hw.testing.linear_policy import LinearPolicy, feedback_spec
 from deal_hw.types import FloatArray, RobotState, Status, Trajectory
 
 SPEC = feedback_spec(DESCRIPTION)

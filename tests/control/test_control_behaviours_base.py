@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fakes.linear_policy import feedback_spec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,6 @@ from deal_hw.control.velocity import FixedVelocity
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import PolicyError, PolicyMismatchError
 from deal_hw.policy import Observation, ObservationBuilder, ObservationTerm, PolicySpec
-from deal_hw.testing.linear_policy import feedback_spec
 from deal_hw.types import BodyState, FloatArray, RobotState, Status
 
 AXES = ("x", "y", "z")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.linear_policy import LinearPolicy, feedback_spec
 
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
@@ -22,7 +23,6 @@ from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
-from deal_hw.testing.linear_policy import LinearPolicy, feedback_spec
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
 MS = 1_000_000

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from fakes.faulty_policy import RARE_M_S, faulty_policy
+from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
@@ -39,8 +41,6 @@ from deal_hw.errors import (
     SafetyError,
     WrongDeviceError,
 )
-from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
-from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.types import Status
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.unitree_mujoco import PUBLISHED, SUBSCRIBED, UnitreeMujoco
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.loop import Outcome
@@ -16,7 +17,6 @@ from deal_hw.control.posture import PostureConfig
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.emulator.unitree_mujoco import PUBLISHED, SUBSCRIBED, UnitreeMujoco
 from deal_hw.errors import SafetyError, TransportTimeoutError, VersionMismatchError
 from deal_hw.transport import Message, WireOptions
 from deal_hw.workflows.emulation.go2 import free_port

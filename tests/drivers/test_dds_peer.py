@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.go2 import FakeGo2
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,

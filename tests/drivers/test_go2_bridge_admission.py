@@ -8,13 +8,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from fakes.go2 import FakeGo2
 from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.drivers.go2.bridge.admission import Admission, Control
 from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits, is_damping
-from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder

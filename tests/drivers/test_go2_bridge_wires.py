@@ -6,19 +6,19 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from fakes.go2 import STIFF, FakeGo2, FakeTopics
+from fakes.memory_wire import MemoryWire
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.bridge.admission import Control
 from deal_hw.drivers.go2.bridge.bridge import Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
-from deal_hw.drivers.go2.fake import STIFF, FakeGo2, FakeTopics
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.rpc import STATUS_TEXTS, Request, encode_request, read_note
 from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
 from deal_hw.drivers.transports.zenoh_stamps import Echo, read_stamp
 from deal_hw.errors import TransportError, TransportLostError
-from deal_hw.testing.memory_wire import MemoryWire
 from deal_hw.transport import Message
 
 ZERO = np.zeros(12)

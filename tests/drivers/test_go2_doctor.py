@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -16,7 +17,6 @@ from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
-from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.memory_wire import MemoryWire
 
 from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
@@ -20,7 +21,6 @@ from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder, decode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
-from deal_hw.testing.memory_wire import MemoryWire
 from deal_hw.transport import Message, WireOptions
 from deal_hw.workflows.emulation.go2 import free_port, make_transport, summary
 from deal_hw.workflows.emulation.process import EmulatorProcess

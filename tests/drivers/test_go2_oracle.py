@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.unitree_mujoco import UnitreeMujoco
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pycdr2 import IdlStruct
 from pycdr2.types import array, float32, int16, int32, int64, sequence, uint8, uint16, uint32
 
 from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS
-from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
 from deal_hw.drivers.go2.messages import remote, rpc, sport_state
 from deal_hw.drivers.go2.messages.protocol import (
     WIRE_JOINTS,

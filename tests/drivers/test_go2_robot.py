@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
+from fakes.go2 import RESTING, STIFF, FakeBench, FakeGo2
 
 from deal_hw.control.passive import make_passive
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.fake import RESTING, STIFF, FakeBench, FakeGo2
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import decode_low_command, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.rpc import encode_note

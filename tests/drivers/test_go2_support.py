@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from fakes.go2 import RESTING, STANDING, FakeBench, FakeGo2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +25,6 @@ from deal_hw.drivers.go2.descriptions.leg_geometry import (
 )
 from deal_hw.drivers.go2.emulator.device import LEGS_DOWN, Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
-from deal_hw.drivers.go2.fake import RESTING, STANDING, FakeBench, FakeGo2
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot

@@ -6,9 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from fakes.go2 import STANDING, STIFF, FakeBench
 
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2.fake import STANDING, STIFF, FakeBench
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
 from deal_hw.drivers.go2.messages.rpc import Response, encode_response

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
+from fakes.go2 import STIFF, FakeGo2
+from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import HoldBehaviour
@@ -18,8 +20,6 @@ from deal_hw.control.safety import Safety
 from deal_hw.drivers import make_robot
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
-from deal_hw.drivers.go2.fake import STIFF, FakeGo2
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder, encode_low_state
 from deal_hw.drivers.go2.messages.simulated import is_unitree_mujoco

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,

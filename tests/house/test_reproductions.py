@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.faulty_policy import faulty_policy
+from fakes.go2 import FakeBench
 from mcap.writer import CompressionType, Writer
 
 from deal_hw.cli.calibrate import Calibrate
@@ -46,14 +48,12 @@ from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
-from deal_hw.drivers.go2.fake import FakeBench
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, DatasetError, PortBusyError, SafetyError
 from deal_hw.findings import Finding, Level
-from deal_hw.testing.faulty_policy import faulty_policy
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.supervised import run_episodes

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import onnx
 import pytest
+from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.install import install_line
 from deal_hw.policies.onnx_runtime import SPEC_KEY
-from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.emulation.process import EmulatorProcess
 

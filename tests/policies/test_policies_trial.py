@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from fakes.faulty_policy import Fault, faulty_policy
+from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 from onnx import helper
 
 from deal_hw.control.behaviours import PolicyBehaviour
@@ -30,8 +32,6 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.trial import TrialPolicy, TrialSettings, check_policy
 from deal_hw.policies.trial_states import ProbeStates
 from deal_hw.policy import ObservationTerm, PolicySpec
-from deal_hw.testing.faulty_policy import Fault, faulty_policy
-from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.workflows.running.plan import RunPlan, check_plan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy
 

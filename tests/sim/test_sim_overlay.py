@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.overlay import Overlay, compute_overlay, reported_velocity_window
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray, Trajectory
 
 LATENCY_TICKS = 12

@@ -7,6 +7,7 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
+from fakes.standing_episode import standing_episode
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -18,7 +19,6 @@ from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.scene import body_poses, read_scene
 from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
 from deal_hw.sim.recordings.standing import sensed_base, tangent_base
-from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 
 SPACE = SPACES["default"]()

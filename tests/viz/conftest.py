@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.clock import VirtualClock
@@ -17,7 +18,6 @@ from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import Event, JointCommand, RobotState, Status, Trajectory
 from deal_hw.viz.episode_log import write_episode
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.standing_episode import standing_episode
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,6 @@ from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
 from deal_hw.sim.recordings.standing import sensed_base
-from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, Trajectory
 from deal_hw.viz.blueprint import inspect_blueprint
 from deal_hw.viz.body_log import roll_pitch

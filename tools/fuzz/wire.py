@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from cobs import cobs
+from fakes.go2 import FakeGo2
 from fastcrc import crc16
 
 from deal_hw.data.recording.record import decode as decode_record
@@ -16,7 +17,6 @@ from deal_hw.data.recording.record import encode as encode_record
 from deal_hw.data.recording.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
 from deal_hw.drivers.cartpole import protocol as serial
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
-from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.remote import (
