@@ -78,6 +78,20 @@ class Parameter:
             high=nominal * ratio,
         )
 
+    @classmethod
+    def encoder_bias(cls, joint: str, most: float) -> Parameter:
+        """Return a joint's encoder bias, reported minus true position, up to ``most`` to both sides [rad]."""
+        return cls(
+            name=f"{joint}.encoder_bias",
+            kind="encoder_bias",
+            elements=(joint,),
+            unit="rad",
+            nominal=0.0,
+            low=-most,
+            high=most,
+            scale="linear",
+        )
+
     def __post_init__(self) -> None:
         if self.scale not in get_args(Scale):
             raise UnknownNameError(f"scale of parameter {self.name!r}", self.scale, get_args(Scale))

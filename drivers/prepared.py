@@ -12,6 +12,7 @@ import os
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from deal_hw.description import SafetyLimits
@@ -39,32 +40,52 @@ def package_file(package: str, inside: str, extra: str) -> Path:
     return path
 
 
-def prepare(
-    text: str,
-    change: Callable[[ET.Element, Mapping[str, float]], None],
-    values: Mapping[str, float],
-    source: str,
-) -> str:
-    """Return an MJCF after a change.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackagedModel:
+    """An MJCF of another package, and the change that makes it a robot's.
 
-    Args:
-        text: The package's MJCF.
-        change: Changes its tree, and raises KeyError or AttributeError if a part is missing.
-        values: Parameter name -> value, passed to the change.
+    Attributes:
+        robot: First part of the prepared file's name.
+        package: The package.
+        inside: The file's path inside of it.
+        extra: Our extra that installs the package.
+        change: Changes its tree by parameter name -> value; raises KeyError or AttributeError if a part is
+            missing.
         source: The file and the package's version that the change was written for.
-
-    Raises:
-        ConfigurationError: The file is not the one that the change was written for.
     """
-    root = ET.fromstring(text)
-    try:
-        change(root, values)
-    except (AttributeError, KeyError) as err:
-        raise ConfigurationError(
-            f"the MJCF is not as expected ({err!r}); deal-hw was written for {source}"
-        ) from err
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode") + "\n"
+
+    robot: str
+    package: str
+    inside: str
+    extra: str
+    change: Callable[[ET.Element, Mapping[str, float]], None]
+    source: str
+
+    def prepare(self, text: str, values: Mapping[str, float]) -> str:
+        """Return the package's MJCF after the change.
+
+        Raises:
+            ConfigurationError: The file is not the one that the change was written for.
+        """
+        root = ET.fromstring(text)
+        try:
+            self.change(root, values)
+        except (AttributeError, KeyError) as err:
+            raise ConfigurationError(
+                f"the MJCF is not as expected ({err!r}); deal-hw was written for {self.source}"
+            ) from err
+        ET.indent(root)
+        return ET.tostring(root, encoding="unicode") + "\n"
+
+    def prepared_path(self, values: Mapping[str, float]) -> Path:
+        """Return the prepared MJCF in the user's cache folder; it is written if missing.
+
+        Raises:
+            MissingExtraError: The package is not installed.
+            ConfigurationError: Its file is missing or not as expected, or no folder can be written.
+        """
+        path = package_file(self.package, self.inside, self.extra)
+        return cached(self.robot, self.prepare(path.read_text(encoding="utf-8"), values))
 
 
 def find(root: ET.Element, path: str) -> ET.Element:

@@ -5,12 +5,14 @@ The cube moves freely, so it is the floating base of this robot; the hand's join
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.parameters import Parameter, ParameterSpace
 
 FINGERS: Final = ("index", "middle", "ring", "thumb")
@@ -24,8 +26,6 @@ RANGE_RAD: Final = (
 )
 HOLDING_RAD: Final = (*(0.0, 0.3, 0.7, 0.7) * 3, 0.9, 0.5, 0.3, 0.6)
 """Bent enough that the cube stays on the palm."""
-CUBE_M: Final = (0.02, 0.0, 0.05)
-"""Start position of the cube in the world; the palm's top is at a height of 0.011 m."""
 PRESS_RAD: Final = 0.3
 """Targets may lie this far beyond a joint's end, where fingers press [rad]."""
 EFFORT_LIMIT_NM: Final = 0.7
@@ -58,19 +58,12 @@ DESCRIPTION: Final = RobotDescription(
     control_rate_hz=50.0,
     device_rate_hz=200.0,
     state_rate_hz=50.0,
-    limits=SafetyLimits(
+    limits=dataclasses.replace(
+        simulated_limits((EFFORT_LIMIT_NM,) * 16),
         target=tuple((low - PRESS_RAD, high + PRESS_RAD) for low, high in RANGE_RAD),
         target_step=(0.5,) * 16,
-        target_distance=(math.inf,) * 16,
-        trip_position=((-math.inf, math.inf),) * 16,
-        trip_velocity=(math.inf,) * 16,
         stiffness=(100.0,) * 16,
         damping=(10.0,) * 16,
-        effort=(EFFORT_LIMIT_NM,) * 16,
-        speed=(math.inf,) * 16,
-        state_age_s=0.06,
-        action_age_s=0.04,
-        ease_in_s=0.0,
     ),
     sensor=SensorModel(noise=(1e-3,) * 16, resolution=(2 * math.pi / 4096,) * 16, velocity_window_s=0.0),
     mjcf=Path(__file__).parent / "assets" / "allegro.xml",

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.drivers.ant.model import ANKLE_HOME_RAD, GEAR_NM, LEG_NUMBERS, STEP_S, prepared_path
+from deal_hw.drivers.ant.model import ANKLE_HOME_RAD, GEAR_NM, LEG_NUMBERS, MODEL, STEP_S
 from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -89,7 +89,7 @@ def description() -> RobotDescription:
         state_rate_hz=50.0,
         limits=simulated_limits((GEAR_NM,) * 8),
         sensor=SensorModel(noise=(1e-3,) * 8, resolution=(2 * math.pi / 4096,) * 8, velocity_window_s=0.0),
-        mjcf=prepared_path(values),
+        mjcf=MODEL.prepared_path(values),
         actuation="motor",
         floating_base="root",
         sources={

@@ -8,35 +8,15 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Final
 
-from deal_hw.drivers.prepared import cached, find, package_file
-from deal_hw.drivers.prepared import prepare as prepare_model
+from deal_hw.drivers.prepared import PackagedModel, find
 
 LEG_NUMBERS: Final = (1, 2, 3, 4)
 STEP_S: Final = 0.005
 GEAR_NM: Final = 15.0
 HOME_HEIGHT_M: Final = 0.55
 ANKLE_HOME_RAD: Final = {1: 1.0, 2: -1.0, 3: -1.0, 4: 1.0}
-
-
-def source_path() -> Path:
-    """Return gymnasium's ant.xml. See :func:`deal_hw.drivers.prepared.package_file`."""
-    return package_file("gymnasium", "envs/mujoco/assets/ant.xml", "train")
-
-
-def prepare(text: str, values: Mapping[str, float]) -> str:
-    """Return gymnasium's MJCF with names for everything and the preset's values.
-
-    Args:
-        text: Content of ant.xml.
-        values: Parameter name -> value, as in ``drivers.ant.description``; all 11.
-
-    Raises:
-        ConfigurationError: The file is not the expected one.
-    """
-    return prepare_model(text, _prepare, values, "ant.xml of gymnasium 1.x")
 
 
 def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
@@ -74,11 +54,11 @@ def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
     key.set("qpos", f"0 0 {HOME_HEIGHT_M!r} 1 0 0 0 {pose}")
 
 
-def prepared_path(values: Mapping[str, float]) -> Path:
-    """Return the prepared MJCF in the user's cache folder; it is written if missing.
-
-    Raises:
-        MissingExtraError: gymnasium is not installed.
-        ConfigurationError: gymnasium's file is missing or not as expected.
-    """
-    return cached("ant", prepare(source_path().read_text(encoding="utf-8"), values))
+MODEL: Final = PackagedModel(
+    robot="ant",
+    package="gymnasium",
+    inside="envs/mujoco/assets/ant.xml",
+    extra="train",
+    change=_prepare,
+    source="ant.xml of gymnasium 1.x",
+)

@@ -78,31 +78,19 @@ def parameter_space() -> ParameterSpace:
     The four servo parameters are the device's behaviour at the description's default gains and limits; with
     other commanded values they scale in proportion.
     """
-
-    def log(name: str, kind: str, element: str, unit: str, nominal: float) -> Parameter:
-        return Parameter(
-            name=name,
-            kind=kind,
-            elements=(element,),
-            unit=unit,
-            nominal=nominal,
-            low=nominal / 5,
-            high=nominal * 5,
-        )
-
     return ParameterSpace(
         [
-            log("pole.length", "rod_length", "pole", "m", POLE_LENGTH_M),
-            log("pole.mass", "body_mass", "pole", "kg", POLE_MASS_KG),
-            log("cart.mass", "body_mass", "cart", "kg", CART_MASS_KG),
-            log("pole.frictionloss", "dof_frictionloss", "pole", "N·m", POLE_FRICTIONLOSS_NM),
-            log("pole.damping", "dof_damping", "pole", "N·m·s/rad", POLE_DAMPING_NMS),
-            log("pole.armature", "dof_armature", "pole", "kg·m²", POLE_ARMATURE_KGM2),
-            log("cart.frictionloss", "dof_frictionloss", "cart", "N", CART_FRICTIONLOSS_N),
-            log("servo.stiffness", "servo_stiffness", "cart", "N/m", STIFFNESS_N_M),
-            log("servo.damping", "servo_damping", "cart", "N·s/m", DAMPING_NS_M),
-            log("servo.effort_limit", "servo_effort_limit", "cart", "N", EFFORT_LIMIT_N),
-            log("servo.speed_limit", "servo_speed_limit", "cart", "m/s", SPEED_LIMIT_M_S),
+            Parameter.around("pole.length", "rod_length", ("pole",), "m", POLE_LENGTH_M),
+            Parameter.around("pole.mass", "body_mass", ("pole",), "kg", POLE_MASS_KG),
+            Parameter.around("cart.mass", "body_mass", ("cart",), "kg", CART_MASS_KG),
+            Parameter.around("pole.frictionloss", "dof_frictionloss", ("pole",), "N·m", POLE_FRICTIONLOSS_NM),
+            Parameter.around("pole.damping", "dof_damping", ("pole",), "N·m·s/rad", POLE_DAMPING_NMS),
+            Parameter.around("pole.armature", "dof_armature", ("pole",), "kg·m²", POLE_ARMATURE_KGM2),
+            Parameter.around("cart.frictionloss", "dof_frictionloss", ("cart",), "N", CART_FRICTIONLOSS_N),
+            Parameter.around("servo.stiffness", "servo_stiffness", ("cart",), "N/m", STIFFNESS_N_M),
+            Parameter.around("servo.damping", "servo_damping", ("cart",), "N·s/m", DAMPING_NS_M),
+            Parameter.around("servo.effort_limit", "servo_effort_limit", ("cart",), "N", EFFORT_LIMIT_N),
+            Parameter.around("servo.speed_limit", "servo_speed_limit", ("cart",), "m/s", SPEED_LIMIT_M_S),
         ]
     )
 

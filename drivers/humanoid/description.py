@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.drivers.humanoid.model import FEET, FIELDS, JOINTS, STEP_S, joint_type, prepared_path
+from deal_hw.drivers.humanoid.model import FEET, FIELDS, JOINTS, MODEL, STEP_S, joint_type
 from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.parameters import Parameter, ParameterSpace
 
@@ -93,7 +93,7 @@ def description() -> RobotDescription:
         sensor=SensorModel(
             noise=(1e-3,) * count, resolution=(2 * math.pi / 4096,) * count, velocity_window_s=0.0
         ),
-        mjcf=prepared_path(values),
+        mjcf=MODEL.prepared_path(values),
         actuation="motor",
         floating_base="root",
         sources={

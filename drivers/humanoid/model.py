@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Final
 
-from deal_hw.drivers.prepared import cached, find, package_file
-from deal_hw.drivers.prepared import prepare as prepare_model
+from deal_hw.drivers.prepared import PackagedModel, find
 
 STEP_S: Final = 0.005
 HOME_HEIGHT_M: Final = 1.29
@@ -31,24 +29,6 @@ FEET: Final = ("right_right_foot", "left_right_foot", "left_left_foot", "right_l
 FIELDS: Final = ("frictionloss", "damping", "armature", "stiffness")
 _LOOKS: Final = ("include", "statistic", "sensor")
 _MARKS: Final = ("site", "camera", "light")
-
-
-def source_path() -> Path:
-    """Return dm_control's humanoid.xml. See :func:`deal_hw.drivers.prepared.package_file`."""
-    return package_file("dm_control", "suite/humanoid.xml", "bench")
-
-
-def prepare(text: str, values: Mapping[str, float]) -> str:
-    """Return dm_control's MJCF without purely visual parts, with the preset's values.
-
-    Args:
-        text: Content of humanoid.xml.
-        values: Parameter name -> value, as in ``drivers.humanoid.description``.
-
-    Raises:
-        ConfigurationError: The file is not the expected one.
-    """
-    return prepare_model(text, _prepare, values, "humanoid.xml of dm_control 1.0")
 
 
 def joint_type(joint: str) -> str:
@@ -93,11 +73,11 @@ def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
     key.set("qpos", f"0 0 {HOME_HEIGHT_M!r} 1 0 0 0 " + " ".join("0" * len(JOINTS)))
 
 
-def prepared_path(values: Mapping[str, float]) -> Path:
-    """Return the prepared MJCF in the user's cache folder, written if it is not there yet.
-
-    Raises:
-        MissingExtraError: dm_control is not installed.
-        ConfigurationError: Its file is missing or not as expected.
-    """
-    return cached("humanoid", prepare(source_path().read_text(encoding="utf-8"), values))
+MODEL: Final = PackagedModel(
+    robot="humanoid",
+    package="dm_control",
+    inside="suite/humanoid.xml",
+    extra="bench",
+    change=_prepare,
+    source="humanoid.xml of dm_control 1.0",
+)

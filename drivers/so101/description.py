@@ -1,7 +1,6 @@
 """Facts about the SO-101 arm: six Feetech STS3215 servos in position mode, proportional control only.
 
-Joint names are those of mujoco_menagerie and LeRobot; :data:`RECORDED_NAMES` gives those of the public
-recordings (isaac-sim2real/sage).
+Joint names are those of mujoco_menagerie and LeRobot.
 """
 
 from __future__ import annotations
@@ -22,18 +21,7 @@ RANGE_RAD: Final = (
     (-2.7438473, 2.7438473),
     (-0.174533, 2.1633),
 )
-RECORDED_NAMES: Final = {
-    "Rotation": "shoulder_pan",
-    "Pitch": "shoulder_lift",
-    "Elbow": "elbow_flex",
-    "Wrist_Pitch": "wrist_flex",
-    "Wrist_Roll": "wrist_roll",
-    "Jaw": "gripper",
-}
 TICK_RAD: Final = 2 * math.pi / 4096
-JAW_TRAVEL_RAD: Final = 1524 * TICK_RAD
-"""Travel of the jaw that the public recordings write as 0 to 1: 1524 encoder ticks."""
-
 STIFFNESS_NM_RAD: Final = 11.0
 JOINT_DAMPING_NMS_RAD: Final = 0.6
 FRICTIONLOSS_NM: Final = 0.052
@@ -109,24 +97,8 @@ def parameter_space() -> ParameterSpace:
     determined; the links' own inertia adds little. The bias is the calibrated zero (middle of the travel)
     minus the model's.
     """
-    return ParameterSpace(
-        [
-            *_rows(),
-            *(
-                Parameter(
-                    name=f"{joint}.encoder_bias",
-                    kind="encoder_bias",
-                    elements=(joint,),
-                    unit="rad",
-                    nominal=0.0,
-                    low=-ENCODER_BIAS_RAD,
-                    high=ENCODER_BIAS_RAD,
-                    scale="linear",
-                )
-                for joint in JOINTS
-            ),
-        ]
-    )
+    biases = [Parameter.encoder_bias(joint, ENCODER_BIAS_RAD) for joint in JOINTS]
+    return ParameterSpace([*_rows(), *biases])
 
 
 def unbiased_space() -> ParameterSpace:

@@ -234,23 +234,23 @@ def test_ant_without_gymnasium_names_the_extra(monkeypatch: pytest.MonkeyPatch) 
     """The model is gymnasium's and is not copied."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match="gymnasium is not installed"):
-        ant_model.source_path()
+        ant_model.MODEL.prepared_path({})
 
 
 def test_ant_of_another_gymnasium_is_refused() -> None:
     """A file without the expected names is not half prepared."""
     with pytest.raises(ConfigurationError, match=r"gymnasium 1\.x"):
-        ant_model.prepare("<mujoco><worldbody/></mujoco>", {**DEFAULT, "contact.damping_ratio": 0.7})
+        ant_model.MODEL.prepare("<mujoco><worldbody/></mujoco>", {**DEFAULT, "contact.damping_ratio": 0.7})
 
 
 def test_ant_is_prepared_once_and_mended_if_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The cache holds one file a preset; a damaged one is written again, and no half files stay."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     values = {**PAPER, "contact.damping_ratio": 0.8}
-    path = ant_model.prepared_path(values)
+    path = ant_model.MODEL.prepared_path(values)
     text = path.read_text(encoding="utf-8")
     path.write_text("<mujoco", encoding="utf-8")
-    assert ant_model.prepared_path(values).read_text(encoding="utf-8") == text
+    assert ant_model.MODEL.prepared_path(values).read_text(encoding="utf-8") == text
     assert [p.name for p in (tmp_path / "deal-hw").iterdir()] == [path.name]
     assert "material" not in text and "texture" not in text
 
@@ -260,16 +260,16 @@ def test_cache_that_cannot_be_written_falls_back(tmp_path: Path, monkeypatch: py
     blocked = tmp_path / "file"
     blocked.write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
-    assert ant_model.prepared_path({**DEFAULT, "contact.damping_ratio": 0.7}).is_file()
+    assert ant_model.MODEL.prepared_path({**DEFAULT, "contact.damping_ratio": 0.7}).is_file()
 
 
 def test_humanoid_of_another_dm_control_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A file without the expected names is not half prepared, and a missing package names its extra."""
     with pytest.raises(ConfigurationError, match=r"dm_control 1\.0"):
-        humanoid_model.prepare("<mujoco><option/></mujoco>", {"contact.damping_ratio": 0.7})
+        humanoid_model.MODEL.prepare("<mujoco><option/></mujoco>", {"contact.damping_ratio": 0.7})
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match="dm_control is not installed"):
-        humanoid_model.source_path()
+        humanoid_model.MODEL.prepared_path({})
 
 
 def test_humanoid_touches_the_floor_alone_and_has_no_textures() -> None:

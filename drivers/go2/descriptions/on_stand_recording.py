@@ -59,19 +59,7 @@ def _space(groups: Sequence[tuple[str, tuple[str, ...]]], *, bias: bool) -> Para
         for group, elements in groups
     ]
     if bias:
-        parameters += [
-            Parameter(
-                name=f"{joint}.encoder_bias",
-                kind="encoder_bias",
-                elements=(joint,),
-                unit="rad",
-                nominal=0.0,
-                low=-ENCODER_BIAS_RAD,
-                high=ENCODER_BIAS_RAD,
-                scale="linear",
-            )
-            for joint in floor.JOINTS
-        ]
+        parameters += [Parameter.encoder_bias(joint, ENCODER_BIAS_RAD) for joint in floor.JOINTS]
     return ParameterSpace(parameters)
 
 
