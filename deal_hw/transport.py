@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import io
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,14 @@ class Transport(abc.ABC):
             TransportLostError: The peer vanished.
         """
 
+    def fileno(self) -> int:
+        """Return the descriptor of the open path, which a child process can inherit; -1: each opens its own.
+
+        Raises:
+            UnsupportedOperation: The path has none.
+        """
+        raise io.UnsupportedOperation(f"{type(self).__name__} has no file descriptor")
+
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -127,8 +136,8 @@ class TransportWrapper(Transport):
         return self._inner.receive(timeout_s)
 
     def fileno(self) -> int:
-        """Return the descriptor of the path; -1: each process opens its own."""
-        return int(self._inner.fileno())  # type: ignore[attr-defined]
+        """Return the descriptor of the path."""
+        return self._inner.fileno()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
@@ -160,10 +159,7 @@ class CartpoleRobot(Robot):
 
     def fileno(self) -> int:
         """Return the descriptor of the transport."""
-        fileno = getattr(self._transport, "fileno", None)
-        if fileno is None:
-            raise io.UnsupportedOperation(f"{type(self._transport).__name__} has no file descriptor")
-        return int(fileno())
+        return self._transport.fileno()
 
     def take_wire(self) -> list[Message]:
         """Return and forget the raw messages since the last call; if many, only the newest."""

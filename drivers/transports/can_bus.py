@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -114,10 +113,6 @@ class CanTransport(Transport):
         self._accept = tuple(accept)
         self._clock = clock or MonotonicClock()
         self._off = False
-
-    @abc.abstractmethod
-    def fileno(self) -> int:
-        """Return a descriptor that a child process can inherit; -1: each process opens its own path."""
 
     def _bus_off(self) -> None:
         self._off = True

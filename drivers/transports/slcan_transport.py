@@ -12,7 +12,7 @@ import contextlib
 import re
 from collections import deque
 from collections.abc import Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from serial.tools import list_ports
 
@@ -20,7 +20,7 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.transports.can_bus import NO_ACKNOWLEDGE, CanTransport
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import ConfigurationError, TransportTimeoutError
-from deal_hw.transport import Message
+from deal_hw.transport import Message, Transport
 
 BITRATES: Final = {
     10_000: b"S0",
@@ -106,34 +106,6 @@ class LineReader:
         return lines
 
 
-class SerialPort(Protocol):
-    """The required methods of a serial port: a :class:`~deal_hw.transport.Transport` with a descriptor."""
-
-    def open(self) -> None:
-        """Open the port."""
-        ...
-
-    def close(self) -> None:
-        """Close the port."""
-        ...
-
-    def reopen(self) -> None:
-        """Open the port again if it was lost."""
-        ...
-
-    def send(self, message: Message) -> None:
-        """Write at once."""
-        ...
-
-    def receive(self, timeout_s: float) -> Message:
-        """Return the received bytes."""
-        ...
-
-    def fileno(self) -> int:
-        """Return the descriptor of the open port."""
-        ...
-
-
 class SlcanTransport(CanTransport):
     """A serial CAN adapter.
 
@@ -162,7 +134,7 @@ class SlcanTransport(CanTransport):
         clock: Clock | None = None,
         accept: Sequence[tuple[int, int]] = (),
         fd: int | None = None,
-        serial: SerialPort | None = None,
+        serial: Transport | None = None,
     ) -> None:
         super().__init__(port, clock, accept)
         if self.address.bitrate not in BITRATES:
@@ -171,7 +143,7 @@ class SlcanTransport(CanTransport):
                 f"{', '.join(map(str, BITRATES))}"
             )
         path = self.address.channel
-        self._serial: SerialPort
+        self._serial: Transport
         if serial is not None:
             self._serial = serial
         elif fd is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from typing import Protocol
 
 from deal_hw.drivers.transports.virtual_wire import TickingCore, VirtualWire
@@ -29,10 +28,6 @@ class VirtualTransport(VirtualWire[DeviceCore]):
         self._check()
         self._catch_up()
         self.device.receive(message.payload)
-
-    def fileno(self) -> int:
-        """There is no descriptor: virtual time passes in :meth:`receive`."""
-        raise io.UnsupportedOperation("a virtual wire has no file descriptor; wait in receive()")
 
     def _run_tick(self, tick_ns: int) -> None:
         if data := self.device.tick():

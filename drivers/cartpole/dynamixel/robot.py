@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections import deque
 from collections.abc import Mapping
@@ -453,10 +452,7 @@ class DynamixelCartpole(Robot):
 
     def fileno(self) -> int:
         """Return the descriptor of the transport."""
-        fileno = getattr(self._transport, "fileno", None)
-        if fileno is None:
-            raise io.UnsupportedOperation(f"{type(self._transport).__name__} has no file descriptor")
-        return int(fileno())
+        return self._transport.fileno()
 
     def take_wire(self) -> list[Message]:
         """Return and forget the raw messages since the last call; if many, only the newest."""
