@@ -204,12 +204,6 @@ def schroeder_phases(power: FloatArray) -> FloatArray:
     return np.asarray(-2 * math.pi * np.cumsum(before))
 
 
-def crest_factor(values: FloatArray) -> FloatArray:
-    """Return peak over root mean square of each column, (T, A) -> (A,); a sine has 1.41."""
-    rms = np.sqrt(np.mean(values**2, axis=0))
-    return np.asarray(np.max(np.abs(values), axis=0) / np.where(rms > 0, rms, 1.0))
-
-
 def multisine(
     amplitude: FloatArray,
     low_hz: float,

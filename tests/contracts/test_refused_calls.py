@@ -21,7 +21,6 @@ from deal_hw.control.waveforms import Sweep, random_steps
 from deal_hw.data.export.lerobot import export_lerobot
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.grid import to_trajectories
-from deal_hw.data.importing.load import load_recordings
 from deal_hw.data.importing.store import minimal_description
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
@@ -167,7 +166,6 @@ FILES: list[tuple[Callable[[Path], object], type[DealHwError], str]] = [
         ConfigurationError,
         "the calibrated model has other elements than the file: ",
     ),
-    (lambda p: load_recordings([p / "a.csv", p / "b.csv"]), DatasetError, "import them into two datasets"),
     (lambda p: export_lerobot([], p / "out", "r", "t"), InsufficientDataError, "no recording to export"),
 ]
 

@@ -18,7 +18,8 @@ from deal_hw.cli.main import parse
 from deal_hw.data.checks.plausibility import examine
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.columns import parse_column_map, read_column_map
-from deal_hw.data.importing.load import load_recordings, load_tables
+from deal_hw.data.importing.grid import to_trajectories
+from deal_hw.data.importing.load import load_tables
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.telemetry_checks import Severity, worst
@@ -98,7 +99,7 @@ def test_import_and_export(
     assert dataset.episodes[0].facts == {"plausibility": {"rec.csv": []}, "source": source}
     assert data(Export(path=out, out=tmp_path / "lerobot", task="wave")) == 0
     assert "1 LeRobot episode of robot" in capsys.readouterr().out
-    (back,) = load_recordings([tmp_path / "lerobot"])
+    (back,) = to_trajectories(*load_tables(tmp_path / "lerobot"))
     np.testing.assert_allclose(back.trajectory.position, trajectory.position, atol=1e-6)
     assert data(Export(path=dataset.path(0), out=tmp_path / "again")) == 0
 
@@ -278,7 +279,7 @@ def test_public_recordings_pass(path: Path) -> None:
     legs = [f"{leg}_{part}" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
     (table,) = load_tables(path, joints=legs if "go2" in str(path) else None)
     assert worst(examine(table)) is not Severity.FAIL
-    (part,) = load_recordings([path], joints=legs if "go2" in str(path) else None)
+    (part,) = to_trajectories(table)
     facts = part.trajectory.metadata["import"]
     assert facts["method"] == "kept" and facts["largest_shift_s"] < 1e-3
     assert 1 / facts["period_s"] == pytest.approx(199.9574 if "go2" in str(path) else 49.850, abs=2e-3)

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.data.importing.grid import Gains, common_period, grid_rate, period_of, to_trajectories
-from deal_hw.data.importing.load import load_recordings
+from deal_hw.data.importing.grid import Gains, common_period, period_of, to_trajectories
+from deal_hw.data.importing.load import own_episodes
 from deal_hw.data.importing.store import write_dataset
 from deal_hw.data.importing.table import Table, table_of
+from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
@@ -61,9 +62,9 @@ def test_align_gives_the_arrays_back(make_table: MakeTable, rate_hz: float, per_
     time_s = np.arange(1200) / rate_hz
     table = make_table(time_s=time_s, command_s=time_s)
     (part,) = to_trajectories(table, GAINS)
-    assert grid_rate(table) == pytest.approx(rate_hz, rel=1e-12)
+    assert 1 / period_of(table) == pytest.approx(rate_hz, rel=1e-12)
     assert part.trajectory.metadata["import"]["method"] == "kept"
-    episode = align(part.trajectory, robot(table, grid_rate(table), per_sample))
+    episode = align(part.trajectory, robot(table, 1 / period_of(table), per_sample))
     np.testing.assert_array_equal(episode.position, table.position)
     np.testing.assert_array_equal(episode.sample, per_sample * np.arange(1200))
     assert episode.usable[:-1].all()
@@ -80,7 +81,7 @@ def test_uneven_stamps_within_two_percent_move_to_the_grid(make_table: MakeTable
     assert facts["method"] == "kept" and 0 < facts["largest_shift_s"] < 0.01
     np.testing.assert_array_equal(part.trajectory.position, table.position)
     np.testing.assert_allclose(part.trajectory.command_age_s, 0.0, atol=1e-12)
-    episode = align(part.trajectory, robot(table, grid_rate(table), 5))
+    episode = align(part.trajectory, robot(table, 1 / period_of(table), 5))
     np.testing.assert_array_equal(episode.target, np.repeat(table.target[:-1], 5, axis=0))
 
 
@@ -233,13 +234,13 @@ def test_dataset_of_an_import_reads_back(make_table: MakeTable, tmp_path: Path) 
     """What is written as episodes reads back as the same trajectory, and aligns to the same arrays."""
     table = jittered(make_table(effort=np.ones((1200, 3))), 0.01)
     recordings = to_trajectories(table, GAINS)
-    description = robot(table, grid_rate(table), 5)
+    description = robot(table, 1 / period_of(table), 5)
     dataset = write_dataset(tmp_path / "dataset", recordings, description, [{"plausibility": []}])
     assert dataset.episodes[0].states == 1200 and dataset.episodes[0].purpose == "import"
     assert not [v for v in dataset.episodes[0].verdicts if v["severity"] == "fail"]
-    (back,) = load_recordings([tmp_path / "dataset"])
-    (again,) = load_recordings([dataset.path(0)])
-    before, after = recordings[0].trajectory, back.trajectory
+    (after,) = map(read_trajectory, own_episodes(tmp_path / "dataset"))
+    (again,) = map(read_trajectory, own_episodes(dataset.path(0)))
+    before = recordings[0].trajectory
     for name in (
         "position",
         "velocity",
@@ -250,7 +251,7 @@ def test_dataset_of_an_import_reads_back(make_table: MakeTable, tmp_path: Path) 
         "status",
     ):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), err_msg=name)
-        np.testing.assert_array_equal(getattr(again.trajectory, name), getattr(before, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(again, name), getattr(before, name), err_msg=name)
     for name in ("device_s", "receive_s", "sent_s", "command_age_s"):
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-9, err_msg=name)
     assert after.metadata["import"] == before.metadata["import"]

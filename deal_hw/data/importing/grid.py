@@ -80,11 +80,6 @@ def period_of(table: Table) -> float:
     return float(np.sum(inside) / np.sum(np.maximum(np.round(inside / median), 1)))
 
 
-def grid_rate(table: Table) -> float:
-    """Return the sampling rate [Hz]; a description's device rate must be a multiple of it."""
-    return 1.0 / period_of(table)
-
-
 def common_period(tables: Sequence[Table]) -> float:
     """Return one period for several recordings of a robot [s], so that they share one description.
 

@@ -12,7 +12,6 @@ from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import ColumnMap
 from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.data.importing.episode_source import read_own
-from deal_hw.data.importing.grid import Gains, Recording, common_period, to_trajectories
 from deal_hw.data.importing.guess import guess_columns
 from deal_hw.data.importing.guess_topics import guess_topics
 from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
@@ -22,7 +21,6 @@ from deal_hw.data.importing.starting_map import starting_map
 from deal_hw.data.importing.table import Table, build_table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
-from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder import METADATA_NAME
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
@@ -112,44 +110,6 @@ def tables_of(
             _tell(say, channels, used, joints, columns is None and number == 0)
         tables.append(build_table(channels, used, joints))
     return tables
-
-
-def load_recordings(
-    paths: Sequence[Path],
-    columns: ColumnMap | None = None,
-    joints: Sequence[str] | None = None,
-    gains: Gains | None = None,
-    say: Say | None = None,
-) -> list[Recording]:
-    """Read recordings of one robot onto one grid; episodes and datasets of deal-hw stay unchanged.
-
-    Args:
-        paths: As for :func:`load_tables`; or episodes and datasets recorded by deal-hw.
-        columns: Meaning of the channels; None: guessed.
-        joints: Names of the model's joints.
-        gains: Settings of the robot's servos, in the order of the joints with commands; None: unknown.
-        say: Called with sentences on guesses and omissions.
-
-    Raises:
-        DatasetError: One cannot be read or understood, or they do not fit each other.
-    """
-    own: list[Recording] = []
-    tables: list[Table] = []
-    for path in map(Path, paths):
-        episodes = own_episodes(path, say)
-        own += [Recording(read_trajectory(episode)) for episode in episodes]
-        if not episodes:
-            tables += load_tables(path, columns, joints, say)
-    if not tables:
-        return own
-    different = [table for table in tables if table.joint_names != tables[0].joint_names]
-    if different:
-        raise DatasetError(
-            f"{different[0].name} has the joints {', '.join(different[0].joint_names)}, but "
-            f"{tables[0].name} {', '.join(tables[0].joint_names)}; import them into two datasets"
-        )
-    period = common_period(tables)
-    return own + [part for table in tables for part in to_trajectories(table, gains, period)]
 
 
 def own_episodes(path: Path, say: Say | None = None) -> list[Path]:

@@ -64,10 +64,6 @@ class ClockSync:
     drift_uncertainty_ppm: float
     jumps: tuple[ClockJump, ...] = ()
 
-    def to_host_s(self, device_s: FloatArray) -> FloatArray:
-        """Return host times on the base of ``receive_s`` of device times on the base of ``device_s``."""
-        return device_s + self.offset_s + self.drift_ppm * 1e-6 * (device_s - self.reference_s)
-
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite uncertainties as null."""
         values = asdict(self)
