@@ -26,13 +26,8 @@ from fakes.go2 import FakeGo2
 from deal_hw.bench.rows import describe_call
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
-from deal_hw.drivers.go2.messages.protocol import (
-    LowCommand,
-    LowCommandEncoder,
-    decode_low_command,
-    decode_low_state,
-    encode_low_state,
-)
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL

@@ -14,13 +14,8 @@ import numpy as np
 from deal_hw.bench.rows import describe_machine, write_rows
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
-from deal_hw.drivers.go2.messages.protocol import (
-    LowCommand,
-    LowCommandEncoder,
-    decode_low_command,
-    decode_low_state,
-    encode_low_state,
-)
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 
 BATCHES: Final = 200
 BATCH: Final = 200

@@ -17,7 +17,7 @@ from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.body import body_state, is_damped
-from deal_hw.drivers.go2.messages.protocol import LowStateFrame
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.remote import decode_remote, parse_combination
 from deal_hw.drivers.go2.messages.rpc import STATUS_TEXTS, read_note

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, get_args
 
 from deal_hw.drivers.command_echo import ClockOffset
-from deal_hw.drivers.go2.messages.protocol import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.errors import FrameError, ProtocolError, TransportLostError, UnknownNameError
 from deal_hw.transport import Message

@@ -99,7 +99,8 @@ def test_import_and_export(
     assert dataset.episodes[0].facts == {"plausibility": {"rec.csv": []}, "source": source}
     assert data(Export(path=out, out=tmp_path / "lerobot", task="wave")) == 0
     assert "1 LeRobot episode of robot" in capsys.readouterr().out
-    (back,) = to_trajectories(*load_tables(tmp_path / "lerobot"))
+    (table,) = load_tables(tmp_path / "lerobot")
+    (back,) = to_trajectories(table)
     np.testing.assert_allclose(back.trajectory.position, trajectory.position, atol=1e-6)
     assert data(Export(path=dataset.path(0), out=tmp_path / "again")) == 0
 

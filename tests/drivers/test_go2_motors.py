@@ -18,7 +18,7 @@ from deal_hw.drivers.go2.emulator.motors import AMBIENT_C, Motors
 from deal_hw.drivers.go2.emulator.profiles import profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment, read_remote_script
 from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth, nominal_truth
-from deal_hw.drivers.go2.messages.protocol import LowCommand
+from deal_hw.drivers.go2.messages.low_command import LowCommand
 from deal_hw.drivers.go2.messages.remote import Remote, button_mask
 from deal_hw.errors import ConfigurationError, UnknownNameError
 

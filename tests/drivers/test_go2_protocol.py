@@ -11,20 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.drivers.go2.descriptions import floor
-from deal_hw.drivers.go2.messages.layout import COMMAND_MODE_AT, STATE_MODE_AT
-from deal_hw.drivers.go2.messages.protocol import (
+from deal_hw.drivers.go2.messages.layout import (
+    COMMAND_MODE_AT,
     LOW_COMMAND_BYTES,
     LOW_STATE_BYTES,
-    WIRE_JOINTS,
-    LowCommand,
-    LowCommandEncoder,
-    LowState,
-    LowStateFrame,
-    decode_low_command,
-    decode_low_state,
-    encode_low_state,
+    STATE_MODE_AT,
 )
-from deal_hw.drivers.go2.messages.wire import low_command_image, low_state_image, words_crc
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame, decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS, low_command_image, low_state_image, words_crc
 from deal_hw.errors import ConfigurationError, FrameError
 
 

@@ -21,7 +21,8 @@ from deal_hw.drivers import make_robot
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
-from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder, encode_low_state
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
+from deal_hw.drivers.go2.messages.low_state import encode_low_state
 from deal_hw.drivers.go2.messages.simulated import is_unitree_mujoco
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.go2.unitree_mujoco import (

@@ -17,13 +17,8 @@ from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, efforts_under
 from deal_hw.drivers.go2.messages import topics
-from deal_hw.drivers.go2.messages.protocol import (
-    LowCommand,
-    LowCommandEncoder,
-    LowState,
-    decode_low_command,
-    encode_low_state,
-)
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
 from deal_hw.drivers.go2.messages.remote import Remote, encode_remote
 from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_request, encode_response
 from deal_hw.drivers.go2.robot import Go2Robot

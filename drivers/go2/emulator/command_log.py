@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from deal_hw.drivers.go2.messages.protocol import LowCommand
+from deal_hw.drivers.go2.messages.low_command import LowCommand
 
 STIFF, DAMPING, OFF = "stiff", "damping", "off"
 _MOST_CHANGES: Final = 2000

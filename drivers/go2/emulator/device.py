@@ -21,13 +21,8 @@ from deal_hw.drivers.go2.emulator.sport_controller import LYING, PERIOD_MS, STAN
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages import topics
-from deal_hw.drivers.go2.messages.protocol import (
-    LowCommand,
-    LowCommandEncoder,
-    LowState,
-    decode_low_command,
-    encode_low_state,
-)
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
 from deal_hw.drivers.go2.messages.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.drivers.go2.messages.sport_state import POINTS, SportState, encode_sport_state
 from deal_hw.errors import FrameError

@@ -9,7 +9,7 @@ import numpy as np
 from deal_hw.drivers.go2.descriptions.floor import EFFORT_LIMIT_NM, VELOCITY_LIMIT_RAD_S, per_joint
 from deal_hw.drivers.go2.emulator.profiles import Go2Profile
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
-from deal_hw.drivers.go2.messages.protocol import MODE_SERVO, POSITION_STOP, VELOCITY_STOP, LowCommand
+from deal_hw.drivers.go2.messages.low_command import MODE_SERVO, POSITION_STOP, VELOCITY_STOP, LowCommand
 from deal_hw.types import FloatArray, IntArray
 
 AMBIENT_C: Final = 28.0

@@ -10,7 +10,7 @@ import numpy as np
 from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import Go2Profile
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
-from deal_hw.drivers.go2.messages.protocol import LowState
+from deal_hw.drivers.go2.messages.low_state import LowState
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 

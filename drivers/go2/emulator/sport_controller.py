@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.messages.protocol import LowCommand
+from deal_hw.drivers.go2.messages.low_command import LowCommand
 from deal_hw.types import FloatArray
 
 PERIOD_MS: Final = 2

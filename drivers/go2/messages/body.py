@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.messages.protocol import LowStateFrame
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.remote import Remote
 from deal_hw.types import BodyState, FloatArray
 

@@ -1,4 +1,4 @@
-"""LowCmd: PD targets for the motors. Import its names from ``messages.protocol``."""
+"""LowCmd: PD targets for the motors."""
 
 from __future__ import annotations
 

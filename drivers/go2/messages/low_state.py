@@ -1,4 +1,4 @@
-"""LowState: the robot's state, every 2 ms. Import its names from ``messages.protocol``."""
+"""LowState: the robot's state, every 2 ms."""
 
 from __future__ import annotations
 
