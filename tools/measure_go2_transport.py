@@ -25,9 +25,9 @@ from stall_monitor import Account, watch_stalls
 from deal_hw.bench.rows import describe_machine, write_rows
 from deal_hw.cli.show import seconds_bar
 from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.ranges import Range, check_ranges
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.go2 import free_port
-from deal_hw.workflows.options import Range, check_ranges
 
 _START_S: Final = 30.0
 _END_S: Final = 20.0

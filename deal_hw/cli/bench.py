@@ -13,8 +13,9 @@ import tyro
 from deal_hw.calibration import Budget
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.ranges import Range, check_ranges
 from deal_hw.workflows.calibration.model import Recordings
-from deal_hw.workflows.options import Only, Range, Ratio, Threads, check_ranges, refuse_others
+from deal_hw.workflows.options import Only, Ratio, Threads, refuse_others
 
 if TYPE_CHECKING:
     from deal_hw.bench.rows import Cells, Row

@@ -23,10 +23,11 @@ from deal_hw.drivers.transports.zenoh_access import access_settings
 from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpoints
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
+from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.common import run_until, signalled
 from deal_hw.workflows.emulation.go2 import free_port
-from deal_hw.workflows.options import Checked, Range, given, refuse
+from deal_hw.workflows.options import given, refuse
 
 ROBOTS = ("go2",)
 LOOPBACK_PORT = 7447

@@ -24,8 +24,9 @@ from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import CalibrateReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
+from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
-from deal_hw.workflows.options import CARTPOLE, Checked, Only, Range, Seed, refuse_others
+from deal_hw.workflows.options import CARTPOLE, Only, Seed, refuse_others
 from deal_hw.workflows.running.report import RunReport
 
 if TYPE_CHECKING:

@@ -12,10 +12,11 @@ import tyro
 
 from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_episode
+from deal_hw.ranges import Range
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
 from deal_hw.workflows.inspect import InspectSettings, check_file, predicted
-from deal_hw.workflows.options import Range, refuse
+from deal_hw.workflows.options import refuse
 
 
 @dataclass(frozen=True, kw_only=True)

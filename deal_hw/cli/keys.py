@@ -17,7 +17,7 @@ from deal_hw.drivers.transports.certificates import (
     sign,
 )
 from deal_hw.errors import ConfigurationError
-from deal_hw.workflows.options import Checked, Range
+from deal_hw.ranges import Checked, Range
 
 Days = Annotated[float, Range(1, 36500, "days")]
 WARN_DAYS = 30

@@ -11,7 +11,8 @@ from deal_hw.calibration import SHORTEST_S
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
-from deal_hw.workflows.options import OWN_ROBOT, File, Range, RunSeconds, Seed, from_settings, given, refuse
+from deal_hw.ranges import Range
+from deal_hw.workflows.options import OWN_ROBOT, File, RunSeconds, Seed, from_settings, given, refuse
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import RunOptions, plan_options

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settings
+from deal_hw.ranges import Range
+from deal_hw.workflows.options import File, RunSeconds, Seed, from_settings
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import RunOptions, plan_options, refuse_unrecorded

@@ -21,17 +21,8 @@ from deal_hw.control.excitation_plan import (
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.workflows.options import (
-    File,
-    Range,
-    Ratio,
-    Seed,
-    Threads,
-    check_ranges,
-    from_settings,
-    given,
-    refuse,
-)
+from deal_hw.ranges import Range, check_ranges
+from deal_hw.workflows.options import File, Ratio, Seed, Threads, from_settings, given, refuse
 from deal_hw.workflows.robot import described, described_spaces
 from deal_hw.workflows.shipped import balancer
 

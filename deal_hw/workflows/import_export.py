@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from deal_hw.data.files import INDEX_NAME, dataset_of
 from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.ranges import Checked, Range
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
 from deal_hw.workflows.calibration.recordings import on_grid
-from deal_hw.workflows.options import Checked, Range, given, refuse
+from deal_hw.workflows.options import given, refuse
 from deal_hw.workflows.robot import is_ours, load_robot, recorded_robot
 from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent

@@ -15,8 +15,9 @@ from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
+from deal_hw.ranges import Checked, Range
 from deal_hw.sim.recordings.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
-from deal_hw.workflows.options import Checked, File, Range, from_settings
+from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.robot import recorded_robot
 from deal_hw.workflows.say import html_table
 

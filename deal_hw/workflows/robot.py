@@ -15,7 +15,8 @@ from deal_hw.drivers import DESCRIPTIONS, ROBOTS, parameter_spaces, recorded_des
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.findings import Finding, Level
 from deal_hw.parameters import ParameterSpace
-from deal_hw.workflows.options import Checked, File, Range, from_settings
+from deal_hw.ranges import Checked, Range
+from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.say import html_table
 
 if TYPE_CHECKING:

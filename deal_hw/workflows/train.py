@@ -15,9 +15,10 @@ import numpy as np
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import VERDICT
+from deal_hw.ranges import Checked, Range
 from deal_hw.reading import read_json, reading
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
-from deal_hw.workflows.options import Checked, File, Range, Seed, from_settings
+from deal_hw.workflows.options import File, Seed, from_settings
 from deal_hw.workflows.robot import described, is_user_robot
 from deal_hw.workflows.say import html_table, text_table
 

@@ -1,4 +1,4 @@
-"""A serial CAN adapter (slcan) with an emulated cart-pole on its bus, behind a pseudo-terminal."""
+"""An emulated cart-pole on a CAN bus, behind an emulated serial adapter."""
 
 from __future__ import annotations
 
@@ -6,180 +6,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink
+from deal_hw.drivers.cartpole.can_link import NODE, CanLink
 from deal_hw.drivers.cartpole.controller import Controller, Firmware
 from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice
-from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.faults import CanFaults, Hazards
 from deal_hw.drivers.cartpole.firmwares import CAN_FIRMWARES, usable_firmware
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, settings_of
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.servo import Servo
+from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
-from deal_hw.drivers.transports.slcan_transport import (
-    BITRATES,
-    BUS_ERROR,
-    END,
-    PASSIVE,
-    REFUSED,
-    TX_FULL,
-    WARNING,
-    LineReader,
-    decode_line,
-    encode_line,
-)
 from deal_hw.errors import UnknownNameError
 
-_BUFFERED: Final = 3
-"""Most frames waiting in the adapter while the first is not acknowledged."""
 SECOND_DEVICE: Final = 0x5EC0_0000
 """Changes the serial number of a second device under the same number."""
-
-
-class SlcanAdapter:
-    """The adapter, the bus and the devices on it, as one device that speaks the adapter's characters.
-
-    Args:
-        devices: Devices on the bus, whose bytes are frames in the layout of :data:`FRAME`; the first is the
-            cart-pole itself.
-        faults: Faults of the bus.
-    """
-
-    def __init__(self, devices: list[EmulatedDevice], faults: CanFaults) -> None:
-        self._devices = devices
-        self._faults = faults
-        self._reader = LineReader()
-        self._answers = b""
-        self._bitrate: bytes | None = None
-        self._is_open = False
-        self._armed_ns: int | None = None
-        self._bus_off = False
-        self._waiting = 0
-
-    @property
-    def device_ns(self) -> int:
-        """Device time at which the next tick runs [ns]."""
-        return self._devices[0].device_ns
-
-    @property
-    def received_bytes(self) -> int:
-        """Bytes of the frames from the host that reached a device; not the adapter's own commands."""
-        return sum(device.received_bytes for device in self._devices)
-
-    @property
-    def armed(self) -> bool:
-        """Whether the motor follows targets."""
-        return self._devices[0].armed
-
-    @property
-    def mode(self) -> str:
-        """State of the motor."""
-        return self._devices[0].mode
-
-    @property
-    def watchdog(self) -> bool:
-        """Whether the motor was stopped by missing commands."""
-        return self._devices[0].watchdog
-
-    @property
-    def trouble(self) -> str:
-        """Current fault of the bus."""
-        if self._driven_off:
-            return "bus-off"
-        if self._full:
-            return "transmit buffer full"
-        return "node lost" if self._during(self._faults.lost_node_after_s, float("inf")) else ""
-
-    def receive(self, data: bytes) -> None:
-        """Take characters from the host; frames reach the devices in their next tick."""
-        for line in self._reader.feed(data):
-            self._answers += self._answer(line)
-
-    def advance_to(self, device_ns: int) -> bytes:
-        """Run every tick up to a device time [ns]; return the characters sent meanwhile."""
-        answers, self._answers = self._answers, b""
-        sent = [device.advance_to(device_ns) for device in self._devices]
-        if self._armed_ns is None and self.armed:
-            self._armed_ns = device_ns
-        self._bus_off |= self._driven_off
-        if not self._hears:
-            return answers
-        lines = [[_line(f) for f in FRAME.iter_unpack(frames)] for frames in sent]
-        # Two devices with one number corrupt each other's messages.
-        longest = max(map(len, lines))
-        return answers + b"".join(own[k] for k in range(longest) for own in lines if k < len(own))
-
-    def tick(self) -> bytes:
-        """Run one tick; return the characters sent in it."""
-        return self.advance_to(self.device_ns)
-
-    def _answer(self, line: bytes) -> bytes:
-        match line[:1]:
-            case b"t":
-                return self._send(line)
-            case b"S":
-                self._bitrate = line
-            case b"O" | b"L":
-                self._is_open = True
-            case b"C":
-                self._is_open = False
-                # Closing and opening helps only after the cause of the bus-off is over.
-                self._bus_off = self._driven_off
-                self._waiting = 0
-            case b"F":
-                return b"F%02X" % self._flags() + END
-            case b"V":
-                return b"V1013" + END
-            case b"N":
-                return b"NEMUL" + END
-            case b"":
-                pass
-            case _:
-                return REFUSED
-        return END
-
-    def _send(self, line: bytes) -> bytes:
-        frame = decode_line(line)
-        if frame is None or not self._is_open or self._bus_off or self._full:
-            return REFUSED
-        if not self._acknowledged:
-            self._waiting += 1
-            return b"z" + END if self._waiting <= _BUFFERED else REFUSED
-        for device in self._devices:
-            device.receive(FRAME.pack(frame[0], len(frame[1]), frame[1]))
-        return b"z" + END
-
-    def _flags(self) -> int:
-        if self._bus_off or not self._right_bitrate:
-            return BUS_ERROR | PASSIVE
-        if self._full:
-            return TX_FULL
-        return 0 if self._acknowledged else WARNING | BUS_ERROR
-
-    @property
-    def _hears(self) -> bool:
-        return self._is_open and not self._bus_off and self._acknowledged
-
-    @property
-    def _acknowledged(self) -> bool:
-        lost = self._during(self._faults.lost_node_after_s, float("inf"))
-        return self._right_bitrate and not lost and not self._faults.no_acknowledge
-
-    @property
-    def _driven_off(self) -> bool:
-        return self._during(self._faults.bus_off_after_s, self._faults.bus_off_s)
-
-    @property
-    def _full(self) -> bool:
-        return self._during(self._faults.tx_full_after_s, self._faults.tx_full_s)
-
-    @property
-    def _right_bitrate(self) -> bool:
-        return self._bitrate == BITRATES[self._faults.bitrate]
-
-    def _during(self, after_s: float | None, length_s: float) -> bool:
-        if after_s is None or self._armed_ns is None:
-            return False
-        return after_s < (self.device_ns - self._armed_ns) / 1e9 <= after_s + length_s
 
 
 def can_device(
@@ -259,7 +100,3 @@ def can_emulator(
     return adapter_emulator(
         can_devices(truth, faults, firmware), link=link, hazards=hazards, port=lambda path: path + query
     )
-
-
-def _line(frame: tuple[int, int, bytes]) -> bytes:
-    return encode_line(f"{frame[0]:03X}", frame[2][: frame[1]])

@@ -7,142 +7,21 @@ import os
 import select
 import tty
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.drivers.cartpole.device import EmulatedDevice
+from deal_hw.drivers.cartpole.faults import Hazards
 from deal_hw.drivers.cartpole.firmwares import device_of
+from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError
-from deal_hw.testing.faults import FrameFaults
 
 STALL_NS = 50_000_000
 """If the process is behind by more than this, device time stands still instead of catching up."""
 
 _MOST_CHANGES = 2000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CanFaults:
-    """Settings and faults of an emulated CAN bus. Times are counted from the first arming.
-
-    Attributes:
-        node: Number of the device.
-        bitrate: Bit rate of the bus [bit/s]; an adapter set to another rate receives nothing.
-        bus_off_after_s: The adapter's controller goes bus-off [s]; None for never.
-        bus_off_s: Time after that in which it cannot return to the bus [s].
-        tx_full_after_s: The adapter's transmit buffer is full [s]; None for never.
-        tx_full_s: Duration of that [s].
-        lost_node_after_s: The device loses its wire to the bus; the adapter stays connected [s]; None for
-            never.
-        no_acknowledge: No node acknowledges a frame, from the start.
-        duplicate_node: A second device has the same number.
-        dbc_version: Version of the protocol that the device speaks.
-    """
-
-    node: int = 1
-    bitrate: int = 500_000
-    bus_off_after_s: float | None = None
-    bus_off_s: float = 1.0
-    tx_full_after_s: float | None = None
-    tx_full_s: float = 1.0
-    lost_node_after_s: float | None = None
-    no_acknowledge: bool = False
-    duplicate_node: bool = False
-    dbc_version: int = 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServoFaults:
-    """Settings and faults of emulated servos. Times are counted from the first arming.
-
-    Attributes:
-        baud_rate: Baud rate of both.
-        duplicate_id: Both have the belt servo's id.
-        wrong_mode: The belt servo is in velocity mode.
-        protocol: Version that the pole servo speaks.
-        reboot_after_s: The belt servo restarts [s]; None for never.
-        overload_after_s: The belt servo switches itself off for overload [s].
-        absent_after_s: The pole servo falls silent for good [s].
-    """
-
-    baud_rate: int = 1_000_000
-    duplicate_id: bool = False
-    wrong_mode: bool = False
-    protocol: int = 2
-    reboot_after_s: float | None = None
-    overload_after_s: float | None = None
-    absent_after_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Hazards:
-    """Faults that the emulator makes. Times are counted from the first arming.
-
-    Attributes:
-        freeze_after_s: The firmware hangs: it sends and receives nothing any more [s]; None for never.
-        cut_after_s: The wire is cut: nothing is sent or received, but the firmware runs on [s]; None for
-            never.
-        cut_s: Duration of the cut [s].
-        vanish_after_s: The port disappears as if unplugged, but the firmware runs on [s]; None for never.
-        return_after_s: Time after that until it returns, as a new port under the same link [s]; None: it does
-            not return, and the emulator ends.
-        faults: What happens to frames from the device.
-        can: A CAN bus and its faults.
-        servo: Dynamixel servos and their faults.
-    """
-
-    freeze_after_s: float | None = None
-    cut_after_s: float | None = None
-    cut_s: float = 1.0
-    vanish_after_s: float | None = None
-    return_after_s: float | None = None
-    faults: FrameFaults | None = None
-    can: CanFaults = CanFaults()
-    servo: ServoFaults = ServoFaults()
-
-
-class PtyDevice(Protocol):
-    """The device behind the port: takes and returns characters, in device time."""
-
-    @property
-    def received_bytes(self) -> int:
-        """Number of bytes from the host."""
-        ...
-
-    @property
-    def trouble(self) -> str:
-        """Present fault of its wire, in words; "" for none."""
-        ...
-
-    @property
-    def device_ns(self) -> int:
-        """Device time at which the next tick runs [ns]."""
-        ...
-
-    @property
-    def armed(self) -> bool:
-        """Whether the motor follows targets."""
-        ...
-
-    @property
-    def mode(self) -> str:
-        """Mode of the motor."""
-        ...
-
-    @property
-    def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away."""
-        ...
-
-    def receive(self, data: bytes) -> None:
-        """Take characters from the host."""
-        ...
-
-    def advance_to(self, device_ns: int) -> bytes:
-        """Run every tick up to a device time [ns]; return the characters sent meanwhile."""
-        ...
 
 
 class CartpoleEmulator:
@@ -166,7 +45,7 @@ class CartpoleEmulator:
 
     def __init__(
         self,
-        device: PtyDevice,
+        device: EmulatedDevice | SlcanAdapter,
         link: Path | None = None,
         hazards: Hazards | None = None,
         clock: Clock | None = None,

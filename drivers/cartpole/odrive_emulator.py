@@ -15,7 +15,8 @@ from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
 from deal_hw.drivers.cartpole.controller import TICKS_PER_STATE, Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.description import DAMPING_NS_M, DESCRIPTION, EFFORT_LIMIT_N, STIFFNESS_N_M
 from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice
-from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.faults import CanFaults, Hazards
 from deal_hw.drivers.cartpole.firmwares import CAN_FIRMWARES, usable_firmware
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, settings_of
 from deal_hw.drivers.cartpole.mechanics import Mechanics

@@ -11,8 +11,9 @@ import pytest
 
 from deal_hw.cli.doctor import Doctor, doctor
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers.cartpole.can_emulator import SlcanAdapter, can_devices
-from deal_hw.drivers.cartpole.emulator import CanFaults
+from deal_hw.drivers.cartpole.can_emulator import can_devices
+from deal_hw.drivers.cartpole.faults import CanFaults
+from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport

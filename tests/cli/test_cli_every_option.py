@@ -65,8 +65,8 @@ VALUES: dict[str, tuple[str, ...]] = {
     "mode": ("peer",),
 }
 """What options that are no numbers, flags and choices are given."""
-COMPOSED = (("", "_after_s"), ("servo_", ""))
-"""Beginnings and ends of names that the emulators of the Go2 and of the servos compose."""
+COMPOSED = (("", "_after_s"),)
+"""Beginnings and ends of names that the emulator of the Go2 composes."""
 TOLD_ELSEWHERE = {"quiet", "json"}
 """They change what is printed or written of the result, which the tests of each verb look at."""
 

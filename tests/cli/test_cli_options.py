@@ -16,7 +16,8 @@ from verb_options import dataclasses_of
 from deal_hw.cli.main import VERBS, main, run
 from deal_hw.control.posture import PostureConfig
 from deal_hw.errors import ConfigurationError, UnknownNameError
-from deal_hw.workflows.options import Only, Range
+from deal_hw.ranges import Range
+from deal_hw.workflows.options import Only
 
 NO_USE: tuple[float, ...] = (math.nan, math.inf, -math.inf, 1e300)
 """No option takes one of these."""

@@ -15,17 +15,18 @@ from hypothesis import strategies as st
 from deal_hw.cli.emulate import Emulate
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.can_emulator import SlcanAdapter, can_device, can_devices
+from deal_hw.drivers.cartpole.can_emulator import can_device, can_devices
 from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept, database, frame_id
 from deal_hw.drivers.cartpole.can_robot import CanFrames
 from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
-from deal_hw.drivers.cartpole.emulator import CanFaults
+from deal_hw.drivers.cartpole.faults import CanFaults
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, library, settings_of
 from deal_hw.drivers.cartpole.odrive_emulator import OdriveFirmware, PoleEncoder, odrive_device
 from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.truth import candidate_truth, nominal_truth
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport

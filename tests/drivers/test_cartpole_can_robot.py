@@ -21,13 +21,15 @@ from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers import claim_name, make_robot
 from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_emulator import SlcanAdapter, can_device, can_devices, can_emulator
+from deal_hw.drivers.cartpole.can_emulator import can_device, can_devices, can_emulator
 from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept, frame_id
 from deal_hw.drivers.cartpole.can_robot import CanFrames, can_robot
 from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.faults import CanFaults, Hazards
 from deal_hw.drivers.cartpole.link import SerialLink
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport, encode_line
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
@@ -46,7 +48,6 @@ from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, WireOptions
 from deal_hw.types import RobotState, Status
 from deal_hw.workflows.emulation.process import EmulatorProcess
-from deal_hw.workflows.emulation.settings import CanOptions
 from deal_hw.workflows.running.settings import LinkOptions
 
 MS = 1_000_000
@@ -358,8 +359,8 @@ def test_settings_of_a_port_do_not_make_it_another_robot(tmp_path: Path) -> None
 def test_options_of_a_bus_need_one() -> None:
     """On the serial wire they would be ignored."""
     with pytest.raises(ConfigurationError, match="--node would have no effect"):
-        Emulate(robot="cartpole", can=CanOptions(node=3))
-    Emulate(robot="cartpole", transport="can", can=CanOptions(node=3))
+        Emulate(robot="cartpole", can=CanFaults(node=3))
+    Emulate(robot="cartpole", transport="can", can=CanFaults(node=3))
 
 
 @pytest.mark.parametrize("transport", ["can", "odrive"])

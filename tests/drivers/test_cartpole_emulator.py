@@ -13,7 +13,8 @@ from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.faults import Hazards
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 from deal_hw.drivers.transports.serial_transport import SerialTransport

@@ -29,7 +29,7 @@ from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS
 from deal_hw.drivers.cartpole.dynamixel.emulator import ServoEmulator, dynamixel_emulator
 from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.emulator import Hazards, ServoFaults
+from deal_hw.drivers.cartpole.faults import Hazards, ServoFaults
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, PortNotFoundError
 from deal_hw.findings import Finding, Level
@@ -149,7 +149,7 @@ def test_the_return_delay_is_kept(sdk: tuple[PortHandler, PacketHandler]) -> Non
 def test_a_port_of_another_rate_hears_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Servos at 57600 baud are deaf at a million, and answer at their own rate."""
     monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 200)
-    with emulated(ServoFaults(baud_rate=57600)) as (path, _):
+    with emulated(ServoFaults(servo_baud_rate=57600)) as (path, _):
         port = PortHandler(path)
         port.setBaudRate(1_000_000)
         assert PacketHandler(2.0).ping(port, 1)[1] == COMM_RX_TIMEOUT
@@ -176,10 +176,14 @@ def test_doctor_lists_servos(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("faults", "says", "remedy"),
     [
-        (ServoFaults(baud_rate=57600), "set to 57600 baud, but deal-hw expects 1000000", r"Baud Rate \(8\)"),
-        (ServoFaults(baud_rate=3_000_000), "set to 3000000 baud", "baud_rate=3000000"),
         (
-            ServoFaults(duplicate_id=True),
+            ServoFaults(servo_baud_rate=57600),
+            "set to 57600 baud, but deal-hw expects 1000000",
+            r"Baud Rate \(8\)",
+        ),
+        (ServoFaults(servo_baud_rate=3_000_000), "set to 3000000 baud", "baud_rate=3000000"),
+        (
+            ServoFaults(servo_duplicate_id=True),
             "id 1 at 1000000 baud answers pings",
             "two servos may have the same id",
         ),

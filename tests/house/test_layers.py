@@ -20,6 +20,7 @@ VOCABULARY = (
     "reading",
     "schema",
     "install",
+    "ranges",
     "child_process",
     "version",
 )

@@ -13,8 +13,8 @@ import pytest
 import deal_hw
 from deal_hw.cli.main import EXIT_ERROR, main
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
+from deal_hw.ranges import option
 from deal_hw.workflows.emulation.process import arguments
-from deal_hw.workflows.options import option
 
 POSITIONAL = ("robot", "episode", "model")
 LINES = {"new_robot": ["robot", "new"], "check_robot": ["robot", "check"]}

@@ -15,11 +15,12 @@ import pytest
 import deal_hw
 from deal_hw.control.loop import Outcome
 from deal_hw.drivers.cartpole.description import k9_space
+from deal_hw.drivers.cartpole.faults import CanFaults
 from deal_hw.errors import ConfigurationError, PolicyMismatchError, TransportError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT
 from deal_hw.workflows.emulation.process import arguments
-from deal_hw.workflows.emulation.settings import CanOptions, EmulateSettings, Go2Options
+from deal_hw.workflows.emulation.settings import EmulateSettings, Go2Options
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.say import silent
@@ -101,7 +102,7 @@ def test_an_emulator_that_does_not_start_says_why(tmp_path: Path) -> None:
 def test_settings_become_options_of_the_command_line() -> None:
     """What differs from the defaults, switches that are off among it, and groups inside."""
     settings = EmulateSettings(
-        "cartpole", transport="can", seed=2, nominal=True, can=CanOptions(node=3, no_acknowledge=True)
+        "cartpole", transport="can", seed=2, nominal=True, can=CanFaults(node=3, no_acknowledge=True)
     )
     assert arguments(settings, EmulateSettings("cartpole")) == [
         "--transport",

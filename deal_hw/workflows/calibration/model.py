@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, MissingExtraError, short
 from deal_hw.parameters import ParameterSpace
+from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.checks import (
     examine_recording,
@@ -31,7 +32,7 @@ from deal_hw.workflows.calibration.recordings import (
     without,
 )
 from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
-from deal_hw.workflows.options import Checked, File, Range
+from deal_hw.workflows.options import File
 from deal_hw.workflows.robot import carries_robot, recorded_robot
 from deal_hw.workflows.say import Say, silent
 

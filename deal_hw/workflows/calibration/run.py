@@ -25,6 +25,7 @@ from deal_hw.calibration import (
 )
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.best_so_far import (
     SO_FAR,
@@ -34,7 +35,6 @@ from deal_hw.workflows.calibration.best_so_far import (
     saying_how_to_resume,
 )
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
-from deal_hw.workflows.options import Range
 from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:

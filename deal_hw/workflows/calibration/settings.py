@@ -15,6 +15,7 @@ from deal_hw.data.files import dataset_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.carried import prepare_carried
 from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
@@ -30,7 +31,7 @@ from deal_hw.workflows.calibration.run import (
     residual_std_of,
 )
 from deal_hw.workflows.calibration.walking import WALK_TELLS
-from deal_hw.workflows.options import Checked, File, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.workflows.options import File, Ratio, Seed, Threads, given, refuse
 from deal_hw.workflows.robot import carries_robot
 from deal_hw.workflows.say import Say, silent
 

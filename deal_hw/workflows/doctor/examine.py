@@ -17,10 +17,11 @@ from deal_hw.drivers import (
 )
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
+from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.doctor.robot import examine_robot
-from deal_hw.workflows.options import Checked, Range, from_settings, given, refuse
+from deal_hw.workflows.options import from_settings, given, refuse
 from deal_hw.workflows.say import html_table
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from deal_hw.drivers.cartpole.faults import Hazards
 from deal_hw.errors import MissingExtraError
 from deal_hw.workflows.emulation.common import (
     choose_truth,
@@ -26,7 +26,7 @@ from deal_hw.workflows.emulation.settings import (
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
-    from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
+    from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
     from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
 
@@ -98,12 +98,10 @@ def _truth(config: EmulateSettings) -> CartpoleTruth:
 def _hazards(config: EmulateSettings) -> Hazards:
     import numpy as np
 
-    from deal_hw.drivers.cartpole.emulator import CanFaults, Hazards, ServoFaults
     from deal_hw.testing.faults import FaultRates, FrameFaults
 
     # A frame of a serial CAN adapter is a line; servos send a packet at a time.
     end = b"\r" if config.transport in ON_CAN else None if config.transport == "dynamixel" else b"\0"
-    servo = {name.removeprefix("servo_"): value for name, value in dataclasses.asdict(config.servo).items()}
     rates = FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate)
     return Hazards(
         freeze_after_s=config.freeze_after_s,
@@ -114,6 +112,6 @@ def _hazards(config: EmulateSettings) -> Hazards:
         faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]), end)
         if rates != FaultRates()
         else None,
-        can=CanFaults(**dataclasses.asdict(config.can)),
-        servo=ServoFaults(**servo),
+        can=config.can,
+        servo=config.servo,
     )

@@ -15,7 +15,7 @@ from typing import Any
 from typing_extensions import Self
 
 from deal_hw.errors import TransportError
-from deal_hw.workflows.options import option
+from deal_hw.ranges import option
 
 START_TIMEOUT_S = 60.0
 

@@ -6,22 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+from deal_hw.drivers.cartpole.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.ranges import Range, check_ranges
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import (
-    CARTPOLE,
-    File,
-    Only,
-    Range,
-    Ratio,
-    Seed,
-    Share,
-    check_ranges,
-    given,
-    refuse,
-    refuse_others,
-)
+from deal_hw.workflows.options import CARTPOLE, File, Only, Ratio, Seed, Share, given, refuse, refuse_others
 
 GO2 = Only(("go2",))
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
@@ -93,73 +83,6 @@ class Go2Options:
             certificate=self.certificate,
             key=self.key,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class CanOptions:
-    """An emulated CAN bus and its faults, whose times count from the first arming of the motor."""
-
-    node: Annotated[int, Range(1, 62)] = 1
-    """CAN: number of the device on the bus."""
-
-    bitrate: Literal[125000, 250000, 500000, 800000, 1000000] = 500000
-    """CAN: bit rate of the bus; a host with another rate receives nothing."""
-
-    bus_off_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """CAN: the adapter's controller goes bus-off after this time [s]."""
-
-    bus_off_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
-    """CAN: how long the bus stays off, even if it is opened again [s]."""
-
-    tx_full_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """CAN: the adapter's transmit buffer is full after this time [s]."""
-
-    tx_full_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
-    """CAN: how long the transmit buffer is full [s]."""
-
-    lost_node_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """CAN: the device's wire to the bus breaks after this time [s]; the adapter stays."""
-
-    no_acknowledge: bool = False
-    """CAN: no node acknowledges the host's frames."""
-
-    duplicate_node: bool = False
-    """CAN: a second device has the same number."""
-
-    dbc_version: Annotated[int, Range(1, 255)] = 1
-    """CAN: version of the protocol that the device speaks."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ServoOptions:
-    """Emulated Dynamixel servos and their faults, whose times count from the first arming of the motor."""
-
-    servo_baud_rate: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 1000000
-    """Dynamixel: baud rate of both servos; a port with another rate does not reach them."""
-
-    servo_duplicate_id: bool = False
-    """Dynamixel: both servos have id 1."""
-
-    servo_wrong_mode: bool = False
-    """Dynamixel: the belt servo is in velocity mode."""
-
-    servo_protocol: Literal[1, 2] = 2
-    """Dynamixel: protocol of the pole servo."""
-
-    servo_reboot_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """Dynamixel: the belt servo restarts after this time [s]."""
-
-    servo_overload_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """Dynamixel: the belt servo switches itself off by overload after this time [s]."""
-
-    servo_absent_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """Dynamixel: the pole servo stops answering after this time [s]."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 CARTPOLE_EMULATORS = {
@@ -261,10 +184,10 @@ class EmulateSettings:
     parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent. For programs that start an emulator."""
 
-    can: Annotated[CanOptions, CARTPOLE] = field(default_factory=CanOptions)
+    can: Annotated[CanFaults, CARTPOLE] = field(default_factory=CanFaults)
     """The CAN bus of a cart-pole."""
 
-    servo: Annotated[ServoOptions, CARTPOLE] = field(default_factory=ServoOptions)
+    servo: Annotated[ServoFaults, CARTPOLE] = field(default_factory=ServoFaults)
     """The servos of a cart-pole."""
 
     go2: Annotated[Go2Options, GO2] = field(default_factory=Go2Options)
@@ -279,9 +202,9 @@ class EmulateSettings:
         refuse_others(self, "emulate", self.robot)
         wire = self.transport or TRANSPORTS[self.robot][0]
         if wire not in ON_CAN:
-            refuse(given(self.can, CanOptions()), "only `--transport can` and `odrive` have a CAN bus")
+            refuse(given(self.can, CanFaults()), "only `--transport can` and `odrive` have a CAN bus")
         if wire != "dynamixel":
-            refuse(given(self.servo, ServoOptions()), "only `--transport dynamixel` has servos")
+            refuse(given(self.servo, ServoFaults()), "only `--transport dynamixel` has servos")
         if wire not in WITH_FIRMWARE:
             refuse(
                 given(self, EmulateSettings, ["firmware"]),

@@ -37,7 +37,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     Block,
 )
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.emulator import ServoFaults
+from deal_hw.drivers.cartpole.faults import ServoFaults
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.sensor import Motor
@@ -186,11 +186,11 @@ class DynamixelDevice(EmulatedDevice):
 
     def _set_up_badly(self) -> None:
         f = self._faults
-        if f.duplicate_id:
+        if f.servo_duplicate_id:
             self._pole.put(ID, self._cart.id)
-        if f.wrong_mode:
+        if f.servo_wrong_mode:
             self._cart.put(OPERATING_MODE, _VELOCITY_MODE)
-        self._pole.protocol = f.protocol
+        self._pole.protocol = f.servo_protocol
 
     # What the mechanics do.
 
@@ -289,13 +289,13 @@ class DynamixelDevice(EmulatedDevice):
             return
         passed_s = (self._now_ns - self._first_ns) / 1e9
         f = self._faults
-        if f.reboot_after_s is not None and passed_s > f.reboot_after_s:
-            self._faults = f = dataclasses.replace(f, reboot_after_s=None)
+        if f.servo_reboot_after_s is not None and passed_s > f.servo_reboot_after_s:
+            self._faults = f = dataclasses.replace(f, servo_reboot_after_s=None)
             self.reboot(self._cart)
-        if f.overload_after_s is not None and passed_s > f.overload_after_s:
-            self._faults = f = dataclasses.replace(f, overload_after_s=None)
+        if f.servo_overload_after_s is not None and passed_s > f.servo_overload_after_s:
+            self._faults = f = dataclasses.replace(f, servo_overload_after_s=None)
             self._cart.fail(OVERLOAD)
-        if f.absent_after_s is not None and passed_s > f.absent_after_s:
+        if f.servo_absent_after_s is not None and passed_s > f.servo_absent_after_s:
             self._pole.present = False
 
     # What the host asks for.

@@ -9,7 +9,8 @@ from typing import Final
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.registers import BAUD_RATES
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.faults import Hazards
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
 _SPEEDS: Final = {
@@ -43,6 +44,6 @@ class ServoEmulator(CartpoleEmulator):
 
 def dynamixel_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Hazards) -> ServoEmulator:
     """Return an emulated cart-pole on two servos."""
-    settings = DynamixelSettings(baud_rate=hazards.servo.baud_rate)
+    settings = DynamixelSettings(baud_rate=hazards.servo.servo_baud_rate)
     device = DynamixelDevice(truth, settings, hazards.servo)
     return ServoEmulator(device, link, hazards)

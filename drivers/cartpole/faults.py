@@ -1,0 +1,97 @@
+"""Settings and faults of an emulated cart-pole's wire; the command line has the first two as options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from deal_hw.ranges import Checked, Range
+from deal_hw.testing.faults import FrameFaults
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanFaults(Checked):
+    """An emulated CAN bus and its faults, whose times count from the first arming of the motor."""
+
+    node: Annotated[int, Range(1, 62)] = 1
+    """CAN: number of the device on the bus."""
+
+    bitrate: Literal[125000, 250000, 500000, 800000, 1000000] = 500000
+    """CAN: bit rate of the bus; a host with another rate receives nothing."""
+
+    bus_off_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """CAN: the adapter's controller goes bus-off after this time [s]."""
+
+    bus_off_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
+    """CAN: how long the bus stays off, even if it is opened again [s]."""
+
+    tx_full_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """CAN: the adapter's transmit buffer is full after this time [s]."""
+
+    tx_full_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
+    """CAN: how long the transmit buffer is full [s]."""
+
+    lost_node_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """CAN: the device's wire to the bus breaks after this time [s]; the adapter stays."""
+
+    no_acknowledge: bool = False
+    """CAN: no node acknowledges the host's frames."""
+
+    duplicate_node: bool = False
+    """CAN: a second device has the same number."""
+
+    dbc_version: Annotated[int, Range(1, 255)] = 1
+    """CAN: version of the protocol that the device speaks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServoFaults(Checked):
+    """Emulated Dynamixel servos and their faults, whose times count from the first arming of the motor."""
+
+    servo_baud_rate: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 1000000
+    """Dynamixel: baud rate of both servos; a port with another rate does not reach them."""
+
+    servo_duplicate_id: bool = False
+    """Dynamixel: both servos have id 1."""
+
+    servo_wrong_mode: bool = False
+    """Dynamixel: the belt servo is in velocity mode."""
+
+    servo_protocol: Literal[1, 2] = 2
+    """Dynamixel: protocol of the pole servo."""
+
+    servo_reboot_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Dynamixel: the belt servo restarts after this time [s]."""
+
+    servo_overload_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Dynamixel: the belt servo switches itself off by overload after this time [s]."""
+
+    servo_absent_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Dynamixel: the pole servo stops answering after this time [s]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hazards:
+    """Faults that the emulator makes. Times are counted from the first arming.
+
+    Attributes:
+        freeze_after_s: The firmware hangs: it sends and receives nothing any more [s]; None for never.
+        cut_after_s: The wire is cut: nothing is sent or received, but the firmware runs on [s]; None for
+            never.
+        cut_s: Duration of the cut [s].
+        vanish_after_s: The port disappears as if unplugged, but the firmware runs on [s]; None for never.
+        return_after_s: Time after that until it returns, as a new port under the same link [s]; None: it does
+            not return, and the emulator ends.
+        faults: What happens to frames from the device.
+        can: A CAN bus and its faults.
+        servo: Dynamixel servos and their faults.
+    """
+
+    freeze_after_s: float | None = None
+    cut_after_s: float | None = None
+    cut_s: float = 1.0
+    vanish_after_s: float | None = None
+    return_after_s: float | None = None
+    faults: FrameFaults | None = None
+    can: CanFaults = CanFaults()
+    servo: ServoFaults = ServoFaults()
