@@ -239,6 +239,10 @@ class RobotDescription:
 
     def digest(self) -> str:
         """Return a digest that changes when any fact changes; sources do not count."""
-        values = self.to_json()
-        values.pop("sources")
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+        return digest_of(self.to_json())
+
+
+def digest_of(description: Mapping[str, Any]) -> str:
+    """Return the digest of a description given as JSON; equals :meth:`RobotDescription.digest`."""
+    facts = {key: value for key, value in description.items() if key != "sources"}
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]

@@ -91,34 +91,6 @@ REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Transports that reach each robot; the first is the default."""
 
-__all__ = [
-    "BALANCE",
-    "CAN_BUSES",
-    "DESCRIPTIONS",
-    "MAKERS",
-    "ODOMETRY",
-    "REACHED_BY",
-    "ROBOTS",
-    "SIMULATED",
-    "SPACES",
-    "TOPIC_TRANSPORTS",
-    "TRANSPORTS",
-    "adopt_robot",
-    "balanced",
-    "can_bus",
-    "claim_name",
-    "default_transport",
-    "driver_description",
-    "make_robot",
-    "make_topic_transport",
-    "make_transport",
-    "parameter_spaces",
-    "recorded_description",
-    "robot_description",
-    "walked",
-    "wire_claim",
-]
-
 
 def make_robot(
     name: str,

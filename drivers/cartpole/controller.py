@@ -87,6 +87,8 @@ class Controller:
     Attributes:
         homings: How often homing began.
         armings: How often the motor was armed.
+        mode: State of the motor.
+        watchdog: Whether the motor was stopped by missing commands since it was last armed.
 
     Args:
         servo: The position loop.
@@ -104,23 +106,13 @@ class Controller:
         self._command_delay = command_delay
         self._link: Link = link or SerialLink()
         self._tick = 0
-        self._mode = Mode.IDLE
-        self._homed = self._watchdog = False
+        self.mode = Mode.IDLE
+        self._homed = self.watchdog = False
         self._last_request: tuple[int, int] | None = None
         self._state_count = 0
         self._commands: deque[tuple[int, protocol.Target]] = deque()
         self._command_sequence = protocol.NO_COMMAND
         self._command_tick = self._alive_tick = 0
-
-    @property
-    def mode(self) -> Mode:
-        """State of the motor."""
-        return self._mode
-
-    @property
-    def watchdog(self) -> bool:
-        """Whether the motor was stopped by missing commands since it was last armed."""
-        return self._watchdog
 
     @property
     def frame_errors(self) -> int:
@@ -153,10 +145,10 @@ class Controller:
         tick = self._tick
         self._tick = tick + 1
         force = 0.0
-        if self._mode is Mode.ARMED and tick - self._alive_tick >= WATCHDOG_TICKS:
+        if self.mode is Mode.ARMED and tick - self._alive_tick >= WATCHDOG_TICKS:
             self._stop()
-            self._watchdog = True
-        if self._mode is Mode.ARMED:
+            self.watchdog = True
+        if self.mode is Mode.ARMED:
             while self._commands and self._commands[0][0] <= tick:
                 self._servo.accept(self._commands.popleft()[1])
             force = self._servo.update(motor.position, motor.velocity)
@@ -169,7 +161,7 @@ class Controller:
     def state(self, reading: Reading) -> protocol.State:
         """Return the same as a message."""
         tick = self._tick - 1
-        armed = self._mode is Mode.ARMED
+        armed = self.mode is Mode.ARMED
         effort, clamped = self._servo.estimate(
             reading.setpoint, reading.cart_um / 1e6, reading.cart_um_s / 1e6
         )
@@ -179,8 +171,8 @@ class Controller:
             status |= Status.EFFORT_CLAMPED if clamped else Status.NONE
             status |= Status.SPEED_CLAMPED if self._servo.slewing else Status.NONE
         status |= Status.HOMED if self._homed else Status.NONE
-        status |= Status.HOMING if self._mode is Mode.HOMING else Status.NONE
-        status |= Status.WATCHDOG if self._watchdog else Status.NONE
+        status |= Status.HOMING if self.mode is Mode.HOMING else Status.NONE
+        status |= Status.WATCHDOG if self.watchdog else Status.NONE
         status |= Status.AT_END_STOP if reading.at_end_stop else Status.NONE
         sequence = self._state_count
         self._state_count = (sequence + 1) & 0xFFFF_FFFF
@@ -200,13 +192,13 @@ class Controller:
 
     def finish_homing(self) -> None:
         """Note that the cart is in the middle and the pole upright; only has an effect while homing."""
-        if self._mode is Mode.HOMING:
-            self._mode = Mode.IDLE
+        if self.mode is Mode.HOMING:
+            self.mode = Mode.IDLE
             self._homed = True
 
     def _take_target(self, target: protocol.Target) -> None:
         # A repeated number comes from a stuck host or adapter; it must not reset the watchdog.
-        if self._mode is not Mode.ARMED or target.sequence == self._command_sequence:
+        if self.mode is not Mode.ARMED or target.sequence == self._command_sequence:
             return
         self._command_sequence = target.sequence
         self._command_tick = self._alive_tick = self._tick
@@ -242,11 +234,11 @@ class Controller:
                 self._stop()
             case protocol.Home():
                 self._stop()
-                self._homed = self._watchdog = False
-                self._mode = Mode.HOMING
+                self._homed = self.watchdog = False
+                self.mode = Mode.HOMING
                 self.homings += 1
             case protocol.Arm():
-                if self._mode is Mode.HOMING:
+                if self.mode is Mode.HOMING:
                     return protocol.Result.HOMING
                 if not self._homed:
                     return protocol.Result.NOT_HOMED
@@ -254,14 +246,14 @@ class Controller:
         return protocol.Result.DONE
 
     def _arm(self, motor: Motor) -> None:
-        self._watchdog = False
-        if self._mode is not Mode.ARMED:
+        self.watchdog = False
+        if self.mode is not Mode.ARMED:
             self._servo.reset(motor.position)
-            self._mode = Mode.ARMED
+            self.mode = Mode.ARMED
             self.armings += 1
         self._alive_tick = self._tick
 
     def _stop(self) -> None:
         self._commands.clear()
         self._servo.reset(self._servo.setpoint)
-        self._mode = Mode.IDLE
+        self.mode = Mode.IDLE

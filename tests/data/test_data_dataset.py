@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.data.recording.dataset import Dataset, digest_of
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.description import digest_of
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
 

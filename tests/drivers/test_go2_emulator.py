@@ -12,6 +12,7 @@ from fakes.memory_wire import MemoryWire
 
 from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
+from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
 from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, Go2Faults
@@ -23,7 +24,7 @@ from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
 from deal_hw.transport import Message, WireOptions
-from deal_hw.workflows.emulation.go2 import free_port, make_transport, summary
+from deal_hw.workflows.emulation.go2 import free_port, summary
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.settings import Go2Options
 
@@ -134,8 +135,11 @@ def test_its_own_faults_do_not_end_it(transport: str, shares: dict[str, float], 
     clock = VirtualClock(5_000 * MS)
     device = Go2Device(nominal_truth(), sport="", plan=FaultPlan(**shares))  # type: ignore[arg-type]
     port = free_port({"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:0"}[transport])
-    wire = make_transport(
-        transport, port, WireOptions(listen=True) if transport == "zenoh" else WireOptions(domain=dds_domain)
+    wire = make_topic_transport(
+        transport,
+        port,
+        MonotonicClock(),
+        WireOptions(listen=True) if transport == "zenoh" else WireOptions(domain=dds_domain),
     )
     emulator = Go2Emulator(device, wire, clock)
     emulator.open()
@@ -210,12 +214,6 @@ def test_a_free_port_is_found() -> None:
         free_port("tcp/192.0.2.1:0")
 
 
-def test_transports_are_made_by_name() -> None:
-    """A name that is none lists those there are."""
-    with pytest.raises(UnknownNameError, match="transport of the Go2 'serial'; known: dds, zenoh"):
-        make_transport("serial", "x", WireOptions())
-
-
 def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
     """A client releases sport mode and commands, sees ticks that count up; at the end the truth is told."""
     pytest.importorskip("zenoh")
@@ -236,7 +234,7 @@ def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
         str(revealed),
     )
     with process:
-        client = make_transport("zenoh", process.port, WireOptions())
+        client = make_topic_transport("zenoh", process.port, MonotonicClock(), WireOptions())
         asked = topics.request("motion_switcher")
         answers = topics.response("motion_switcher")
         client.declare(publish=(asked, topics.LOW_COMMAND), subscribe=(answers, topics.LOW_STATE))

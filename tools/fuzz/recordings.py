@@ -19,7 +19,7 @@ import zstandard
 from deal_hw.clock import VirtualClock
 from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.data.files import INDEX_NAME
-from deal_hw.data.recording.dataset import Dataset, digest_of
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.episode_info import summarize
 from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_wire
@@ -27,6 +27,7 @@ from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.recording.repair import repair, verify
 from deal_hw.data.run_folder import RunFolder
+from deal_hw.description import digest_of
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
 from deal_hw.transport import Message

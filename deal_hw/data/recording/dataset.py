@@ -19,7 +19,7 @@ from deal_hw.data.files import INDEX_NAME, write_bytes, write_json
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.reader import Episode, check_description, read_episode
 from deal_hw.data.recording.repair import repair
-from deal_hw.description import RobotDescription
+from deal_hw.description import RobotDescription, digest_of
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
 from deal_hw.reading import MIB, read_json
 from deal_hw.schema import STRICT
@@ -31,12 +31,6 @@ _INDEX_BYTES = 64 * MIB
 """That of 10,000 episodes has some 30 MB [B]."""
 _LOCK_NAME = ".lock"
 Notify = Callable[[str], None]
-
-
-def digest_of(description: Mapping[str, Any]) -> str:
-    """Return the digest of a description given as JSON; equals ``RobotDescription.digest()``."""
-    facts = {key: value for key, value in description.items() if key != "sources"}
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True, slots=True)

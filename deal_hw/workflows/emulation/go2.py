@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from deal_hw.clock import MonotonicClock
 from deal_hw.control.velocity_error import Track
+from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError, shown
+from deal_hw.errors import ConfigurationError, MissingExtraError, shown
 from deal_hw.reading import reading
-from deal_hw.transport import TopicTransport, WireOptions
 from deal_hw.workflows.emulation.common import (
     choose_truth,
     happenings,
@@ -36,21 +37,6 @@ if TYPE_CHECKING:
 TRACK_COLUMNS = ("time_s", "x", "y", "heading")
 TRACK_NS = 10_000_000
 _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
-
-
-def make_transport(name: str, port: str, options: WireOptions) -> TopicTransport:
-    """Return a topic transport that is not opened yet.
-
-    Raises:
-        UnknownNameError: There is no such transport.
-        MissingExtraError: Its package is not installed.
-    """
-    from deal_hw import drivers
-    from deal_hw.clock import MonotonicClock
-
-    if name not in DEFAULT_PORTS:
-        raise UnknownNameError("transport of the Go2", name, DEFAULT_PORTS)
-    return drivers.make_topic_transport(name, port, MonotonicClock(), options)
 
 
 def emulate_go2(
@@ -75,7 +61,8 @@ def emulate_go2(
     device = _device(config, truth)
     transport = config.transport or "dds"
     port = free_port(config.port or DEFAULT_PORTS[transport])
-    emulator = Go2Emulator(device, make_transport(transport, port, config.go2.wire(transport)))
+    wire = make_topic_transport(transport, port, MonotonicClock(), config.go2.wire(transport))
+    emulator = Go2Emulator(device, wire)
     gc.collect()
     gc.freeze()
     # Threads of the transport inherit the priority of the moment when it is opened.
