@@ -204,6 +204,10 @@ def schroeder_phases(power: FloatArray) -> FloatArray:
     return np.asarray(-2 * math.pi * np.cumsum(before))
 
 
+MOST_TONES = 24
+"""Most tones of a joint."""
+
+
 def multisine(
     amplitude: FloatArray,
     low_hz: float,
@@ -212,7 +216,6 @@ def multisine(
     *,
     tilt: float = 0.0,
     rng: np.random.Generator,
-    most: int = 24,
 ) -> Tones:
     """Return a multisine with Schroeder phases, other harmonics for each joint.
 
@@ -225,7 +228,6 @@ def multisine(
         base_hz: All frequencies are multiples of it; one over the signal's length, so that joints differ.
         tilt: Amplitudes fall with frequency to this power; 0 is flat, 1 equal speeds.
         rng: Draws beginning and sign of each joint.
-        most: Most tones of a joint.
 
     Raises:
         ConfigurationError: The band contains fewer harmonics than there are joints.
@@ -233,7 +235,7 @@ def multisine(
     A = len(amplitude)
     harmonics = np.arange(math.ceil(low_hz / base_hz - 1e-9), math.floor(high_hz / base_hz + 1e-9) + 1)
     harmonics = harmonics[harmonics > 0]
-    count = min(len(harmonics) // A, most)
+    count = min(len(harmonics) // A, MOST_TONES)
     if count < 1:
         raise ConfigurationError(
             f"the band {low_hz:g} to {high_hz:g} Hz contains {len(harmonics)} multiples of {base_hz:.3g} "

@@ -64,9 +64,9 @@ class MethodCase:
         rng = np.random.default_rng(seed)
         return self.method.run(self.make_problem(), budget, rng, progress, checkpoint)
 
-    def store(self, path: Path, identity: str = "mine") -> StateStore:
+    def store(self, path: Path) -> StateStore:
         """Return a place to keep a run's state."""
-        return MemoryStore() if self.open_store is None else self.open_store(path, identity)
+        return MemoryStore() if self.open_store is None else self.open_store(path, "mine")
 
     def log_error(self, estimate: FloatArray) -> float:
         """Return the mean |ln(estimate / truth)|."""

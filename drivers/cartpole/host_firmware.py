@@ -18,10 +18,9 @@ from deal_hw.drivers.cartpole.description import (
     STIFFNESS_N_M,
 )
 from deal_hw.drivers.cartpole.mechanics import Mechanics
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.sensor import Motor, Reading, fit
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
 
-_I32 = 0x7FFF_FFFF
 _MODES = (Mode.IDLE, Mode.HOMING, Mode.ARMED)
 _ONE = 65536
 _DRAW = ctypes.CFUNCTYPE(ctypes.c_uint16)
@@ -220,12 +219,8 @@ class CanHostFirmware(HostFirmware):
 
 
 def _integers(motor: Motor) -> tuple[int, int]:
-    return _fit(motor.position * 1e9), _fit(motor.velocity * 1e6)
+    return fit(motor.position * 1e9), fit(motor.velocity * 1e6)
 
 
 def _values(reading: Reading) -> tuple[int, ...]:
-    return (*reading[:4], _fit(reading.setpoint * 1e9), reading.at_end_stop)
-
-
-def _fit(value: float) -> int:
-    return min(max(round(value), -_I32), _I32)
+    return (*reading[:4], fit(reading.setpoint * 1e9), reading.at_end_stop)

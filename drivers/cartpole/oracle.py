@@ -57,9 +57,7 @@ def oracle_balances(truth: CartpoleTruth) -> bool:
     return all(balances(truth, controller, angle) for angle in (START_ANGLE_RAD, -START_ANGLE_RAD))
 
 
-def balances(
-    truth: CartpoleTruth, controller: LqrController, start_angle_rad: float, duration_s: float = BALANCE_S
-) -> bool:
+def balances(truth: CartpoleTruth, controller: LqrController, start_angle_rad: float) -> bool:
     """Return whether |angle| stays below 0.3 rad and the cart in the target range, over the real wire."""
     clock = VirtualClock()
     device = CartpoleDevice(truth, start_angle_rad=start_angle_rad)
@@ -70,7 +68,7 @@ def balances(
     controller.reset()
     period_ns = round(1e9 / DESCRIPTION.control_rate_hz)
     deadline_ns = clock.now_ns()
-    for _ in range(round(duration_s * DESCRIPTION.control_rate_hz)):
+    for _ in range(round(BALANCE_S * DESCRIPTION.control_rate_hz)):
         deadline_ns += period_ns
         position = _newest_position(robot, clock, deadline_ns)
         if position is not None:

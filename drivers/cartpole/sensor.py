@@ -80,7 +80,7 @@ class Sensor:
         pole_urad = self._encode(sample.pole, 1)
         self._reported.append((cart_um, pole_urad))
         if self._reported.maxlen == 1:
-            velocity = (_fit(sample.cart_velocity * 1e6), _fit(sample.pole_velocity * 1e6))
+            velocity = (fit(sample.cart_velocity * 1e6), fit(sample.pole_velocity * 1e6))
         else:
             velocity = self._difference()
         return Reading(cart_um, velocity[0], pole_urad, velocity[1], sample.setpoint)
@@ -90,16 +90,15 @@ class Sensor:
             value += self._noise[joint] * self._rng.standard_normal()
         if step := self._resolution[joint]:
             value = round(value / step) * step
-        return _fit(value * 1e6)
+        return fit(value * 1e6)
 
     def _difference(self) -> tuple[int, int]:
         (old_cart, old_pole), (cart, pole) = self._reported[0], self._reported[-1]
         # Right after a start the window is not full yet; then the difference runs over what there is.
         count = max(1, len(self._reported) - 1)
-        return _fit((cart - old_cart) * self._rate_hz / count), _fit(
-            (pole - old_pole) * self._rate_hz / count
-        )
+        return fit((cart - old_cart) * self._rate_hz / count), fit((pole - old_pole) * self._rate_hz / count)
 
 
-def _fit(value: float) -> int:
+def fit(value: float) -> int:
+    """Return the nearest integer that a field of 32 bits with sign holds."""
     return min(max(round(value), -_I32), _I32)

@@ -101,7 +101,6 @@ def to_trajectories(
     table: Table,
     gains: Gains | None = None,
     period_s: float | None = None,
-    purpose: str = "import",
     gap_periods: float = GAP_PERIODS,
 ) -> list[Recording]:
     """Put a recording on a uniform grid; gaps split it.
@@ -116,7 +115,6 @@ def to_trajectories(
         table: The recording.
         gains: Settings of the servos; None: unknown.
         period_s: The grid's period [s]; None: the recording's own.
-        purpose: Goes into the metadata.
         gap_periods: A pause of more periods splits the recording. Infinite: no pause does, and its samples
         are absent.
 
@@ -149,7 +147,7 @@ def to_trajectories(
             "rows_left_out": int(table.time_s.size - clock.size),
             "period_s": period,
         }
-        recordings.append(_recording(table, rows[part], clock[part], period, gains, purpose, facts))
+        recordings.append(_recording(table, rows[part], clock[part], period, gains, facts))
     return recordings
 
 
@@ -193,7 +191,6 @@ def _recording(
     clock: FloatArray,
     period: float,
     gains: Gains | None,
-    purpose: str,
     facts: dict[str, Any],
 ) -> Recording:
     values = {"position": table.position[rows], "velocity": _velocity(table, rows, clock)}
@@ -214,7 +211,7 @@ def _recording(
     put = _keep if even else _interpolate
     placed = put(clock, index, period, values, table.command_s)
     metadata = {
-        "purpose": purpose,
+        "purpose": "import",
         "import": {**facts, "method": placed.method, "largest_shift_s": placed.shift_s},
     }
     device_s = np.asarray(placed.index * period, dtype=np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shutil
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 
 from deal_hw.clock import VirtualClock
 from deal_hw.data.importing.channels import digest_of_file
-from deal_hw.data.importing.grid import Gains, Recording
+from deal_hw.data.importing.grid import Recording
 from deal_hw.data.recording.dataset import Dataset, Notify
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -111,7 +112,6 @@ def minimal_description(
     name: str,
     units: Sequence[str],
     rate_hz: float,
-    gains: Gains | None = None,
     mjcf: Path | None = None,
     rates_per_sample: int = 1,
 ) -> dict[str, Any]:
@@ -124,7 +124,6 @@ def minimal_description(
         name: Its name.
         units: Unit of each position, (J,).
         rate_hz: Sampling rate of the recordings' grid.
-        gains: Settings of its servos; None: unknown.
         mjcf: Its model, or None.
         rates_per_sample: Device periods between two samples, 1 or more.
     """
@@ -133,17 +132,16 @@ def minimal_description(
     first = recordings[0].trajectory
     J, A = len(first.joint_names), len(first.actuated)
     unknown, free = (math.nan,) * A, (math.inf,) * A
-    servo = gains or Gains(stiffness=unknown, damping=unknown, effort_limit=free, speed_limit=free)
     return {
         "name": name,
         "joint_names": list(first.joint_names),
         "actuated": list(first.actuated),
         "position_units": list(units),
         "default_position": [0.0] * J,
-        "stiffness": list(servo.stiffness),
-        "damping": list(servo.damping),
-        "effort_limit": list(servo.effort_limit),
-        "speed_limit": list(servo.speed_limit),
+        "stiffness": list(unknown),
+        "damping": list(unknown),
+        "effort_limit": list(free),
+        "speed_limit": list(free),
         "control_rate_hz": rate_hz,
         "device_rate_hz": rate_hz * rates_per_sample,
         "state_rate_hz": rate_hz,
@@ -192,19 +190,8 @@ def _state(trajectory: Trajectory, row: int, stamp_ns: int, number: int) -> Robo
 
 
 def _body(body: BodyTrajectory, row: int) -> BodyState:
-    return BodyState(
-        orientation=body.orientation[row],
-        angular_velocity=body.angular_velocity[row],
-        acceleration=body.acceleration[row],
-        foot_force=body.foot_force[row],
-        temperature=body.temperature[row],
-        lost=body.lost[row].astype(np.int64),
-        battery=float(body.battery[row]),
-        voltage=float(body.voltage[row]),
-        current=float(body.current[row]),
-        sticks=body.sticks[row],
-        buttons=int(body.buttons[row]),
-    )
+    values = {entry.name: getattr(body, entry.name)[row] for entry in dataclasses.fields(body)}
+    return BodyState(**{**values, "lost": values["lost"].astype(np.int64)})
 
 
 def _command(trajectory: Trajectory, index: int) -> JointCommand:

@@ -115,16 +115,13 @@ class RecorderHandle:
                 self._finished = report
 
 
-def start_recorder(
-    path: Path, description: Mapping[str, Any], metadata: Mapping[str, Any], clock: Clock | None = None
-) -> RecorderHandle:
+def start_recorder(path: Path, description: Mapping[str, Any], metadata: Mapping[str, Any]) -> RecorderHandle:
     """Start a recorder process.
 
     Args:
         path: The episode file to create.
         description: ``RobotDescription.to_json()``.
         metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
-        clock: For time-outs; the machine's monotonic clock by default.
     """
     control_end, recorder_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     control_end.setblocking(False)
@@ -145,4 +142,4 @@ def start_recorder(
         recorder_end.close()
         os.close(config)
         os.close(status_write)
-    return RecorderHandle(control_end, process, status_read, clock or MonotonicClock())
+    return RecorderHandle(control_end, process, status_read, MonotonicClock())

@@ -69,10 +69,9 @@ def crc(data: bytes) -> int:
     return int(crc16.umts(data))
 
 
-def packet(servo: int, body: bytes, *, stuff: bool = True) -> bytes:
+def packet(servo: int, body: bytes) -> bytes:
     """Return a packet of a body that begins with its instruction; the CRC is added."""
-    if stuff:
-        body = body.replace(_PLAIN, _STUFFED)
+    body = body.replace(_PLAIN, _STUFFED)
     head = HEADER + bytes([servo]) + (len(body) + 2).to_bytes(2, "little") + body
     return head + crc(head).to_bytes(2, "little")
 
