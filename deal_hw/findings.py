@@ -35,6 +35,11 @@ class Finding:
     message: str
     remedy: str = ""
 
+    @classmethod
+    def judged(cls, area: str, wrong: bool, message: str, remedy: str) -> Finding:
+        """Return a warning with its remedy where something is wrong, else the same message as OK."""
+        return cls(area, Level.WARN, message, remedy) if wrong else cls(area, Level.OK, message)
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         return {

@@ -185,13 +185,8 @@ class Go2Doctor:
         text = (
             f"round trip of a request: {p50 * 1e3:.2f} ms median, {most * 1e3:.2f} ms longest of {len(times)}"
         )
-        slow = p50 > _SLOW_ROUND_TRIP_S
-        yield Finding(
-            "link",
-            Level.WARN if slow else Level.OK,
-            text,
-            "use a cable instead of wireless; stop other load on network and computer" if slow else "",
-        )
+        remedy = "use a cable instead of wireless; stop other load on network and computer"
+        yield Finding.judged("link", p50 > _SLOW_ROUND_TRIP_S, text, remedy)
         yield _judge_mode(name)
         return name
 
@@ -228,8 +223,8 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
         f"{np.percentile(gaps, 99) * 1e3:.2f} ms p99, {gaps.max() * 1e3:.2f} ms longest"
     )
     sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
-    remedy = "use a cable instead of wireless, or a faster or less busy computer" if sparse or late else ""
-    yield Finding("states", Level.WARN if remedy else Level.OK, text, remedy)
+    remedy = "use a cable instead of wireless, or a faster or less busy computer"
+    yield Finding.judged("states", sparse or late, text, remedy)
     if not heard.ticks:
         return
     ticks = np.diff(np.array(heard.ticks, dtype=np.int64).astype(np.uint32))
@@ -304,27 +299,15 @@ def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str | None) -
 def _judge_supply(frame: LowStateFrame) -> Iterator[Finding]:
     charge = frame.battery_percent
     text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
-    low = charge < 20
-    yield Finding("robot", Level.WARN if low else Level.OK, text, "charge it" if low else "")
+    yield Finding.judged("robot", charge < 20, text, "charge it")
     hottest = int(np.max(frame.temperature))
-    hot = hottest > 70
-    yield Finding(
-        "robot",
-        Level.WARN if hot else Level.OK,
-        f"hottest motor {hottest} °C",
-        "let it cool down" if hot else "",
-    )
+    yield Finding.judged("robot", hottest > 70, f"hottest motor {hottest} °C", "let it cool down")
 
 
 def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
     lean = math.degrees(tilt(frame.orientation))
     tilted = not lean < 30.0 or not abs(float(frame.orientation @ frame.orientation) - 1.0) < 0.01
-    yield Finding(
-        "robot",
-        Level.WARN if tilted else Level.OK,
-        f"the body leans by {lean:.0f} degrees",
-        "set it down level" if tilted else "",
-    )
+    yield Finding.judged("robot", tilted, f"the body leans by {lean:.0f} degrees", "set it down level")
     remote = decode_remote(frame.remote)
     if remote is None:
         yield Finding(

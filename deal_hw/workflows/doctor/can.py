@@ -65,13 +65,12 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
         )
         return
     share = bits / seconds / address.bitrate
-    busy = share > _BUSY
-    yield Finding(
+    yield Finding.judged(
         "can",
-        Level.WARN if busy else Level.OK,
+        share > _BUSY,
         f"{transport.port}: {sum(frames.values()) / seconds:.0f} frames a second{rate}, "
         f"at least {share:.0%} of {address.bitrate} bit/s",
-        "use a higher bit rate, or take other devices off the bus" if busy else "",
+        "use a higher bit rate, or take other devices off the bus",
     )
     if foreign := sorted(set(frames) - set(nodes)):
         others = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])

@@ -49,20 +49,18 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
         errors = robot.transport_errors - errors
     wanted_hz = robot.description.state_rate_hz
     rate_hz = (len(host_ns) - 1) / max((host_ns[-1] - host_ns[0]) * 1e-9, 1e-9)
-    slow = rate_hz < _SLOW * wanted_hz
-    yield Finding(
+    yield Finding.judged(
         "states",
-        Level.WARN if slow else Level.OK,
+        rate_hz < _SLOW * wanted_hz,
         f"{rate_hz:.0f} states a second of {wanted_hz:.0f}",
-        "try another cable or a less busy computer" if slow else "",
+        "try another cable or a less busy computer",
     )
     share = errors / (errors + len(host_ns))
-    bad = share > _FEW_ERRORS
-    yield Finding(
+    yield Finding.judged(
         "states",
-        Level.WARN if bad else Level.OK,
+        share > _FEW_ERRORS,
         f"{errors} of {errors + len(host_ns)} states corrupt or lost ({share:.1%})",
-        "check cable, connectors and grounding" if bad else "",
+        "check cable, connectors and grounding",
     )
     yield judge_clock(np.array(host_ns), np.array(device_ns))
 
