@@ -61,6 +61,21 @@ def stored(settings: Settings, *more: int) -> bytes:
     return data + struct.pack("<H", crc16.ibm_3740(data))
 
 
+def flash_page(
+    settings: Settings, full_force_n: float, node: int = 1, can_kbit: int = 500, drive: int = 0
+) -> bytes:
+    """Return the settings for the last page of the chip's flash, with their CRC, little-endian.
+
+    Args:
+        settings: Trims, serial number, delay.
+        full_force_n: Force on the cart with the PWM fully on [N].
+        node: Number on the CAN bus.
+        can_kbit: Bit rate of the CAN bus: 250, 500 or 1000 [kbit/s].
+        drive: Number of the motor drive beside a pole encoder node.
+    """
+    return stored(settings, round(full_force_n * 1000), node, can_kbit, drive)
+
+
 @functools.cache
 def library() -> ctypes.CDLL:
     """Return the core, compiled on the first call.

@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from fakes.stm32_device import Stm32Chip
 from firmware_inputs import CAN, INSTALL_QEMU, MACHINE, RecordedCore, outputs, results_under_qemu
 
 from deal_hw.clock import VirtualClock
@@ -16,7 +17,7 @@ from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage, frame_id
 from deal_hw.drivers.cartpole.controller import Mode
 from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings
+from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, flash_page
 from deal_hw.drivers.cartpole.odrive_emulator import (
     ENABLE_WATCHDOG,
     WATCHDOG_TIMEOUT,
@@ -29,7 +30,6 @@ from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot
 from deal_hw.drivers.cartpole.protocol import Ack, Info, MessageType, Result
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
 from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.stm32_device import Stm32Chip, flash_page
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.testing.fake_device import FakeDevice

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.stm32_device import Stm32Chip, Stm32Device
 from firmware_inputs import CAN, INSTALL_QEMU, MACHINE, SERIAL, RecordedCore, outputs, results_under_qemu
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, frame_id
-from deal_hw.drivers.cartpole.host_firmware import Settings
+from deal_hw.drivers.cartpole.host_firmware import Settings, flash_page
 from deal_hw.drivers.cartpole.link import HostLink, SerialLink
 from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.stm32_device import Stm32Chip, Stm32Device, flash_page
 from deal_hw.drivers.cartpole.truth import candidate_truth, nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from fakes.go2 import RESTING, STANDING, FakeBench, FakeGo2
+from fakes.go2 import RESTING, STANDING, FakeBench, FakeGo2, efforts_under
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +18,6 @@ from deal_hw.control.passive import make_passive
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, joint_ranges
 from deal_hw.drivers.go2.descriptions.leg_geometry import (
     WEIGHT_N,
-    efforts_under,
     foot_jacobians,
     foot_loads,
     foot_positions,

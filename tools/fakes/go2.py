@@ -15,7 +15,7 @@ import numpy as np
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, efforts_under
+from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_jacobians
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
@@ -24,6 +24,17 @@ from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_request, 
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports.virtual_topics import TopicCore, VirtualTopics
 from deal_hw.types import FloatArray
+
+
+def efforts_under(position: FloatArray, loads: FloatArray) -> FloatArray:
+    """Return the efforts that balance the floor's forces on the feet, (12,) [N·m].
+
+    Args:
+        position: Joint positions, (12,) [rad].
+        loads: Force of the floor on each foot, (4, 3) [N].
+    """
+    return np.asarray(-np.einsum("lij,li->lj", foot_jacobians(position), loads).reshape(12))
+
 
 RESTING: Final = np.array(DRIVER.rest_position)
 STANDING: Final = np.array(DRIVER.default_position)

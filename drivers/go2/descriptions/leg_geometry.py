@@ -76,13 +76,3 @@ def foot_loads(position: FloatArray, effort: FloatArray) -> FloatArray:
     """
     transposed = np.swapaxes(foot_jacobians(position), -1, -2)
     return np.asarray(-np.linalg.solve(transposed, effort.reshape(*effort.shape[:-1], 4, 3, 1))[..., 0])
-
-
-def efforts_under(position: FloatArray, loads: FloatArray) -> FloatArray:
-    """Return the efforts that balance the floor's forces on the feet, (12,) [N·m].
-
-    Args:
-        position: Joint positions, (12,) [rad].
-        loads: Force of the floor on each foot, (4, 3) [N].
-    """
-    return np.asarray(-np.einsum("lij,li->lj", foot_jacobians(position), loads).reshape(12))

@@ -10,8 +10,8 @@ import ctypes
 import functools
 
 from deal_hw.drivers.cartpole import native
-from deal_hw.drivers.cartpole.can_link import NODE, CanLink
-from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of, stored
+from deal_hw.drivers.cartpole.can_link import CanLink
+from deal_hw.drivers.cartpole.host_firmware import flash_page, settings_of
 from deal_hw.drivers.cartpole.link import SerialLink
 from deal_hw.drivers.cartpole.rig_device import (
     BYTES_PER_TICK,
@@ -54,21 +54,6 @@ def library(*, encoder: bool = False) -> ctypes.CDLL:
     chip.chip_bus.restype, chip.chip_bus.argtypes = None, [ctypes.c_int, number, ctypes.c_int]
     chip.chip_tick.restype, chip.chip_tick.argtypes = number, RigChip.ARGUMENTS
     return chip
-
-
-def flash_page(
-    settings: Settings, full_force_n: float, node: int = NODE, can_kbit: int = 500, drive: int = 0
-) -> bytes:
-    """Return the settings for the last page of the chip's flash, with their CRC, little-endian.
-
-    Args:
-        settings: Trims, serial number, delay.
-        full_force_n: Force on the cart with the PWM fully on [N].
-        node: Number on the CAN bus.
-        can_kbit: Bit rate of the CAN bus: 250, 500 or 1000 [kbit/s].
-        drive: Number of the motor drive beside a pole encoder node.
-    """
-    return stored(settings, round(full_force_n * 1000), node, can_kbit, drive)
 
 
 class Stm32Chip(RigChip):
