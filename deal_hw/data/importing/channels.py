@@ -52,6 +52,10 @@ class Channels:
         ]
         return ", ".join([*names[:24], *(["..."] if len(names) > 24 else [])]) or "none"
 
+    def is_wide(self, name: str) -> bool:
+        """Return whether there is an array of this name with several columns."""
+        return name in self.arrays and self.arrays[name].ndim == 2
+
     def column(self, name: str) -> FloatArray:
         """Return one channel, (T,).
 

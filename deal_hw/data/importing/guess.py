@@ -77,7 +77,7 @@ def guess_columns(
     arrays = {
         guess.role: guess
         for guess in guesses
-        if guess.role and not guess.stem and _is_wide(channels, guess.channel)
+        if guess.role and not guess.stem and channels.is_wide(guess.channel)
     }
     if "position" in arrays:
         return _from_arrays(channels, time, arrays, joints)
@@ -132,10 +132,6 @@ def _key(name: str) -> tuple[str, ...]:
     """Return the words of a joint's name without words common to all joints."""
     words = [word.lower() for word in _SPLIT.split(name) if word]
     return tuple(word for word in words if word not in _FILLERS) or tuple(words)
-
-
-def _is_wide(channels: Channels, name: str) -> bool:
-    return channels.arrays[name].ndim == 2
 
 
 def _from_arrays(
@@ -222,7 +218,7 @@ def _from_columns(
             guess.channel == time.column
             or not guess.role
             or not guess.stem
-            or _is_wide(channels, guess.channel)
+            or channels.is_wide(guess.channel)
         ):
             continue
         key = _key(" ".join(guess.stem))

@@ -51,7 +51,7 @@ def guess_topics(channels: Channels, joints: Sequence[str] | None = None) -> Col
         for topic, kind in channels.types.items()
         if (field := STATES.get(_plain(kind)))
         and not is_target(topic)
-        and _is_wide(channels, f"{topic}.{field}")
+        and channels.is_wide(f"{topic}.{field}")
     }
     if not states:
         return None
@@ -88,10 +88,6 @@ def _plain(kind: str) -> str:
     return kind.rpartition("/")[2]
 
 
-def _is_wide(channels: Channels, name: str) -> bool:
-    return name in channels.arrays and channels.arrays[name].ndim == 2
-
-
 def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str, str]:
     """Return the topics that may contain the commands, with their channels; of the best kind only."""
     reference: dict[str, str] = {}
@@ -99,13 +95,13 @@ def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str,
     segments = []
     for topic, kind in channels.types.items():
         for field in CONTROLLER_STATES.get(_plain(kind), ()):
-            if _is_wide(channels, f"{topic}.{field}"):
+            if channels.is_wide(f"{topic}.{field}"):
                 reference.setdefault(topic, f"{topic}.{field}")
         name = f"{topic}.{COMMANDS.get(_plain(kind), '')}"
         if _plain(kind) == "JointTrajectory" and name not in channels.arrays:
             segments.append(topic)
         named = name in channels.labels and bool(set(channels.labels[name]) & set(names))
-        ordered = _is_wide(channels, name) and name not in channels.labels and is_target(topic)
+        ordered = channels.is_wide(name) and name not in channels.labels and is_target(topic)
         fits = ordered and channels.arrays[name].shape[1] == len(names)
         if (named and name != state and (is_target(topic) or _plain(kind) != "JointState")) or fits:
             others[topic] = name

@@ -184,47 +184,35 @@ def _put_floats(out: bytearray, values: Any) -> None:
         out += np.asarray(values, dtype="<f8").tobytes()
 
 
+def _of(kind: str, names: str) -> tuple[tuple[str, str], ...]:
+    """Return fields of one type, in their order."""
+    return tuple((kind, name) for name in names.split())
+
+
 ROBOT = RosMessageType(
-    "deal_hw_msgs/msg/Robot",
-    (("string", "description_json"), ("string[]", "joint_names"), ("string[]", "actuated")),
+    "deal_hw_msgs/msg/Robot", (("string", "description_json"), *_of("string[]", "joint_names actuated"))
 )
 STATE = RosMessageType(
     "deal_hw_msgs/msg/State",
     (
-        ("int64", "receive_ns"),
-        ("int64", "device_ns"),
-        ("int64", "sequence"),
-        ("int64", "command_sequence"),
-        ("int64", "command_age_ns"),
+        *_of("int64", "receive_ns device_ns sequence command_sequence command_age_ns"),
         ("uint32", "status"),
-        ("float64[]", "position"),
-        ("float64[]", "velocity"),
-        ("float64[]", "effort"),
+        *_of("float64[]", "position velocity effort"),
     ),
 )
 COMMAND = RosMessageType(
     "deal_hw_msgs/msg/Command",
     (
-        ("int64", "stamp_ns"),
-        ("int64", "cycle"),
-        ("int64", "sequence"),
-        ("float64[]", "position_target"),
-        ("float64[]", "velocity_target"),
-        ("float64[]", "stiffness"),
-        ("float64[]", "damping"),
-        ("float64[]", "effort"),
-        ("float64[]", "effort_limit"),
-        ("float64[]", "speed_limit"),
+        *_of("int64", "stamp_ns cycle sequence"),
+        *_of(
+            "float64[]", "position_target velocity_target stiffness damping effort effort_limit speed_limit"
+        ),
     ),
 )
 CYCLE = RosMessageType(
     "deal_hw_msgs/msg/Cycle",
     (
-        ("int64", "cycle"),
-        ("int64", "deadline_ns"),
-        ("int64", "start_ns"),
-        ("int64", "state_age_ns"),
-        ("int64", "lost"),
+        *_of("int64", "cycle deadline_ns start_ns state_age_ns lost"),
         ("uint32", "flags"),
         ("bool", "has_action"),
         ("float64[]", "action"),
@@ -232,23 +220,14 @@ CYCLE = RosMessageType(
     ),
 )
 EVENT = RosMessageType(
-    "deal_hw_msgs/msg/Event",
-    (("int64", "stamp_ns"), ("string", "kind"), ("string", "message"), ("string", "data_json")),
+    "deal_hw_msgs/msg/Event", (("int64", "stamp_ns"), *_of("string", "kind message data_json"))
 )
 BODY = RosMessageType(
     "deal_hw_msgs/msg/Body",
     (
-        ("int64", "receive_ns"),
-        ("int64", "sequence"),
-        ("float64[]", "orientation"),
-        ("float64[]", "angular_velocity"),
-        ("float64[]", "acceleration"),
-        ("float64[]", "foot_force"),
-        ("float64[]", "temperature"),
-        ("float64[]", "lost"),
-        ("float64", "battery"),
-        ("float64", "voltage"),
-        ("float64", "current"),
+        *_of("int64", "receive_ns sequence"),
+        *_of("float64[]", "orientation angular_velocity acceleration foot_force temperature lost"),
+        *_of("float64", "battery voltage current"),
         ("float64[]", "sticks"),
         ("int64", "buttons"),
     ),
@@ -266,9 +245,7 @@ JOINT_STATE = RosMessageType(
         *_STAMP,
         ("string", "frame_id"),
         ("string[]", "name"),
-        ("float64[]", "position"),
-        ("float64[]", "velocity"),
-        ("float64[]", "effort"),
+        *_of("float64[]", "position velocity effort"),
     ),
     "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
     + _HEADER_TEXT,
@@ -278,7 +255,7 @@ LOG = RosMessageType(
     (
         *_STAMP,
         ("uint8", "level"),
-        *[("string", name) for name in ("message", "name", "file")],
+        *_of("string", "message name file"),
         ("uint32", "line"),
     ),
     "builtin_interfaces/Time timestamp\nuint8 level\nstring message\nstring name\nstring file\n"
@@ -289,9 +266,8 @@ TRANSFORM = RosMessageType(
     (
         ("uint32", "count"),
         *_STAMP,
-        ("string", "frame_id"),
-        ("string", "child_frame_id"),
-        *[("float64", name) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")],
+        *_of("string", "frame_id child_frame_id"),
+        *_of("float64", "x y z qx qy qz qw"),
     ),
     "geometry_msgs/TransformStamped[] transforms\n"
     f"{_SECTION}geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
