@@ -303,7 +303,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
     monkeypatch.setattr("deal_hw.drivers.go2.emulator.device.Go2Device", note("device", device))
     monkeypatch.setattr("deal_hw.drivers.go2.emulator.emulator.Go2Emulator", note("go2", emulator))
-    monkeypatch.setattr(emulated_go2, "make_transport", note("transport"))
+    monkeypatch.setattr(emulated_go2, "make_topic_transport", note("transport"))
     monkeypatch.setattr(emulated_go2, "summary", lambda report: [])
     monkeypatch.setattr(emulated_go2, "tracking", nothing("tracking"))
     for module in (emulated_cartpole, emulated_go2):

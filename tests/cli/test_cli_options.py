@@ -207,7 +207,6 @@ def test_words_that_do_not_parse_still_get_the_box(capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("line", "option"),
     [
-        ("calibrate d --parameters nothere.yaml", "--parameters"),
         ("calibrate d --columns nothere.yaml", "--columns"),
         ("calibrate d --leave-out nosuch 0 99", "--leave-out"),
         ("calibrate d --fit-seconds 3", "--fit-seconds"),
