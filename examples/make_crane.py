@@ -21,7 +21,7 @@ MJCF = """<mujoco model="crane">
   <actuator><position name="m1" joint="boom" kp="{3}" kv="0.5" forcerange="-30 30"/>
     <position name="m2" joint="stick" kp="25" kv="0.3" forcerange="-15 15"/></actuator>
 </mujoco>"""
-(folder := Path(sys.argv[1])).mkdir(parents=True, exist_ok=True)
+(folder := Path(sys.argv[1] if sys.argv[1:] else "crane")).mkdir(parents=True, exist_ok=True)
 (folder / "crane.xml").write_text(MJCF.format("0.5", "0.1", "0.2", "60"))
 for seed, name in enumerate(("slow", "fast", "other")):
     model = mujoco.MjModel.from_xml_string(MJCF.format("0.8", "0.25", "0.13", "48"))

@@ -65,7 +65,10 @@ class Repair:
 
 @dataclass(frozen=True, kw_only=True)
 class Import(ImportSettings):
-    """Make a dataset from plausible recordings of any robot."""
+    """Make a dataset from plausible recordings of any robot.
+
+    Example:  deal-hw data import rec.csv --robot robot.yaml --out runs/mine/dataset
+    """
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
 
@@ -160,11 +163,13 @@ def _info(config: InfoSettings) -> int:
 
     console = Console()
     if not config.path.is_dir():
-        episode, _ = summarize(config.path, f"episodes/{config.path.name}")
+        episode, recorded = summarize(config.path, f"episodes/{config.path.name}")
         if config.json:
             print(json.dumps(asdict(episode), indent=2))
         else:
             _print_episode(console, episode)
+            if recorded is not None:
+                console.print(_motion_table(episode.excitation or {}, recorded.description))
         return EXIT_OK
     notes: list[str] = []
     dataset = Dataset.open(config.path, notes.append)
@@ -289,15 +294,31 @@ def _print_episode(console: Console, episode: EpisodeInfo) -> None:
     offset, drift = _clock_texts(episode)
     table.add_row("clocks", "", f"host minus device {offset}, drift {drift}")
     console.print(table)
-    if episode.excitation:
-        moved = _plain_table(Text("motion, for each joint"))
-        moved.add_column("quantity", no_wrap=True)
-        moved.add_column("value")
-        for name, value in episode.excitation.items():
-            moved.add_row(name, _plain(value))
-        console.print(moved)
 
 
-def _plain(value: Any) -> str:
-    values = value if isinstance(value, (tuple, list)) else [value]
-    return ", ".join("-" if number is None else f"{number:.4g}" for number in values)
+def _motion_table(excitation: Mapping[str, Any], description: Mapping[str, Any]) -> Table:
+    """Return how far and how fast each joint moved, and how its targets changed."""
+    from rich.text import Text
+
+    names, actuated = description["joint_names"], description["actuated"]
+    units = description.get("position_units") or [""] * len(names)
+    table = _plain_table(Text("motion of each joint; speeds are in units per second"))
+    table.add_column("joint")
+    for column in (
+        "unit",
+        "moves by",
+        "max speed",
+        "RMS speed",
+        "reversals",
+        "target range",
+        "target changes",
+    ):
+        table.add_column(column, justify="right")
+    for joint, (name, unit) in enumerate(zip(names, units, strict=False)):
+        cells = [f"{excitation[key][joint]:.3g}" for key in ("position_range", "speed_max", "speed_rms")]
+        cells.append(str(excitation["reversals"][joint]))
+        if name in actuated:
+            target = actuated.index(name)
+            cells += [f"{excitation['target_range'][target]:.3g}", str(excitation["target_changes"][target])]
+        table.add_row(Text(name), unit, *cells)
+    return table

@@ -15,6 +15,7 @@ from deal_hw.data.recording.reader import read_episode
 from deal_hw.ranges import Range
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
+from deal_hw.viz.viewer import from_elsewhere
 from deal_hw.workflows.inspect import InspectSettings, check_file, predicted
 from deal_hw.workflows.options import refuse
 
@@ -89,22 +90,24 @@ def inspect(config: Inspect) -> InspectReport:
     if window:
         check_display()
     found = predicted(config, path, episode)
+    if not config.quiet:
+        # Before the view, which stays until it is closed.
+        print(found.table(), flush=True)
     with found.saved(None if config.save is None else found.save(config.save)) as rrd:
         if config.screenshot:
             found.screenshot(config.screenshot, config.at, rrd=rrd)
         if config.web:
-            _serve(rrd, config.web_port)
+            _serve(rrd, config.web_port, config.quiet)
         elif window:
             open_window(rrd)
     files = tuple(file for file in (config.save, config.screenshot) if file)
     if not config.quiet:
-        print(found.table())
         for file in files:
             print(f"written: {file}")
     return InspectReport(overlay=found.overlay, note=found.note, files=files)
 
 
-def _serve(rrd: Path, port: int) -> None:
+def _serve(rrd: Path, port: int, quiet: bool) -> None:
     # By default SIGTERM would end this process and leave the server running.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -112,7 +115,9 @@ def _serve(rrd: Path, port: int) -> None:
             contextlib.suppress(KeyboardInterrupt),
             serve_web(rrd, port=port) as (address, server),
         ):
-            print(f"open {address}  (this machine only; Ctrl-C ends it)", flush=True)
+            print(f"open {address}  (Ctrl-C ends it)", flush=True)
+            if not quiet:
+                print(f"on another computer, run there first: {from_elsewhere(address)}", flush=True)
             server.process.wait()
             server.check()
     finally:

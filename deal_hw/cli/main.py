@@ -216,55 +216,63 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
     Raises:
         UnknownNameError: There is no such verb.
-        DealHwError: A setting refuses its value.
-        SystemExit: The arguments do not parse, or are --help.
+        DealHwError: The arguments do not parse, or a setting refuses its value.
+        SystemExit: The arguments are --help.
     """
     verb = find(name)
     import importlib
 
     import tyro
 
-    from deal_hw.cli.parsing import Rules
+    from deal_hw.cli.parsing import Rules, unparsed
 
     module = importlib.import_module(verb.module)
     rules = Rules(arguments)
 
-    def read(speak: bool) -> Any:
+    def read() -> Any:
         return tyro.cli(
             getattr(module, verb.config),
             prog=f"deal-hw {name}",
             description=_description(verb, getattr(module, verb.config), rules.hidden),
             args=list(arguments),
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed),
-            console_outputs=speak,
             registry=rules.registry,
         )
 
+    said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(io.StringIO()):
-            settings = read(speak=False)
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            settings = read()
     except SystemExit as stop:
-        # tyro draws a box around an error of a setting; here it becomes one line, like other errors.
+        if not stop.code:
+            # Help. Only now is it known which options are hidden.
+            settings = read()
+        # tyro draws a box around an error; here it becomes one line, like other errors.
         cause: BaseException | None = stop
         while cause is not None and not isinstance(cause, DealHwError):
             cause = cause.__context__
         if cause is not None:
             raise cause from None
-        if stop.code and hasattr(module, "check_words"):
+        if hasattr(module, "check_words"):
             # A verb may know a better answer than that an option is unknown.
             module.check_words(arguments)
-        settings = read(speak=True)
+        raise unparsed(said.getvalue(), f"deal-hw {name}", verb.example) from None
     return settings, getattr(module, verb.function)
 
 
 def _description(verb: Verb, config: Any, hidden: Iterable[str]) -> str:
     """Return the text above the options in a verb's help: purpose, example, hidden options."""
-    text = inspect.cleandoc(config.__doc__) if isinstance(config, type) and config.__doc__ else verb.help
+    text = inspect.cleandoc(config.__doc__) if isinstance(config, type) and config.__doc__ else ""
+    text = text or f"{verb.help[:1].upper()}{verb.help[1:]}."
     lines = [text]
     if f"deal-hw {verb.example}" not in text:
         lines.append(f"Example:  deal-hw {verb.example}")
     if hidden:
-        lines.append(f"More options for {', '.join(sorted(hidden))}: name one before --help to see them.")
+        first, *others = sorted(hidden)
+        lines.append(
+            f"More options for {', '.join([first, *others])}: name one before --help to see them, such as "
+            f"deal-hw {verb.example.split()[0]} {first} --help"
+        )
     return "\n\n".join(lines)
 
 
@@ -272,8 +280,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """Run a verb with its command-line arguments and return its exit code.
 
     Raises:
-        DealHwError: The verb failed, or an extra is missing.
-        SystemExit: The arguments do not parse, or are --help.
+        DealHwError: The arguments do not parse, the verb failed, or an extra is missing.
+        SystemExit: The arguments are --help.
     """
     try:
         settings, function = parse(name, arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from types import NoneType, UnionType
@@ -18,6 +19,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.options import OWN_ROBOT, Only
 
 
@@ -147,3 +149,21 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float | None] |
         is_instance=lambda value: (optional and value is None) or isinstance(value, int | float),
         str_from_instance=lambda value: [str(value)],
     )
+
+
+def unparsed(printed: str, line: str, example: str) -> ConfigurationError:
+    """Return the parser's error as one line.
+
+    Args:
+        printed: What the parser printed: a title, the error, mostly an explanation, and the help page; rules
+            lie between them.
+        line: The command without its arguments, such as `deal-hw collect`.
+        example: Working arguments, the verb included.
+    """
+    _, *parts, page = (" ".join(part.split()) for part in re.split("-{10,}", printed))
+    page = "deal-hw" + page.partition("deal-hw")[2]
+    parts = [part.removeprefix("Argument helptext: ").removesuffix(".") for part in parts]
+    if page == f"{line} --help":
+        # The example of a verb with sub-verbs is not one of each sub-verb.
+        parts.append(f"example: deal-hw {example}")
+    return ConfigurationError("; ".join([*parts, f"all options: {page}"]))

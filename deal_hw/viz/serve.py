@@ -58,8 +58,8 @@ def check_display() -> None:
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigurationError(
             "no desktop was found (neither DISPLAY nor WAYLAND_DISPLAY is set), so no window can open. Add "
-            "--web (a browser on this machine), --save FILE.rrd (to open it elsewhere: rerun FILE.rrd), or "
-            "--screenshot FILE.png"
+            "--web (a browser here, or on another computer over ssh), --save FILE.rrd (to open it elsewhere: "
+            "rerun FILE.rrd), or --screenshot FILE.png"
         )
 
 

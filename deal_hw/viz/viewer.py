@@ -8,6 +8,7 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import socket
 import subprocess
 import tempfile
@@ -153,6 +154,16 @@ def web_address(port: int, data: str) -> str:
         data: Address of the data.
     """
     return f"http://{LOOPBACK}:{port}?url={urllib.parse.quote(data, safe='')}&theme=light"
+
+
+def from_elsewhere(address: str) -> str:
+    """Return the command that makes an address of this machine open on another computer.
+
+    Args:
+        address: As :func:`web_address` returns it; it names the ports of the page and of the data.
+    """
+    ports = re.findall(rf"{re.escape(LOOPBACK)}:(\d+)", urllib.parse.unquote(address))
+    return f"ssh {' '.join(f'-L {port}:{LOOPBACK}:{port}' for port in ports)} {platform.node()}"
 
 
 def wait_until_listening(viewer: Viewer, port: int, timeout_s: float) -> None:

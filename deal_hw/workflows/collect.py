@@ -69,8 +69,8 @@ class CollectSettings(RunOptions):
     limits, within the safety limits."""
 
     attempts: Annotated[int, Range(1, 100)] = ATTEMPTS
-    """Most recordings of an episode of motion rich. An episode that hardly moves is repeated with a stronger
-    motion. After a trip nothing is repeated: check the robot first."""
+    """How often an episode of motion rich is recorded at most. One that hardly moves is repeated with a
+    stronger motion. After a trip nothing is repeated: check the robot first."""
 
     seed: Seed = 0
     """Seed of the random set-points; episode k uses SEED + k."""

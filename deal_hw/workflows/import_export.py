@@ -46,7 +46,7 @@ class ImportSettings(Checked):
     name: str = ""
     """The robot's name; by default the file name of the model, or of the first recording."""
     device_periods: Annotated[int, Range(1, 100_000)] = 1
-    """Device periods between two samples: the robot's control rate divided by the recording's rate."""
+    """Periods of the robot's own control loop between two samples: its rate divided by the recording's."""
     force: bool = False
     """Import recordings although a check failed; the failed checks are noted in the dataset."""
     dry_run: bool = False
@@ -101,7 +101,8 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         joints = described["joint_names"]
     told = columns is not None or described is not None or facts is not None
     episodes, foreign = ([], list(config.paths)) if told else _as_recorded(config, say)
-    tables = [table for path in foreign for table in load_tables(path, columns, joints, say)]
+    said: dict[str, str] = {}
+    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, said)]
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
     if episodes:
         described = dict(episodes[0].description)

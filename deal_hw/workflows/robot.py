@@ -154,7 +154,10 @@ def is_ours(name: str) -> bool:
 
 def is_user_robot(robot: str) -> bool:
     """Return whether a verb's robot is a file or a folder, and not the name of a robot of deal-hw."""
-    return not is_ours(robot) and (Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir())
+    if not robot or is_ours(robot):
+        # An empty path would be the present folder.
+        return False
+    return Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir()
 
 
 def user_robot(robot: str) -> UserRobot:

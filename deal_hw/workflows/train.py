@@ -327,6 +327,11 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
             "--nominal"
         )
     source = config.distribution
+    if is_user_robot(config.robot) and not config.env:
+        raise ConfigurationError(
+            f"{config.robot}: deal-hw has no training environment for this robot; name your own by --env "
+            "module:ENV_ID (page 'Train a policy' of the documentation)"
+        )
     if config.env:
         if config.udr:
             raise ConfigurationError(

@@ -88,8 +88,11 @@ def test_info_of_an_episode_shows_checks(
     assert data(InfoSettings(path=dataset / "episodes" / "000000.mcap")) == 0
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 80
-    for words in ("clamped_by_us", "host minus device", "position_range"):
+    for words in ("clamped_by_us", "host minus device"):
         assert words in printed
+    cart, pole = (line.split() for line in printed.splitlines()[-3:-1])
+    # The pole has no motor, so it has no targets.
+    assert (cart[:2], len(cart), pole[:2], len(pole)) == (["cart", "m"], 8, ["pole", "rad"], 6)
 
 
 def test_verify_then_repair(

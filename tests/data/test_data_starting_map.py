@@ -69,6 +69,18 @@ def test_a_joint_that_was_not_found_is_added_to_the_guessed_ones(header: str, tm
     assert table.position[:, 1].tolist() == [3, 7] and table.time_s.tolist() == [0, 0.01]
 
 
+def test_a_guess_that_was_printed_is_not_printed_again(tmp_path: Path) -> None:
+    """Twenty recordings of one robot give one map and nineteen lines; another header gives its own map."""
+    one, other = "time,boom_pos,boom_cmd\n0,1,2\n1,1,2\n", "time,boom_pos\n0,1\n1,1\n"
+    told: list[str] = []
+    known: dict[str, str] = {}
+    for name, text in (("a.csv", one), ("b.csv", one), ("c.csv", other)):
+        (tmp_path / name).write_text(text)
+        load_tables(tmp_path / name, joints=("boom",), say=told.append, said=known)
+    assert told.count("b.csv: the same column map as a.csv") == 1
+    assert [line.partition(":")[0] for line in told if "was guessed" in line] == ["a.csv", "c.csv"]
+
+
 @pytest.mark.parametrize(
     "header",
     [

@@ -22,7 +22,14 @@ from deal_hw.install import install_line
 from deal_hw.viz import palette
 from deal_hw.viz.screenshot import RENDERER_INSTALL, save_screenshot
 from deal_hw.viz.serve import open_window, serve_web
-from deal_hw.viz.viewer import LOOPBACK, free_port, run_viewer, wait_until_listening, web_address
+from deal_hw.viz.viewer import (
+    LOOPBACK,
+    free_port,
+    from_elsewhere,
+    run_viewer,
+    wait_until_listening,
+    web_address,
+)
 
 
 def test_web_is_served_on_loopback_only(shown: Any) -> None:
@@ -54,6 +61,13 @@ def test_windows_and_pages_are_light() -> None:
     # Rerun forgets settings of another version.
     assert settings["rerun.version"] == importlib.metadata.version("rerun-sdk")
     assert web_address(1, "rerun+http://a/proxy").endswith("?url=rerun%2Bhttp%3A%2F%2Fa%2Fproxy&theme=light")
+
+
+def test_another_computer_gets_page_and_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page alone would show an empty viewer: the data come over a port of their own."""
+    monkeypatch.setattr("platform.node", lambda: "robot")
+    line = from_elsewhere(web_address(9090, f"rerun+http://{LOOPBACK}:9876/proxy"))
+    assert line == f"ssh -L 9090:{LOOPBACK}:9090 -L 9876:{LOOPBACK}:9876 robot"
 
 
 def test_a_taken_port_is_named(shown: Any) -> None:

@@ -74,7 +74,11 @@ def read_channels(path: Path) -> list[Channels]:
 
 
 def load_tables(
-    path: Path, columns: ColumnMap | None = None, joints: Sequence[str] | None = None, say: Say | None = None
+    path: Path,
+    columns: ColumnMap | None = None,
+    joints: Sequence[str] | None = None,
+    say: Say | None = None,
+    said: dict[str, str] | None = None,
 ) -> list[Table]:
     """Read the recordings in a file, in SI units, on their own stamps.
 
@@ -84,13 +88,15 @@ def load_tables(
         columns: Meaning of its channels; None: guessed from their names.
         joints: Names of the model's joints; None: those of the map, or of the file.
         say: Called with sentences on guesses and omissions.
+        said: Guessed maps that were printed already, each with the recording's name; a new one is added. One
+            that is in it is not printed again.
 
     Raises:
         DatasetError: It cannot be read or understood.
     """
     described = "page 'Use your recordings' of the documentation describes one"
     with reading(path, "a recording of a robot", described):
-        tables = tables_of(read_channels(path), columns, joints, say)
+        tables = tables_of(read_channels(path), columns, joints, say, said)
     if not tables:
         raise DatasetError(f"{path} holds no recording")
     return tables
@@ -101,13 +107,14 @@ def tables_of(
     columns: ColumnMap | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
+    said: dict[str, str] | None = None,
 ) -> list[Table]:
     """Interpret channels, as :func:`load_tables` does for a file."""
     tables = []
     for number, channels in enumerate(recordings):
         used = columns or _guess(channels, joints, say)
         if say is not None:
-            _tell(say, channels, used, joints, columns is None and number == 0)
+            _tell(say, channels, used, joints, columns is None and number == 0, said)
         tables.append(build_table(channels, used, joints))
     return tables
 
@@ -166,14 +173,26 @@ def _say_map(
     joints: Sequence[str] | None,
     guessed: ColumnMap | None,
     title: str = _INCOMPLETE,
+    said: dict[str, str] | None = None,
 ) -> None:
-    say(f"{channels.path.name} {channels.part}".strip() + f": {title}")
-    for line in starting_map(channels, joints, guessed):
+    name = f"{channels.path.name} {channels.part}".strip()
+    lines = starting_map(channels, joints, guessed)
+    first = name if said is None else said.setdefault("\n".join([title, *lines]), name)
+    if first != name:
+        say(f"{name}: the same column map as {first}")
+        return
+    say(f"{name}: {title}")
+    for line in lines:
         say(f"  {line}")
 
 
 def _tell(
-    say: Say, channels: Channels, columns: ColumnMap, joints: Sequence[str] | None, guessed: bool
+    say: Say,
+    channels: Channels,
+    columns: ColumnMap,
+    joints: Sequence[str] | None,
+    guessed: bool,
+    said: dict[str, str] | None,
 ) -> None:
     name = f"{channels.path.name} {channels.part}".strip()
     for note in channels.notes:
@@ -184,4 +203,4 @@ def _tell(
             say(f"{name}: not in the file: {', '.join(missing)}; its channels: {channels.listed()}")
         if not (columns.target or any(joint.target for joint in columns.joints)):
             say(f"{name}: no commanded positions found")
-        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED)
+        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED, said)

@@ -148,6 +148,10 @@ def read_robot_file(path: Path) -> RobotFile:
     Raises:
         ConfigurationError: It cannot be read, or a field is wrong; the message names the fields.
     """
+    if path.suffix.lower() == ".xml":
+        raise ConfigurationError(
+            f"{path} is an MJCF, not a robot.yaml: make one with `deal-hw robot new {path}`, and name that"
+        )
     with reading(path, "a robot (YAML)", ADVICE, error=ConfigurationError):
         return from_values(RobotFile, read_yaml(path))
 

@@ -42,11 +42,12 @@ def read_tables(
     from deal_hw.data.importing.memory_source import read_memory
 
     tables: list[Table] = []
+    said: dict[str, str] = {}
     for number, source in enumerate(sources):
         if isinstance(source, str | Path):
-            tables += load_tables(Path(source), columns, joints, say)
+            tables += load_tables(Path(source), columns, joints, say, said)
         else:
-            tables += tables_of([read_memory(source, f"{name}[{number}]")], columns, joints, say)
+            tables += tables_of([read_memory(source, f"{name}[{number}]")], columns, joints, say, said)
     return tables
 
 

@@ -21,7 +21,8 @@ from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.doctor.robot import examine_robot
-from deal_hw.workflows.options import from_settings, given, refuse
+from deal_hw.workflows.options import GO2, from_settings, given, refuse
+from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.say import html_table
 
 
@@ -38,20 +39,25 @@ class DoctorSettings(Checked):
     transport: str = ""
     """Transport to the robot, such as serial, can, dds or zenoh; by default the robot's usual one."""
 
-    state_check: Literal["strict", "length"] = "strict"
+    state_check: Annotated[Literal["strict", "length"], GO2] = "strict"
     """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
 
-    simulator: Literal["none", "unitree_mujoco"] = "none"
+    simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
     """Simulator in place of a real Go2: unitree_mujoco."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
     """How long to listen to the robot [s]."""
 
-    wire: WireOptions = field(default_factory=WireOptions)
+    wire: Annotated[WireOptions, GO2] = field(default_factory=WireOptions)
     """Network options."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if is_user_robot(self.robot):
+            raise ConfigurationError(
+                f"{self.robot}: deal-hw has no driver for this robot, so there is no connection to check; "
+                "`deal-hw robot check robot.yaml` checks its description"
+            )
         if bool(self.robot) != bool(self.port):
             raise ConfigurationError(
                 "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"

@@ -12,6 +12,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.ranges import Range, check_ranges
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import CARTPOLE, File, Only, Ratio, Seed, Share, given, refuse, refuse_others
+from deal_hw.workflows.robot import is_user_robot
 
 GO2 = Only(("go2",))
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
@@ -107,7 +108,7 @@ class EmulateSettings:
     """Settings of :func:`deal_hw.emulate`."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """The robot to emulate."""
+    """The robot to emulate: cartpole or go2."""
 
     transport: str | None = None
     """The wire. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a pseudo-terminal.
@@ -195,6 +196,11 @@ class EmulateSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        if is_user_robot(self.robot):
+            raise ConfigurationError(
+                f"{self.robot}: deal-hw has no driver for this robot, so there is nothing to emulate; "
+                "`deal-hw collect robot.yaml --simulated` records its simulation"
+            )
         if self.robot not in TRANSPORTS:
             raise UnknownNameError("robot to emulate", self.robot, TRANSPORTS)
         if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:

@@ -21,7 +21,7 @@ class LegOptions:
     """Options of a robot with legs."""
 
     stand: bool | None = None
-    """Stand up first and lie down at the end; by default if the robot has a rest pose."""
+    """Whether to stand up first and lie down at the end; by default True if the robot has a rest pose."""
 
     velocity: str = "0,0,0"
     """Requested velocity of a walking policy: ahead, left, turn, such as 0.3,0,0 [m/s, m/s, rad/s]; or remote
@@ -80,8 +80,8 @@ class RunOptions(Checked):
     """Options of a robot with legs."""
 
     out: File | None = None
-    """Run folder; the episodes go to OUT/dataset. collect needs OUT or DATASET; deploy and replay record in
-    runs/VERB_ROBOT by default."""
+    """Run folder; the episodes go to OUT/dataset. `collect` needs it, or --dataset. By default `deploy`
+    records in runs/deploy_ROBOT, `replay` in runs/replay_ROBOT."""
 
     dataset: File | None = None
     """Dataset folder instead of OUT/dataset; new episodes are added to it."""
