@@ -1,6 +1,6 @@
 """The whole loop on an emulated cart-pole: record, calibrate, train, deploy.
 
-python examples/cartpole_loop.py            # a policy that balances needs --steps 400000, some minutes
+python examples/cartpole_loop.py            # a policy that balances needs --steps 48000, two minutes
 """
 
 import argparse

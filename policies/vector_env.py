@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import copy
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -99,6 +100,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         )
         self._builder = ObservationBuilder(layout, (count,))
         self._elapsed = np.zeros(count, dtype=np.int64)
+        self._recent_shares: deque[float] = deque(maxlen=100)
         self._scale = np.array(layout.action_scale)
         self._default = np.array(layout.default_position)[list(description.actuated_index)]
         if description.actuation == "motor":
@@ -121,8 +123,12 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         return ()
 
     def measures(self) -> dict[str, float]:
-        """Return the task's values of the steps since the last call, by name with its unit."""
-        return {}
+        """Return the task's values since the last call, by name with its unit.
+
+        By default the share of an episode's longest duration that members lasted, mean of the last hundred
+        episodes; nothing before the first ends.
+        """
+        return {"time_up": float(np.mean(self._recent_shares))} if self._recent_shares else {}
 
     def privileged(self) -> FloatArray:
         """Return the critic's information beyond the observation, (N, P); nothing by default."""
@@ -190,6 +196,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         over = terminated | truncated
         if not over.any():
             return self._observe(), reward, terminated, truncated, {}
+        self._recent_shares.extend((self._elapsed[over] / self.ticks).tolist())
         # Members that go on must observe this tick only once, so the final observation is built on a copy.
         final = copy.deepcopy(self._builder).build(*self.sensed())
         self._restart(over)

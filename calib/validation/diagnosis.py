@@ -106,7 +106,8 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     "contact": (
         "bursts",
         "The robot may touch something that the model does not have.",
-        "Look at {}. If it touched something, record without that, or leave it out (--data, --leave-out).",
+        "Look at {}. If it touched something, record without that. Recordings in files (--data) can leave it "
+        "out (--leave-out).",
     ),
 }
 """For each cause: how the residual looks, what it means, and what to do, with {} for the place."""
@@ -481,4 +482,4 @@ def _stretches(numbers: Sequence[int], unit_s: float) -> list[str]:
             found[-1][1] = number
         else:
             found.append([number, number])
-    return [f"{(a - 0.5) * unit_s:.2f}-{(b + 0.5) * unit_s:.2f} s" for a, b in found]
+    return [f"{max(a - 0.5, 0.0) * unit_s:.2f} to {(b + 0.5) * unit_s:.2f} s" for a, b in found]

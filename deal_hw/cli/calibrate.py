@@ -154,7 +154,18 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     if not config.quiet:
         print_result(report.result, work.advice, work.name)
         print_files(report.files)
+        _print_next(report, work.name, folder.parent)
     return report
+
+
+def _print_next(report: CalibrateReport, robot: str, folder: Path) -> None:
+    """Print the line that trains with the result, where there is a task and the result can be used."""
+    from deal_hw.calib.validation.verdict import trust
+    from deal_hw.policies.tasks import TASKS
+
+    file = report.files.get("distribution.json")
+    if file is not None and robot in TASKS and trust(report.result).colour != "red":
+        print(f"to train with it: deal-hw train {robot} --distribution {file} --out {folder}")
 
 
 def _run_folder(config: Calibrate) -> Path:

@@ -78,19 +78,26 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         advice: How to get a held-out recording if there is none.
         name: Name under which `deal-hw collect` records this robot; "" if it cannot.
     """
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
     from rich.padding import Padding
     from rich.table import Table
+    from rich.text import Text
 
     from deal_hw.calib.design.advice import next_step
     from deal_hw.calib.uncertainty.intervals import MISMATCH
     from deal_hw.calib.validation.verdict import trust
 
-    table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
+    table = Table(
+        title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
     for heading, align in (
         ("parameter", "left"),
-        ("unit", "left"),
         ("nominal", "right"),
         ("estimate", "right"),
         ("90 % interval", "left"),
@@ -101,19 +108,18 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         low, high = result.interval[k]
         verdict = result.verdicts[k] if result.verdicts else "-"
         table.add_row(
-            p.name,
-            p.unit,
+            Text(f"{p.name} [{p.unit}]"),
             f"{p.nominal:.4g}",
             "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}",
             f"{low:.4g} .. {high:.4g}",
             verdict,
         )
     low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
-    table.add_row("latency", "ms", "0", f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}", "")
+    latency = (f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}")
+    table.add_row(Text("latency [ms]"), "0", *latency, "")
     console = Console()
-    if console.width < TABLE_WIDTH:
-        console = Console(width=TABLE_WIDTH)
-    console.print(table)
+    # A row of long names is broken by the terminal, which is easier to read than cells that are broken.
+    Console(width=max(console.width, TABLE_WIDTH)).print(table)
     overall = trust(result)
     console.print(f"[bold]{overall.colour}:[/bold] {overall.sentence}")
     for words in result.null_directions:

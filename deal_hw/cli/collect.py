@@ -8,6 +8,7 @@ import tyro
 
 from deal_hw.cli.show import Terminal
 from deal_hw.control.excitation import RichConfig
+from deal_hw.control.loop import Outcome
 from deal_hw.workflows.collect import CollectSettings, run
 from deal_hw.workflows.running.report import RunReport
 
@@ -27,3 +28,11 @@ class Collect(CollectSettings):
 def collect(config: Collect) -> RunReport:
     """Run the verb; see :func:`deal_hw.workflows.collect.collect`."""
     return run(config, Terminal(config.quiet))
+
+
+def collect_and_say_next(config: Collect) -> RunReport:
+    """Run the verb, and print the line that calibrates from the recordings."""
+    report = collect(config)
+    if report.outcome is Outcome.FINISHED and not config.quiet:
+        print(f"next: deal-hw calibrate {report.dataset}")
+    return report

@@ -205,7 +205,7 @@ def _dataset_table(dataset: Dataset) -> Table:
     table.add_column("no.", justify="right", no_wrap=True)
     table.add_column("motion")
     table.add_column("UTC", no_wrap=True)
-    for name in ("s", "states", "commands"):
+    for name in ("s", "states", "sent"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("moves by")
     table.add_column("checks", no_wrap=True)
@@ -228,7 +228,7 @@ def _plain_table(title: Text) -> Table:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
 
 
 def _motion(episode: EpisodeInfo) -> str:

@@ -95,7 +95,9 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     with _emulated(config, "after") as robot:
         for name, policy in policies.items():
             with stages.stage(f"walk {name}", "the same velocities again"):
-                walks[name] = robot.walk(policy, profile, PROFILE_S, out / f"walk_{name}", episodes)
+                walks[name] = robot.walk(
+                    policy, profile, PROFILE_S, out / f"walk_{_in_paths(name)}", episodes
+                )
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
         episode = first_episode(out / "dataset_on_stand" if config.on_stand else folder.dataset)
         rrd = show_episode(folder, episode)
@@ -161,12 +163,13 @@ class _Emulated:
         Raises:
             SafetyError: No walk could be used.
         """
-        for _ in range(ATTEMPTS):
+        for left in reversed(range(ATTEMPTS)):
             walked = self.walk(policy, script, seconds, dataset, times)
             reason = next(filter(None, map(_unusable, walked.report.episodes)), "")
             if not reason:
                 return walked
-            print(f"warning: the walk cannot be used for calibration ({reason})", file=sys.stderr)
+            again = "; it is walked again" if left else ""
+            print(f"warning: the walk cannot be used for calibration ({reason}){again}", file=sys.stderr)
         raise SafetyError(
             f"no walk of {ATTEMPTS} can be used for calibration; the last one: {reason}. A busy computer, "
             "or one that pauses, causes old states and clock jumps (see `deal-hw doctor`); end other "
@@ -246,7 +249,7 @@ def _fine_tuned(
     config: Demo, folder: RunFolder, stages: Stages, found: Path, udr: Path
 ) -> Mapping[str, Path]:
     """Fine-tune the shipped policy under the calibration, and as long under UDR for comparison."""
-    policies = {name: folder.policies / f"{name}.onnx" for name in ("udr more", "calibrated")}
+    policies = {name: folder.policies / f"{_in_paths(name)}.onnx" for name in ("udr more", "calibrated")}
     for name, policy in policies.items():
         distribution = found if name == "calibrated" else None
         with stages.stage(f"train {name}", "some more training steps of the shipped policy"):
@@ -262,6 +265,11 @@ def _fine_tuned(
                 )
             )
     return policies
+
+
+def _in_paths(name: str) -> str:
+    """Return a stage's name without spaces: users paste the paths."""
+    return name.replace(" ", "_")
 
 
 def _errors(report: EpisodeReport, track: Track) -> tuple[VelocityError | None, bool]:

@@ -75,6 +75,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             "collect",
             help="record the robot during an informative motion",
             example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
+            function="collect_and_say_next",
         ),
         "calibrate": _verb(
             "calibrate",
@@ -88,6 +89,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             help="train a policy under the calibrated distribution",
             example="train cartpole --distribution runs/first/calibration/distribution.json --out runs/first",
             extra="train",
+            function="train_and_say_next",
         ),
         "deploy": _verb(
             "deploy",

@@ -79,7 +79,7 @@ class Terminal(RunView):
 
     @contextlib.contextmanager
     def progress(self, title: str, seconds: float) -> Iterator[OnBeat]:
-        """Show a bar on a terminal, elsewhere lines; trouble in making the robot passive each second."""
+        """Show a bar on a terminal, elsewhere lines; each reason why the robot is not passive at once."""
         if self._quiet:
             yield ignore
             return
@@ -89,9 +89,11 @@ class Terminal(RunView):
 
             def on_beat(beat: Beat) -> None:
                 nonlocal started_ns, trouble
-                if beat.phase.startswith(f"{MAKING_PASSIVE}: ") and beat.phase != trouble:
-                    trouble = beat.phase
-                    print(f"{title}: {trouble}", file=sys.stderr, flush=True)
+                # The last part counts seconds; the bar, or a line every ten seconds, shows it.
+                reason, counted, _ = beat.phase.rpartition("; ")
+                if counted and reason.startswith(f"{MAKING_PASSIVE}: ") and reason != trouble:
+                    trouble = reason
+                    print(f"{title}: {beat.phase}", file=sys.stderr, flush=True)
                 if beat.phase != RUNNING:
                     bar.say(beat.phase)
                     return

@@ -10,6 +10,7 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from deal_hw.cli.piped import PipedProgress
+from deal_hw.drivers import ROBOTS
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import InterruptedTrainingError, Training, TrainSettings, run
 
@@ -46,14 +47,24 @@ def train(config: Train) -> Training:
     return training
 
 
+def train_and_say_next(config: Train) -> Training:
+    """Train, and print the line that runs the policy."""
+    training = train(config)
+    if not config.quiet and config.robot in ROBOTS:
+        print(f"next: deal-hw deploy {config.robot} --port PORT --policy {training.path}")
+    return training
+
+
 def _print(training: Training) -> None:
     print(f"policy: {training.path}")
     print(f"record: {training.record}")
     print(f"checkpoint: {training.checkpoint}")
     if training.status is not None and training.first_return is not None:
+        share = training.status.measures.get("time_up")
+        up = "" if share is None else f"; {share:.0%} of an episode's time passes before a fall"
         print(
-            f"return: {training.status.mean_return:.1f}, at first {training.first_return:.1f} (mean of up to "
-            "100 episodes; page 'Train a policy' of the documentation says what is good)"
+            f"return: {training.status.mean_return:.1f}, at first {training.first_return:.1f}{up} (means of "
+            "up to 100 episodes; page 'Train a policy' of the documentation says what is good)"
         )
 
 
@@ -67,9 +78,9 @@ def _with_bar(config: Train) -> Training:
 
 
 def _words(status: TrainingStatus) -> str:
-    return (
-        f"{status.steps}/{status.total} steps, return {status.mean_return:.1f} {_measures(status)}".rstrip()
-    )
+    # The return is 0 until the first episode ends.
+    reached = f"return {status.mean_return:.1f} " if status.mean_return else ""
+    return f"{status.steps}/{status.total} steps, {reached}{_measures(status)}".rstrip(", ")
 
 
 def _measures(status: TrainingStatus) -> str:

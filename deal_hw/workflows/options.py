@@ -106,6 +106,15 @@ def refuse_others(settings: Any, verb: str, name: str) -> None:
         refuse(names, f"only {' and '.join(f'`{verb} {other}`' for other in only.names)} can use that")
 
 
+def _in_group(settings: Any, name: str) -> str:
+    """Return how Python gives an option that is in a group of options; empty if no group has it."""
+    for entry in dataclasses.fields(settings):
+        group = entry.default_factory
+        if dataclasses.is_dataclass(group) and name in {inner.name for inner in dataclasses.fields(group)}:
+            return f"{entry.name}={getattr(group, '__name__', '')}({name}=...)"
+    return ""
+
+
 def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Callable[P, R]]:
     """Let a function of settings take them as arguments, with the same checks as the verb.
 
@@ -120,7 +129,14 @@ def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Call
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             for name in kwargs:
                 if name not in signature.parameters:
-                    raise UnknownNameError(f"argument of {function.__name__}", name, signature.parameters)
+                    error = UnknownNameError(f"argument of {function.__name__}", name, signature.parameters)
+                    if group := _in_group(settings, name):
+                        error.args = (f"{error}; did you mean {group}?",)
+                    raise error
+            try:
+                signature.bind(*args, **kwargs)
+            except TypeError as err:
+                raise TypeError(f"{function.__name__}(): {err}") from None
             return function(settings(*args, **kwargs))
 
         del call.__wrapped__

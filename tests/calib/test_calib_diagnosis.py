@@ -153,7 +153,7 @@ def test_contact_comes_in_bursts() -> None:
         wrong[window, sample : sample + 12] = 20 * STD * rng.normal(size=12)
     found = {f.cause: f for f in _named(wrong)}
     assert "contact" in found
-    assert "rec.csv 0.98-1.07 s, rec.csv 3.18-3.28 s" in found["contact"].alarm.do
+    assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].alarm.do
 
 
 def test_direction_is_kept_where_a_joint_is_still() -> None:

@@ -97,7 +97,7 @@ def test_stopped_before_the_first_generation_keeps_nothing(
     """Then there is nothing to resume, and both the stop and the attempt say so."""
     stop_after(monkeypatch, 1)
     assert main(command(dataset, tmp_path)) == EXIT_INTERRUPTED
-    assert "nothing was saved" in capsys.readouterr().err
+    assert "there is no state to --resume" in capsys.readouterr().err
     assert main(command(dataset, tmp_path, "--resume")) == EXIT_ERROR
     assert "nothing to resume" in capsys.readouterr().err
 

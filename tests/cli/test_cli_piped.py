@@ -13,7 +13,7 @@ from deal_hw.calibration import Progress
 from deal_hw.cli import bench, calibrate_output, design_excitation, piped, show, train
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.clock import VirtualClock
-from deal_hw.control.process_channel import HOMING, RUNNING, Beat
+from deal_hw.control.process_channel import HOMING, MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.training import TrainingStatus
 
 
@@ -117,6 +117,24 @@ def test_runs_of_a_robot(lines: Lines, phase: str) -> None:
         on_beat(Beat(stamp_ns=17 * 10**9, count=10, phase=phase, silence_s=1.0))
         doing = "running, 12 of 30 s" if phase == RUNNING else HOMING
         assert lines.after_ten_seconds() == f"deploy cartpole 1/1: 10 s, {doing}"
+
+
+def test_a_robot_that_is_not_passive_is_said_once_for_each_reason(
+    lines: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The countdown of 30 s is no news each second."""
+    with show.Terminal().progress("collect", 4.0) as on_beat:
+        for why in ("no answer", "the link is lost (gone; check it)"):
+            for second in range(3):
+                text = (
+                    f"{MAKING_PASSIVE}: {why}; passive command repeated for {second} s, {30 - second} s left"
+                )
+                on_beat(Beat(stamp_ns=10**9 * second, count=0, phase=text, silence_s=1.0))
+    said = capsys.readouterr().err.splitlines()
+    assert [line.partition(" passive: ")[2].partition(";")[0] for line in said] == [
+        "no answer",
+        "the link is lost (gone",
+    ]
 
 
 def test_train(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,6 +121,17 @@ def test_an_episode_is_cut_off_without_being_failed() -> None:
     assert [bool(c[0]) for _, c in flags] == [False, False, True, False, False, True]
 
 
+def test_the_share_of_an_episode_before_a_fall_is_measured() -> None:
+    """1 where no member falls; one tick of ten where each falls at once; nothing before the first end."""
+    for end_angle_rad, share in ((0.5, 1.0), (1e-9, 0.1)):
+        env = exact_env(3, ticks=10, end_angle_rad=end_angle_rad)
+        env.reset(seed=0)
+        assert env.measures() == {}
+        for _ in range(10):
+            env.step(np.zeros((3, 1)))
+        assert env.measures() == {"time_up": pytest.approx(share)}
+
+
 def test_host_delay_adds_to_the_latency() -> None:
     """10 ms of the robot and 6 ms of the host: the target of the first tick acts from the 17th step on."""
     task = BalanceTask(host_delay_s=(0.006, 0.006), start_angle_rad=0.0, start_position_m=0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import signal
+import types
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +39,8 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
     training = train(Train(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True))
     assert training.status is not None and training.first_return is not None
     now, first = training.status.mean_return, training.first_return
-    assert (
-        first < 0 and first != now and f"return: {now:.1f}, at first {first:.1f} (" in capsys.readouterr().out
-    )
+    told = f"return: {now:.1f}, at first {first:.1f}; {training.status.measures['time_up']:.0%} of an episode"
+    assert first < 0 and first != now and told in capsys.readouterr().out
     assert f"{first:.4g}" in training.table()
     policy = OnnxPolicy(tmp_path / "policies" / "policy.onnx")
     policy.spec.check_fits(DESCRIPTION)
@@ -52,6 +52,17 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
     assert record["training"]["members"] == 8
     assert record["seed"] == 4
     assert record["reward"].endswith("which has the effect of an alive bonus.")
+
+
+@pytest.mark.parametrize(("robot", "told"), [("cartpole", True), ("ant", False)])
+def test_the_next_line_runs_the_policy(
+    robot: str, told: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a robot that has a driver; a robot of the simulator alone cannot be deployed to."""
+    monkeypatch.setattr(train_module, "train", lambda config: types.SimpleNamespace(path=Path("p.onnx")))
+    train_module.train_and_say_next(Train(robot=robot, udr=True))
+    line = f"next: deal-hw deploy {robot} --port PORT --policy p.onnx\n"
+    assert capsys.readouterr().out == (line if told else "")
 
 
 def test_udr_covers_a_factor_of_five_and_30_ms() -> None:

@@ -94,7 +94,7 @@ def test_a_carried_robot_leaves_with_its_shapes(made: Path, tmp_path: Path) -> N
     assert b"/scene" in (tmp_path / "out" / written[0]).read_bytes()
 
 
-def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
+def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A simulated robot is recorded, again and by its dataset; what it hides is the seed's."""
     yaml = tmp_path / "robot.yaml"
     text = (made / "robot.yaml").read_text(encoding="utf-8").replace("robot.xml", str(made / "robot.xml"))
@@ -112,6 +112,7 @@ def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "run" / "dataset"
     line = ["collect", str(dataset), "--simulated", "--out", str(tmp_path / "again"), "--seconds", "3"]
     assert main([*line, "--truth-seed", "2", "--motion", "chirp"]) == EXIT_OK
+    assert f"next: deal-hw calibrate {tmp_path / 'again' / 'dataset'}\n" in capsys.readouterr().out
     again = tmp_path / "again" / "dataset" / "episodes" / "000000.mcap"
     one, two = (deal_hw.inspect(path).episode.trajectory for path in (report.paths[0], again))
     assert (one.position == two.position).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import json
 import subprocess
 import sys
@@ -13,14 +14,19 @@ import numpy as np
 import pytest
 
 import deal_hw
+from deal_hw.control.excitation_level import ExcitationLevelSearch
 from deal_hw.control.loop import Outcome
-from deal_hw.drivers.cartpole.description import k9_space
+from deal_hw.data.recording.excitation import Excitation
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.faults import CanFaults
 from deal_hw.errors import ConfigurationError, PolicyMismatchError, TransportError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT
+from deal_hw.workflows.emulation.common import next_line
 from deal_hw.workflows.emulation.process import arguments
 from deal_hw.workflows.emulation.settings import EmulateSettings, Go2Options
+from deal_hw.workflows.running import supervised
+from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.say import silent
@@ -78,6 +84,30 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
     assert said == ["tripped: the connection is lost", "warning: switch it off by hand"]
+    kept = dataclasses.replace(lost, path=Path("000003.mcap"))
+    assert kept.lines()[-1].startswith("  to see why: deal-hw inspect 000003.mcap (page 'Remedies'")
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_a_lost_connection_asks_for_no_gentler_motion(confirmed: bool) -> None:
+    """A robot that was made passive ended for its motion; one that could not be, for its cable."""
+    search = ExcitationLevelSearch(0.0, 4, rearm=False)
+    plan = RunPlan(robot="cartpole", motion="rich", policy="", seconds=4.0, seed=0)
+    moved = Excitation(4.0, (0.4, 4.0), (2.0, 8.0), (1.0, 3.0), (9, 9), (0.4,), (40,))
+    ended = EpisodeReport(
+        path=None,
+        outcome=Outcome.TRIPPED,
+        reason="joint 'cart' is at 0.39 m",
+        passive_confirmed=confirmed,
+        loop_timing=None,
+        clipped={},
+        cycles_sent=9,
+        states_recorded=9,
+        warnings=(),
+        motion=moved,
+    )
+    assert not supervised._to_repeat(search, plan, ended, DESCRIPTION)
+    assert ("--excitation-level -1" in search.words) is confirmed
 
 
 def test_a_policy_for_another_robot_is_refused_before_the_port(tmp_path: Path) -> None:
@@ -97,6 +127,13 @@ def test_an_emulator_that_does_not_start_says_why(tmp_path: Path) -> None:
         deal_hw.emulate("cartpole", reveal=True)
     with pytest.raises(ConfigurationError, match="--parent would have no effect"):
         deal_hw.emulate("cartpole", parent=1)
+
+
+def test_an_emulator_says_how_to_reach_it() -> None:
+    """The line can be pasted into another terminal."""
+    settings = EmulateSettings("cartpole", transport="can")
+    line = next_line(settings, "/dev/pts/3").partition(": ")[2]
+    assert line == "deal-hw doctor cartpole --port /dev/pts/3 --transport can"
 
 
 def test_settings_become_options_of_the_command_line() -> None:

@@ -177,7 +177,7 @@ def saying_how_to_resume(path: Path) -> Iterator[None]:
                 "to the same result",
             )
         else:
-            aloud("\ncalibration stopped before its first generation; nothing was saved")
+            aloud("\ncalibration stopped before the search; there is no state to --resume, begin again")
         raise
 
 

@@ -178,8 +178,9 @@ def prepare_model(
     space = searched_space(config, overrides, model, say)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
+    said: dict[str, str] = {}
     fitted, held = (
-        read_tables(sources, columns, facts.names, say, name)
+        read_tables(sources, columns, facts.names, say, name, said)
         for name, sources in (("data", data), ("holdout", holdout))
     )
     refuse_copies([*fitted, *held])

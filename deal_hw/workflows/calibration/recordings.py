@@ -35,14 +35,17 @@ def read_tables(
     columns: ColumnMap | None,
     joints: Sequence[str],
     say: Callable[[str], None],
-    name: str = "data",
+    name: str,
+    said: dict[str, str],
 ) -> list[Table]:
-    """Return recordings in SI units, on their own stamps; those in memory are called NAME[0], NAME[1], ..."""
+    """Return recordings in SI units, on their own stamps; those in memory are called NAME[0], NAME[1], ...
+
+    ``said`` has the guessed column maps that were printed already; new ones are added.
+    """
     from deal_hw.data.importing.load import load_tables, tables_of
     from deal_hw.data.importing.memory_source import read_memory
 
     tables: list[Table] = []
-    said: dict[str, str] = {}
     for number, source in enumerate(sources):
         if isinstance(source, str | Path):
             tables += load_tables(Path(source), columns, joints, say, said)

@@ -12,6 +12,7 @@ from deal_hw.errors import MissingExtraError
 from deal_hw.workflows.emulation.common import (
     choose_truth,
     happenings,
+    next_line,
     realtime_priority,
     reveal,
     run_until,
@@ -56,14 +57,14 @@ def emulate_cartpole(
         from deal_hw.drivers.cartpole.firmwares import usable_firmware
 
         own["firmware"] = usable_firmware(config.firmware)
-        runs = f", firmware {own['firmware']}"
+        runs = f", firmware: {own['firmware']}"
     link = None if config.link is None else Path(config.link)
     emulator: CartpoleEmulator = make(truth, link=link, hazards=_hazards(config), **own)
     try:
-        announce(f"port {emulator.open()}")
-        announce(
-            f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused{runs}; Ctrl-C ends"
-        )
+        port = emulator.open()
+        announce(f"port {port}")
+        announce(f"profile {truth.profile}, seed {truth.seed}{runs}; Ctrl-C ends")
+        announce(next_line(config, port))
         with realtime_priority(), happenings(config.events_to, emulator.changes) as tell:
 
             def step() -> bool:
@@ -79,7 +80,10 @@ def emulate_cartpole(
         emulator.close()
         report = {**truth.to_json(), **emulator.report()}
         reveal(report, announce if config.reveal else silent, config.reveal_to)
-    say(f"emulator: {emulator.slips} stalls, {emulator.dropped} writes dropped")
+    say(
+        f"emulator: this computer stalled it {emulator.slips} times; {emulator.dropped} frames came while no "
+        "program read the port"
+    )
 
 
 def _truth(config: EmulateSettings) -> CartpoleTruth:

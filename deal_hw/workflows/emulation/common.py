@@ -134,6 +134,12 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
         return parse(values)
 
 
+def next_line(config: EmulateSettings, port: str) -> str:
+    """Return the line that says how to reach an emulated robot."""
+    transport = f" --transport {config.transport}" if config.transport else ""
+    return f"next, in another terminal: deal-hw doctor {config.robot} --port {port}{transport}"
+
+
 def reveal(values: Mapping[str, Any], announce: Say, path: File | None) -> None:
     """Announce the truth as one line of JSON; also write it to a file, if one is given."""
     text = json.dumps(values)

@@ -23,6 +23,7 @@ from deal_hw.reading import reading
 from deal_hw.workflows.emulation.common import (
     choose_truth,
     happenings,
+    next_line,
     realtime_priority,
     reveal,
     run_until,
@@ -71,6 +72,7 @@ def emulate_go2(
             emulator.open()
             announce(f"port {port}")
             announce(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends")
+            announce(next_line(config, port))
 
             log = device.log
             with (

@@ -89,6 +89,10 @@ class EpisodeReport:
             lines.append(f"  clipped by the safety filter: {limit} in {cycles} cycles")
         if self.path is not None:
             lines.append(f"  recorded {self.states_recorded} states in {self.path}")
+            if self.outcome is Outcome.TRIPPED:
+                lines.append(
+                    f"  to see why: deal-hw inspect {self.path} (page 'Remedies' of the documentation)"
+                )
         if self.walk is not None and self.walk.seconds:
             lines.append(
                 f"  velocity error, by leg odometry and IMU: {self.walk.velocity_m_s:.2f} m/s, "

@@ -219,6 +219,9 @@ def _to_repeat(
     if plan.motion != "rich" or not judged or plan.dry_run or description.floating_base is not None:
         return False
     tripped = report.reason if report.outcome is Outcome.TRIPPED else ""
+    if tripped and not report.passive_confirmed:
+        # The connection is lost or the robot hangs: a gentler motion would not help.
+        return False
     return report.motion is not None and search.tell(shortfalls(report.motion, description), tripped)
 
 
