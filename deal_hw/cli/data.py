@@ -207,7 +207,7 @@ def _dataset_table(dataset: Dataset) -> Table:
     table.add_column("UTC", no_wrap=True)
     for name in ("s", "states", "sent"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("moves by")
+    table.add_column("moves by", no_wrap=True)
     table.add_column("checks", no_wrap=True)
     for episode in dataset.episodes:
         table.add_row(
@@ -232,10 +232,10 @@ def _plain_table(title: Text) -> Table:
 
 
 def _motion(episode: EpisodeInfo) -> str:
-    """Return the purpose of an episode and its motion, with a changed excitation level."""
+    """Return the purpose of an episode and its motion; a changed excitation level is a line of its own."""
     level = float(episode.facts.get("excitation_level") or 0.0)
-    words = [episode.purpose, motion_of(episode.facts), f"level {level:+g}" if level else ""]
-    return " ".join(word for word in words if word)
+    words = " ".join(filter(None, (episode.purpose, motion_of(episode.facts))))
+    return f"{words}\nlevel {level:+g}" if level else words
 
 
 def _position_ranges(episode: EpisodeInfo, description: Mapping[str, Any]) -> str:

@@ -39,7 +39,7 @@ def test_info_of_a_dataset(
     printed = capsys.readouterr().out
     lines = printed.splitlines()
     (heads,) = (line for line in lines if "checks" in line)
-    assert all(words in heads for words in ("no.", "motion", "states", "commands", "moves by"))
+    assert all(words in heads for words in ("no.", "motion", "states", "sent", "moves by"))
     (row,) = (line for line in lines if "rich" in line)
     assert "test rich" in row and "level +1.5" in printed
     # 600 samples of 1 mm each, and a pole that goes to and fro by 0.49 rad.
