@@ -84,6 +84,8 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
     assert said == ["tripped: the connection is lost", "warning: switch it off by hand"]
+    # The reason of a failure follows as the error.
+    assert dataclasses.replace(lost, outcome=Outcome.FAILED).lines() == ["failed"]
     kept = dataclasses.replace(lost, path=Path("000003.mcap"))
     assert kept.lines()[-1].startswith("  to see why: deal-hw inspect 000003.mcap (page 'Remedies'")
 

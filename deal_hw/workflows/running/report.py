@@ -78,12 +78,13 @@ class EpisodeReport:
         }
 
     def lines(self) -> list[str]:
-        """Return the report for the operator, without the warnings."""
-        lines = [f"{self.outcome.value}: {self.reason}"]
+        """Return the report for the operator, without the warnings, and without the error that follows it."""
+        failed = self.outcome is Outcome.FAILED
+        lines = [self.outcome.value if failed else f"{self.outcome.value}: {self.reason}"]
         if self.planned_s and self.cycles_sent:
             hit = "" if self.clipped or self.outcome is Outcome.TRIPPED else "; no limit was hit"
             lines.append(f"  ran for {self.ran_s:.1f} of {self.planned_s:.1f} s{hit}")
-        if self.loop_timing is not None:
+        if self.loop_timing is not None and self.loop_timing.cycles:
             lines += ["  " + line for line in self.loop_timing.lines()]
         for limit, cycles in self.clipped.items():
             lines.append(f"  clipped by the safety filter: {limit} in {cycles} cycles")

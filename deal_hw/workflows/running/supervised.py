@@ -157,6 +157,9 @@ def run_episodes(
                 reports.append(run.run(_both(show, on_beat)))
             view.ended(reports[-1])
             if run.signal:
+                if reports[-1].outcome is Outcome.FAILED:
+                    # The interrupt takes the place of the error that would say it.
+                    view.warn(f"warning: {reports[-1].reason}")
                 report = RunReport(dataset=dataset, episodes=tuple(reports))
                 raise InterruptedRunError(report, run.signal)
             return reports[-1]
