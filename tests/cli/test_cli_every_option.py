@@ -17,12 +17,13 @@ from verb_options import Option, dataclasses_of, options
 from deal_hw.cli.main import VERBS, parse
 from deal_hw.cli.parsing import Rules
 from deal_hw.clock import VirtualClock
+from deal_hw.control.loop import Outcome
 from deal_hw.drivers import driver_description, make_robot
 from deal_hw.errors import DealHwError
 from deal_hw.types import Trajectory
 from deal_hw.workflows import collect, deploy, replay
 from deal_hw.workflows.doctor import examine
-from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.report import EpisodeReport, RunReport
 
 ROOT = Path(__file__).resolve().parents[2]
 ZENOH = "--transport zenoh --port tcp/127.0.0.1:7447"
@@ -120,7 +121,18 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         make_robot(plan.robot, plan.transport, port, VirtualClock(), plan.wire, plan.robot_settings)
         others.pop("view")
         did.append((plan.to_json(), port, others))
-        return RunReport(dataset=None, episodes=())
+        ended = EpisodeReport(
+            path=None,
+            outcome=Outcome.STOPPED,
+            reason="the run was stopped",
+            passive_confirmed=True,
+            loop_timing=None,
+            clipped={},
+            cycles_sent=0,
+            states_recorded=0,
+            warnings=(),
+        )
+        return RunReport(dataset=None, episodes=(ended,))
 
     def behaviour(trajectory: Trajectory, description: Any) -> Any:
         return type("Replayed", (), {"duration_s": 2.0})()

@@ -303,7 +303,8 @@ def test_a_folder_with_one_episode_stands_for_it(
         monkeypatch.delenv(name, raising=False)
     for folder in ("run", "run/dataset"):
         refused(
-            f"inspect {folder}", "so no window can open. Add --web (a browser on this machine), --save FILE"
+            f"inspect {folder}",
+            "so no window can open. Add --web (a browser here, or on another computer over ssh), --save FILE",
         )
 
 

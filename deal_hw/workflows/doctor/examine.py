@@ -21,7 +21,7 @@ from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.doctor.robot import examine_robot
-from deal_hw.workflows.options import GO2, from_settings, given, refuse
+from deal_hw.workflows.options import GO2, from_settings, given, refuse, refuse_others
 from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.say import html_table
 
@@ -62,6 +62,8 @@ class DoctorSettings(Checked):
             raise ConfigurationError(
                 "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"
             )
+        if self.robot:
+            refuse_others(self, "doctor", self.robot)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,9 +144,7 @@ def _transport(config: DoctorSettings) -> str:
         refuse(given(config, default, options), "without a robot only this computer is checked")
         return ""
     name = config.transport or default_transport(config.robot)
-    if name not in TOPIC_TRANSPORTS:
-        refuse(given(config, default, ("state_check", "simulator")), "only a Go2's states have such checks")
-    elif config.simulator != "none":
+    if config.simulator != "none":
         refuse(given(config, default, ("state_check",)), f"{config.simulator} has no checksums")
     return name
 
