@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, lsq_linear
 
-from deal_hw.calib.data.noise import MAD_TO_STD
+from deal_hw.calib.data.noise import MAD_TO_STD, Mask
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
@@ -78,6 +78,9 @@ def minimise(
     free = high > low
     free[-1] &= not fixed_latency
     start: FloatArray = np.where(free, np.clip(value, low, high), value)
+    # A solution at a bound may come back beside it by rounding.
+    for bound in bounds:
+        start = np.where(free & (np.abs(start - bound) < 1e-9 * (high - low)), bound, start)
     if settings.iterations < 1 or not free.any() or not np.isfinite(fit.residual(start)).all():
         return start, 0
     unit = np.full(len(value), settings.first_step)
@@ -99,13 +102,22 @@ def minimise(
         rows = np.nan_to_num(fit.jacobian(at(step))[:, free] * unit[free], nan=0.0, posinf=0.0, neginf=0.0)
         return np.concatenate([rows, hold * np.eye(len(step))])
 
+    def ends() -> tuple[FloatArray, FloatArray]:
+        return (low - start)[free] / unit[free], (high - start)[free] / unit[free]
+
+    if np.any(free & ((start == low) | (start == high))):
+        here = np.zeros(int(free.sum()))
+        free[free] = ~_stay(jacobian(here), residual(here), *ends())
+        if not free.any():
+            return start, used
+        used = 0
     # The trust region begins with radius 1 because the start is at 0. A rectangular one (dogbox) follows
     # parameters that end at their bound without slowing down before it, as an interior method does.
     found = least_squares(
         residual,
         np.zeros(int(free.sum())),
         jacobian,
-        bounds=((low - start)[free] / unit[free], (high - start)[free] / unit[free]),
+        bounds=ends(),
         method="dogbox",
         ftol=settings.converged,
         xtol=settings.smallest_step,
@@ -113,6 +125,20 @@ def minimise(
         max_nfev=1 + settings.iterations,
     )
     return at(found.x), used
+
+
+def _stay(rows: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray) -> Mask:
+    """Return which parameters are at a bound and stay there, (K,), by the linear model inside the bounds.
+
+    Dogbox frees a parameter at its bound if the gradient alone points inside. Where the others' steps push it
+    out again, it ends there, with steps near zero.
+    """
+    at = (low == 0) | (high == 0)
+    triangle = np.asarray(np.linalg.qr(np.column_stack([rows, -residual]), mode="r"))
+    inside = np.maximum(low, -1.0), np.minimum(high, 1.0)
+    step = lsq_linear(triangle[:, :-1], triangle[:, -1], inside, method="bvls").x
+    stays: Mask = at & np.where(low == 0, step <= 0, step >= 0)
+    return stays
 
 
 def solve(
