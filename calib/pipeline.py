@@ -11,7 +11,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
@@ -154,6 +154,15 @@ class CalibrationRun:
         """Report the stage that begins."""
         if self.progress is not None:
             self.progress(Progress(stage, 0, 1, message))
+
+    def tell(self, stage: str) -> Callable[[int, int], None]:
+        """Return a function that reports how far a stage is: what is done, and of how much."""
+
+        def report(done: int, total: int) -> None:
+            if self.progress is not None:
+                self.progress(Progress(stage, done, total))
+
+        return report
 
     def offer(self, stage: str, found: Fit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""
@@ -492,7 +501,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     suspect = None
     asked = run.settings.diagnosis and run.settings.local_first
     if asked and (local is None or unexplained(local, MISMATCH.white_samples)):
-        suspect = find_shared_error(problem, local)
+        suspect = find_shared_error(problem, local, run.tell("errors that commands and measurements share"))
     if suspect is None:
         return fits.best(run)
     run.say(BEFORE_SEARCH, str(suspect.alarm))

@@ -192,7 +192,7 @@ def test_a_search_that_predicts_as_well_refutes_it(tmp_path: Path, monkeypatch: 
     """Right recordings that were suspected: the calibration goes on as without the suspicion."""
     right = problem("pendulum", None, tmp_path)
     suspicion = FoundError(tuple(shared_errors(right))[:1], 1.0, 100.0, 500.0, right, 10)
-    monkeypatch.setattr(pipeline, "find_shared_error", lambda problem, local: suspicion)
+    monkeypatch.setattr(pipeline, "find_shared_error", lambda problem, local, tell: suspicion)
     said: list[Progress] = []
     rng = np.random.default_rng(0)
     run = CalibrationRun(
