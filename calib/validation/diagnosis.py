@@ -246,11 +246,14 @@ def find_play(problem: Problem, refined: Refined) -> Play | None:
     try:
         first = problem.first_latency_s
         fit = refine(part, wide.space.nominal, first, (SETTINGS.play_s,), fixed_latency=fixed)
-        without = at_parameters(problem.part(rest), refined.theta, refined.latency_s, length)
         with_play = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
+        # The wider fit may have left another minimum; then its parameters predict as well without their play.
+        own, found = np.split(fit.theta, [len(problem.space)])
+        starts = (refined.theta, refined.latency_s), (own, fit.latency_s)
+        bare = [at_parameters(problem.part(rest), *start, length) for start in starts]
+        without = min(bare, key=lambda fit: fit.chi2 if np.isfinite(fit.chi2) else np.inf)
     except (InsufficientDataError, CalibrationError):
         return None
-    found = fit.theta[len(problem.space) :]
     share = 1 - with_play.chi2 / without.chi2
     deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
     if not (deviance > MISMATCH.evidence and share > SETTINGS.noticed):

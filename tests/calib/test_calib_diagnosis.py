@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.intervals import MISMATCH, uncertainty_at, with_rows
 from deal_hw.calib.validation import diagnosis
@@ -275,6 +275,14 @@ def test_a_mass_is_named_with_its_size(tmp_path: Path) -> None:
     assert "Weigh" in found[0].alarm.do and "heavier" in found[0].alarm.seen
     known = uncertainty_at(problem, fit, fixed_latency=False)
     assert known.alarms and with_causes(problem, fit, known)[0].alarms[0] == found[0].alarm
+
+
+def test_another_minimum_is_no_play(tmp_path: Path) -> None:
+    """A right model, and a local fit that ended elsewhere: the wider fit finds the truth, without play."""
+    _, problem, fit = _truth("pendulum", None, tmp_path)
+    elsewhere = at_parameters(problem, 1.5 * fit.theta, fit.latency_s + 0.008, fit.shooting.length)
+    assert elsewhere.chi2 > 10 * fit.chi2
+    assert find_play(problem, elsewhere) is None
 
 
 def test_play_is_found_and_measured(tmp_path: Path) -> None:
