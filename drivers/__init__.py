@@ -59,7 +59,7 @@ TRANSPORTS: Final = {
     "zenoh": "deal_hw.drivers.transports.zenoh_transport:ZenohTransport",
 }
 TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
-"""Transports without a descriptor to inherit: each process opens its own."""
+"""Transports whose connection a child process cannot inherit: each process opens its own."""
 WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "dds": ("domain",),
     "zenoh": ("listen", "mode", "insecure", "ca", "certificate", "key"),
@@ -72,8 +72,8 @@ MAKERS: Final[Mapping[tuple[str, str], str]] = {
 }
 """Robots with another driver on one wire than in :data:`ROBOTS`, (robot, wire) -> "module:function".
 
-The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
-descriptor of the port that a parent process opened. It does no I/O."""
+The function is called as ``function(port, clock, fd=None, can_send=True)``. It returns the Robot and does no
+I/O. ``fd`` is the file descriptor of the port, if a parent process opened it."""
 SIMULATED: Final[Mapping[tuple[str, str], str]] = {
     ("go2", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoRobot",
     ("go2_on_stand", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot",
@@ -157,7 +157,7 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
 
 
 def walked(name: str, trajectory: Trajectory) -> Track | None:
-    """Return a robot's track by its own sensors; None if it has no odometry, or does not walk."""
+    """Return a robot's path by its own sensors; None if it does not walk or has no odometry."""
     if name not in ODOMETRY:
         return None
     found: Track | None = _find("odometry", ODOMETRY, name)(trajectory)
@@ -182,7 +182,7 @@ def wire_claim(
         transport_name: How it is reached.
         port: Where.
         clock: For the waiting.
-        holder: Who claims, in words.
+        holder: Text that names the claiming program, for messages of other programs.
         options: More about a transport of topics.
     """
     if name not in ROBOTS or transport_name not in TOPIC_TRANSPORTS:
@@ -309,7 +309,7 @@ def can_bus(transport_name: str, port: str) -> tuple[str, tuple[int, ...]]:
 
     Raises:
         UnknownNameError: The transport does not use CAN.
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     found: tuple[str, tuple[int, ...]] = _find("CAN transport", CAN_BUSES, transport_name)(port)
     return found
@@ -330,7 +330,7 @@ def _simulated(name: str, simulator: str) -> Any:
     known = [has for robot, has in SIMULATED if robot == name]
     if not known:
         raise ConfigurationError(
-            f"--simulator would have no effect: no simulator stands in for robot {name!r}"
+            f"--simulator would have no effect: there is no simulator for robot {name!r}; leave it out"
         )
     if simulator not in known:
         raise UnknownNameError(f"simulator of robot {name!r}", simulator, known)

@@ -1,4 +1,4 @@
-"""Which command was in force when a state was sensed, for robots that do not say it."""
+"""Finds which command was in force when a state was sensed, for robots that do not report it."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from collections import deque
 from typing import Final
 
 OFFSET_WINDOW_NS: Final = 1_000_000_000
-"""The clocks' offset is the least of one to two such times: a robot whose clock stood still for a moment
-(a computer that paused) is behind for good, and commands are placed by this offset."""
+"""Length of a window [ns]; the offset is the smallest of the present window and the one before.
+An older offset would be wrong after a pause of the robot's computer: its clock then stays behind."""
 
 
 class ClockOffset:
-    """Host clock minus robot clock, at the fastest transit of the last moments.
+    """Host clock minus robot clock, by the fastest recent message.
 
-    A state that waits on its way, or until somebody reads it, arrives late. Only the fastest show the offset.
+    A state may wait on the network or until it is read, and then its offset is too large. The smallest one is
+    the best estimate.
 
     Attributes:
         offset_ns: The offset [ns].
@@ -24,7 +25,7 @@ class ClockOffset:
         self._first = True
 
     def take(self, receive_ns: int, device_ns: int) -> None:
-        """A state came, with its time by both clocks [ns]."""
+        """Take the time of a state by both clocks [ns]."""
         offset = receive_ns - device_ns
         if self._first or receive_ns - self._window_ns > OFFSET_WINDOW_NS:
             self._former_ns = offset if self._first else self._recent_ns
@@ -34,7 +35,7 @@ class ClockOffset:
 
 
 class CommandEcho:
-    """Knows which command was in force when a state was sensed: the robot does not say it."""
+    """Finds which command was in force when a state was sensed, if the robot does not report it."""
 
     def __init__(self) -> None:
         self.reset()
@@ -45,13 +46,14 @@ class CommandEcho:
         self._in_force: tuple[int, int] | None = None
 
     def note(self, sequence: int, stamp_ns: int) -> None:
-        """A new command went out at a time of the host's clock [ns]."""
+        """Note that a command was sent at a time of the host's clock [ns]."""
         self._sent.append((sequence, stamp_ns))
 
     def at(self, device_ns: int, offset_ns: int) -> tuple[int, int]:
         """Return number and age [ns] of the command in force at a time of the robot's clock; (-1, -1): none.
 
-        When a command went out by the robot's clock is settled once, so that ages grow as the clock does.
+        The send time of a command by the robot's clock is computed once, so that its age grows with that
+        clock.
         """
         while self._sent and self._sent[0][1] - offset_ns < device_ns:
             sequence, stamp_ns = self._sent.popleft()

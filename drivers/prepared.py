@@ -1,4 +1,4 @@
-"""Simulated robots whose model is a file of another package: prepares it and keeps it in the user's cache.
+"""Prepares models that are files of other packages, and keeps them in the user's cache.
 
 This repository has no copy of these models.
 """
@@ -36,7 +36,7 @@ def package_file(package: str, inside: str, extra: str) -> Path:
         raise MissingExtraError(package, extra)
     path = Path(spec.submodule_search_locations[0]) / inside
     if not path.is_file():
-        raise ConfigurationError(f"{path} is not there; another version of {package} carries it")
+        raise ConfigurationError(f"{path} is missing; another version of {package} contains it")
     return path
 
 
@@ -49,8 +49,8 @@ class PackagedModel:
         package: The package.
         inside: The file's path inside of it.
         extra: Our extra that installs the package.
-        change: Changes its tree by parameter name -> value; raises KeyError or AttributeError if a part is
-            missing.
+        change: Function that changes its tree, given parameter name -> value; raises KeyError or
+            AttributeError if a part is missing.
         source: The file and the package's version that the change was written for.
     """
 
@@ -101,7 +101,7 @@ def find(root: ET.Element, path: str) -> ET.Element:
 
 
 def cached(robot: str, text: str) -> Path:
-    """Return a file in the user's cache folder with this content, written if it is not there yet.
+    """Return a file in the user's cache folder with this content; it is written if missing.
 
     Args:
         robot: First part of its name.

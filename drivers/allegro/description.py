@@ -25,7 +25,7 @@ RANGE_RAD: Final = (
     *((0.263, 1.396), (-0.105, 1.163), (-0.189, 1.644), (-0.162, 1.719)),
 )
 HOLDING_RAD: Final = (*(0.0, 0.3, 0.7, 0.7) * 3, 0.9, 0.5, 0.3, 0.6)
-"""Bent enough that the cube stays on the palm."""
+"""Default pose: the fingers are bent enough that the cube stays on the palm."""
 PRESS_RAD: Final = 0.3
 """Targets may lie this far beyond a joint's end, where fingers press [rad]."""
 EFFORT_LIMIT_NM: Final = 0.7
@@ -111,7 +111,7 @@ def _parameters(
 
 
 def _alike(names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """Return joints or links, those of the three fingers together."""
+    """Return joints or links in groups: those of the three fingers form one group."""
     found: dict[str, tuple[str, ...]] = {}
     for name in names:
         finger, _, rest = name.partition("_")
@@ -121,15 +121,16 @@ def _alike(names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
 
 
 def parameter_space() -> ParameterSpace:
-    """Return 42 parameters: the three fingers alike, all shapes of the hand alike, no palm mass."""
+    """Return 42 parameters: one set for the three fingers, one for all shapes of the hand, no palm mass."""
     return _parameters({"hand": GEOMS}, _alike(JOINTS), _alike(LINKS), RESTITUTION)
 
 
 def paper_space() -> ParameterSpace:
-    """Return 122 of the 125 parameters of DEAL's Table 10, each for itself.
+    """Return 122 of the 125 parameters of DEAL's Table 10, each searched independently.
 
-    Its 22nd contact (friction and restitution) is the cube's, but MuJoCo uses the shape of higher priority,
-    here the hand's. No motion shows the mass of the palm, which is fixed.
+    Three are left out. The table's 22nd contact (friction and restitution) is the cube's, but MuJoCo uses the
+    values of the shape with the higher priority, here the hand's. The palm is fixed, so no motion shows its
+    mass.
     """
     contacts, joints, links = ({name: (name,) for name in names} for names in (GEOMS, JOINTS, LINKS))
     return _parameters(contacts, joints, links, PAPER_RESTITUTION)

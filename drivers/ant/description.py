@@ -115,7 +115,7 @@ def _space(values: Mapping[str, float]) -> ParameterSpace:
 
 
 def parameter_space() -> ParameterSpace:
-    """Return the 11 parameters of DEAL's Table 7; the four legs are alike.
+    """Return the 11 parameters of DEAL's Table 7; the four legs share theirs.
 
     Contact friction and restitution are the floor's, which determines every contact (geom priority). "Motor
     friction" is dry friction of the joint. "Leg" is the link between hip and ankle, "foot" the one after it.
@@ -126,10 +126,10 @@ def parameter_space() -> ParameterSpace:
 def paper_space() -> ParameterSpace:
     """Return the same with the values of DEAL's Table 7.
 
-    Two of them are odd. A restitution of 0.01 bounces to 1/10000 of the height. Only a small change of the
-    contact's damping distinguishes it from 0.002 or 0.05, and MuJoCo has no restitution at all (see
-    ``geom_restitution``). The default preset has 0.04, so that a factor 20 to either side stays below 1. A
-    friction of 1.5 is rubber on rubber; the default preset has 1, gymnasium's own.
+    Two of them are unusual. With a restitution of 0.01 a body bounces to 1/10000 of its height. MuJoCo has no
+    restitution: it becomes damping of the contact (see ``geom_restitution``), and 0.01 gives nearly the same
+    damping as 0.002 or 0.05. The default preset has 0.04, so that a factor 20 to either side stays below 1. A
+    friction of 1.5 is that of rubber on rubber; the default preset has 1, gymnasium's own value.
     """
     return _space(PAPER)
 

@@ -47,10 +47,10 @@ class Angle:
 CanMessage = protocol.AnyMessage | Angle
 NODE: Final = 1
 LAST_NODE: Final = 62
-"""Largest node number. 0 would use ids of CANopen's network management, 63 is that of a new ODrive."""
+"""Largest node number. Number 0 would use ids of CANopen's network management; a new ODrive has number 63."""
 STATES_PER_HEARTBEAT: Final = 20
 FRAME: Final = struct.Struct("<IB3x8s")
-"""One frame as bytes: Linux' ``struct can_frame``, id, length and eight data bytes."""
+"""One frame as bytes: Linux's ``struct can_frame`` with id, length and eight data bytes."""
 _NUMBER_BITS: Final = 5
 _DEVICE_TIME: Final = 2**48 - 1
 _GROUPS: Final[dict[str, type[CanMessage]]] = {
@@ -117,8 +117,8 @@ class CanLink:
     """One side of a CAN wire; bytes are whole frames in the layout of :data:`FRAME`.
 
     Attributes:
-        errors: Messages that were corrupt or unknown so far.
-        torn: Messages that lost a frame so far; hosts detect a missing state by its number.
+        errors: Number of corrupt or unknown messages so far.
+        torn: Number of messages so far that lost a frame; hosts detect a missing state by its number.
         fault: Two devices with one number; "" for none.
 
     Args:

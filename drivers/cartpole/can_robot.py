@@ -17,7 +17,7 @@ _MOST_AT_ONCE = 256
 
 
 class CanFrames(TransportWrapper):
-    """CAN frames as a stream of bytes, each frame as Linux' ``struct can_frame``; the channel is "".
+    """CAN frames as a stream of bytes, each frame as Linux's ``struct can_frame``; the channel is "".
 
     Args:
         inner: The bus.
@@ -36,15 +36,15 @@ class CanFrames(TransportWrapper):
         return self._inner.error_frames
 
     def send(self, message: Message) -> None:
-        """Send frames one after the other; after one that fails the rest stays."""
+        """Send frames one after the other; after a failed frame the rest is not sent."""
         for identifier, length, data in FRAME.iter_unpack(message.payload):
             self._inner.send(Message(f"{identifier:03X}", data[:length], message.stamp_ns))
 
     def receive(self, timeout_s: float) -> Message:
-        """Return all frames at hand, waiting for the first; the stamp is that of the last."""
+        """Return all received frames, waiting for the first; the stamp is that of the last."""
         frame = self._inner.receive(timeout_s)
         frames = [_pack(frame)]
-        # What goes wrong after the first frame shows in the next call.
+        # An error after the first frame is raised by the next call.
         with contextlib.suppress(TransportError):
             while len(frames) < _MOST_AT_ONCE:
                 frame = self._inner.receive(0.0)
@@ -56,7 +56,7 @@ def can_bus(port: str) -> tuple[str, tuple[int]]:
     """Return the bus of a port, and the device's number on it.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     bus, given = take_settings(port, {"node": 0})
     return bus, (check_node(given.get("node", NODE)),)
@@ -72,7 +72,7 @@ def can_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool 
         can_send: False for a robot that is only listened to.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     bus, (node,) = can_bus(port)
     frames = CanFrames(open_can(bus, clock, accept(node), fd))

@@ -79,16 +79,16 @@ class EmulatedDevice(abc.ABC):
     @property
     @abc.abstractmethod
     def mode(self) -> str:
-        """What the motor does: "idle" and "held" are without torque, "homing" and "armed" are not."""
+        """State of the motor: "idle" and "held" without torque, "homing" and "armed" with torque."""
 
     @property
     @abc.abstractmethod
     def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away."""
+        """Whether the motor was stopped because no commands came."""
 
     @property
     def trouble(self) -> str:
-        """What is wrong with its wire or its motors now; "" for nothing."""
+        """Current fault of its wire or its motors; "" for none."""
         return ""
 
     def receive(self, data: bytes) -> None:
@@ -159,12 +159,12 @@ class CartpoleDevice(EmulatedDevice):
 
     @property
     def mode(self) -> str:
-        """What the motor does: "idle" and "held" are without torque, "homing" and "armed" are not."""
+        """State of the motor: "idle" and "held" without torque, "homing" and "armed" with torque."""
         return "held" if self._mechanics.held else self._firmware.mode.name.lower()
 
     @property
     def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away, since it was last armed."""
+        """Whether the motor was stopped because no commands came, since it was last armed."""
         return self._firmware.watchdog
 
     @property

@@ -30,8 +30,8 @@ class CartpoleEmulator:
     A host may close the port and open it again. Frames that nobody reads are dropped, as on a UART.
 
     Attributes:
-        slips: Times that this process was stalled and device time stood still.
-        dropped: Writes that found no room.
+        slips: How often this process stalled and device time stood still.
+        dropped: Number of writes that the full buffer did not take.
         changes: Changes of the motor and the port, the first 2000: device ms, host ns, and a mode of the
             device, "frozen", "cut", "gone" or "back", or the fault of a bus.
 
@@ -154,7 +154,7 @@ class CartpoleEmulator:
         }
 
     def _have_port(self, now_ns: int, armed_s: float) -> bool:
-        """Remove the port and return it when it is time; return False if it stays away."""
+        """Remove the port and bring it back at the set times; return False if it is gone for good."""
         again_s = self._hazards.return_after_s
         if self._gone_ns < 0 and _passed(self._vanish_after_s, armed_s):
             self.close()

@@ -1,4 +1,4 @@
-"""The emulated cart-poles, by what runs their firmware."""
+"""Table of emulated cart-poles: what runs the firmware of each."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 FIRMWARES = ("auto", "host", "python", "avr")
-"""The C core compiled for this host; in Python with a float servo; the chip's image under simavr.
+"""What runs the firmware of an emulated cart-pole.
 
-"auto" is "host" where the core can be compiled, otherwise "python".
+"host" is the C core, compiled for this computer. "python" is the same in Python, with floats in the servo.
+"avr" is the chip's image under simavr. "auto" is "host" if the core can be compiled, otherwise "python".
 """
 CAN_FIRMWARES = ("auto", "host", "python")
-"""Those of an emulated cart-pole on CAN: the ATmega328P has no CAN controller."""
+"""The same for an emulated cart-pole on CAN; not "avr": the ATmega328P has no CAN controller."""
 
 
 def usable_firmware(firmware: str) -> str:

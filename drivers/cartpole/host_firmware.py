@@ -43,7 +43,7 @@ class Settings(ctypes.Structure):
 
 
 def settings_of(truth: CartpoleTruth, delay_ticks: int) -> Settings:
-    """Return the settings of a device with this truth: its trims are what nobody told the host."""
+    """Return the settings of a device with this truth; its trims are factors that the host does not know."""
     nominal = {
         "stiffness": STIFFNESS_N_M,
         "damping": DAMPING_NS_M,
@@ -133,12 +133,12 @@ class HostFirmware:
 
     @property
     def mode(self) -> Mode:
-        """What the motor does."""
+        """State of the motor."""
         return _MODES[self._looked[0]]
 
     @property
     def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away, since it was last armed."""
+        """Whether the motor was stopped because no commands came, since it was last armed."""
         return bool(self._looked[1])
 
     @property
@@ -180,7 +180,7 @@ class HostFirmware:
         return self._frame.raw[:length]
 
     def finish_homing(self) -> None:
-        """Take note that the cart is in the middle and the pole upright; nothing happens unless homing."""
+        """Note that the cart is in the middle and the pole upright; only has an effect while homing."""
         self._core.cartpole_finish_homing(self._device)
         self._look()
 

@@ -1,4 +1,4 @@
-"""How messages become bytes on a wire and back: what host and device share, and the serial wire."""
+"""Links encode messages as bytes and decode them: the interfaces of both sides, and the serial wire."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deal_hw.errors import ProtocolError
 
 
 class Link(Protocol):
-    """One side of a wire: what the peer's bytes say, and how a message is written.
+    """One side of a wire: decodes the peer's bytes and encodes messages.
 
     Attributes:
         errors: Corrupt frames so far.
@@ -31,28 +31,28 @@ class HostLink(Link, Protocol):
     """The host's side.
 
     Attributes:
-        fault: What was heard that forbids going on, such as two devices under one number; "" for nothing.
-        resync: Bytes that keep a frame that was cut short from swallowing the next one.
-        hint: What to check where bytes come but no answer.
+        fault: Fault after which the host must not continue, such as two devices with one number; "" for none.
+        resync: Bytes that end an incomplete frame, so that the receiver does not join it with the next one.
+        hint: Advice for the case that bytes arrive but no answer.
     """
 
     def feasible(self, target: protocol.Target) -> protocol.Target:
-        """Return what of a target this wire carries, as it will be sent next."""
+        """Return the target as this wire will send it next."""
         ...
 
     @property
     def fault(self) -> str:
-        """What was heard that forbids going on."""
+        """Fault after which the host must not continue; "" for none."""
         ...
 
     @property
     def resync(self) -> bytes:
-        """Bytes that end a frame that was cut short."""
+        """Bytes that end an incomplete frame."""
         ...
 
     @property
     def hint(self) -> str:
-        """What to check where bytes come but no answer."""
+        """Advice for the case that bytes arrive but no answer."""
         ...
 
 
@@ -76,7 +76,7 @@ class SerialLink:
         self._decoder.errors = count
 
     def feasible(self, target: protocol.Target) -> protocol.Target:
-        """Return what of a target this wire carries: all of it."""
+        """Return the target unchanged: this wire carries all of it."""
         return target
 
     def decode(self, data: bytes) -> Iterable[protocol.AnyMessage]:

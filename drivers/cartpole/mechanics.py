@@ -1,4 +1,4 @@
-"""The mechanics and sensors of an emulated cart-pole, without its firmware, one tick at a time."""
+"""The mechanics and sensors of an emulated cart-pole, without its firmware, computed tick by tick."""
 
 from __future__ import annotations
 

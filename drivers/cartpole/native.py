@@ -53,7 +53,7 @@ SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 def cache() -> Path:
-    """Return the folder of what was built: ``$XDG_CACHE_HOME/deal-hw/firmware``."""
+    """Return the folder of built files: ``$XDG_CACHE_HOME/deal-hw/firmware``."""
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(root) / "deal-hw" / "firmware"
 
@@ -147,7 +147,7 @@ def _arm_build(name: str, sources: Sequence[str], *options: str) -> Path:
 
 
 def write_image(folder: Path) -> str:
-    """Write ``cartpole.elf`` and ``cartpole.hex`` into a folder; return what avr-size says of them.
+    """Write ``cartpole.elf`` and ``cartpole.hex`` into a folder; return the report of avr-size.
 
     Raises:
         ConfigurationError: There is no avr-gcc, or it refuses the sources.
@@ -161,7 +161,7 @@ def write_image(folder: Path) -> str:
 
 
 def write_stm32_image(folder: Path) -> str:
-    """Write ``.elf`` and ``.bin`` of each of :data:`STM32` into a folder; return their memory, a line each.
+    """Write ``.elf`` and ``.bin`` of each of :data:`STM32` into a folder; return the memory of each as text.
 
     Raises:
         ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.

@@ -176,7 +176,7 @@ class OdriveLink:
 
     @property
     def fault(self) -> str:
-        """A received fault that forbids to continue; "" for none."""
+        """Fault after which the host must not continue; "" for none."""
         if self._encoder.fault:
             return self._encoder.fault
         if self._armed and self._axis_errors:
@@ -370,7 +370,7 @@ class OdriveLink:
 
     def _take_angle(self, angle: Angle) -> Iterator[protocol.State]:
         cart, self._cart = self._cart, None
-        # Number and time advanced by less than their fields can hold, or the host started anew.
+        # Number and time advanced by less than their fields can hold, or the host restarted.
         passed_us = (angle.device_us - self._device_us) & _U32
         self._sequence = (self._sequence + (((angle.sequence - self._sequence - 1) & 0xFF) + 1)) & _U32
         self._device_us += passed_us

@@ -49,7 +49,7 @@ def odrive_settings(port: str) -> tuple[str, OdriveSettings]:
             settings.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     bus, given = take_settings(port, _LOWEST)
     settings = OdriveSettings()
@@ -67,7 +67,7 @@ def odrive_bus(port: str) -> tuple[str, tuple[int, int]]:
     """Return the bus of a port, and the numbers of drive and encoder on it.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     bus, settings = odrive_settings(port)
     return bus, (settings.drive, settings.encoder)
@@ -83,7 +83,7 @@ def odrive_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bo
         can_send: False for a robot that is only listened to.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     bus, settings = odrive_settings(port)
     frames = CanFrames(open_can(bus, clock, accept(settings.drive, settings.encoder), fd))

@@ -1,4 +1,4 @@
-"""What stands between the emulated mechanics and the wire, in three steps of realism."""
+"""Profiles of an emulated cart-pole: sensors, latency and imperfect mechanics, in three steps."""
 
 from __future__ import annotations
 

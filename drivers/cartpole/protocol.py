@@ -57,7 +57,7 @@ class Result(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Host: who are you? Switches the motor off and forgets earlier commands. Its layout never changes."""
+    """Host: asks what the device is, switches its motor off and clears earlier commands; a fixed layout."""
 
     FORMAT: ClassVar[str] = "<B"
     TYPE: ClassVar[MessageType] = MessageType.HELLO
@@ -170,7 +170,7 @@ class State:
         cart_um_s: Cart velocity.
         pole_urad: Pole angle, 0 upright, not wrapped.
         pole_urad_s: Pole velocity.
-        effort_mn: The controller's own demand, after its limit.
+        effort_mn: Force that the device's controller requests, after its limit.
         status: Bits of :class:`deal_hw.types.Status`.
         command_sequence: Number of the newest command received, or :data:`NO_COMMAND`.
         command_age_us: Device time since that command was received; 0 without one.
@@ -236,7 +236,7 @@ def decode(payload: bytes) -> AnyMessage:
 
     Raises:
         VersionMismatchError: Another version, and neither hello nor info.
-        FrameError: Unknown type, wrong length or a value that means nothing.
+        FrameError: Unknown type, wrong length or an invalid value.
     """
     if len(payload) < 2:
         raise FrameError(f"a payload has at least 2 bytes (version, type), got {len(payload)}")

@@ -112,7 +112,7 @@ class RigChip:
         return self._out.raw[:length]
 
     def _note(self) -> None:
-        """Take note of the outputs."""
+        """Store the outputs."""
 
     def close(self) -> None:
         """Free its memory."""
@@ -187,7 +187,7 @@ class RigDevice(EmulatedDevice):
         counts = self._counts()
         cart, _ = mechanics.position
         turns = counts[1] - self._counted[1]
-        # The hand moves the pole the short way, so the simulator's angle may jump by whole turns.
+        # The hand moves the pole along the shorter way, so the simulator's angle may jump by whole turns.
         turns = (turns + build.counts_per_turn // 2) % build.counts_per_turn - build.counts_per_turn // 2
         data, self._inbox = self._inbox, b""
         switches = (cart <= -build.switch_m, cart >= build.switch_m)
@@ -209,7 +209,7 @@ class RigDevice(EmulatedDevice):
 
     def _counts(self) -> tuple[int, int]:
         """Return the encoders' counts at the end of this millisecond without a force."""
-        # Without this prediction all edges would come a millisecond late, with the effect of a lighter cart.
+        # Without this prediction all edges would come a millisecond late, and the cart would seem lighter.
         motor = self._mechanics.motor()
         _, pole, _, pole_velocity = self._mechanics.truth_row()
         cart = motor.position + motor.velocity * 1e-3

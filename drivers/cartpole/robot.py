@@ -154,7 +154,7 @@ class CartpoleRobot(Robot):
 
     @property
     def fault(self) -> str:
-        """A received fault that forbids to continue; "" for none."""
+        """A received fault after which the host must not continue; "" for none."""
         return self._link.fault
 
     def fileno(self) -> int:
@@ -260,8 +260,8 @@ class CartpoleRobot(Robot):
         if isinstance(message, protocol.State):
             if self._next_state is not None:
                 missing = (message.sequence - self._next_state) & _U32
-                # A number that goes back means that the device restarted: one error, not four thousand
-                # million.
+                # If the number goes back, the device restarted. This counts as one error; the unsigned
+                # difference would be about 2**32.
                 self._gaps += missing if missing < _I32 else 1
             self._next_state = (message.sequence + 1) & _U32
             state = to_robot_state(message, stamp_ns)

@@ -1,4 +1,4 @@
-"""From the true state to the integers in a state frame: delay, noise, quantisation, differenced velocity."""
+"""Converts the true state to a state frame's integers: delay, noise, quantisation, differenced velocity."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _I32 = 0x7FFF_FFFF
 
 
 class Motor(NamedTuple):
-    """What the motor's own encoder says at once: position of the cart and its velocity [m, m/s]."""
+    """Reading of the motor's own encoder, without delay: position and velocity of the cart [m, m/s]."""
 
     position: float
     velocity: float
 
 
 class Sample(NamedTuple):
-    """What the device knows at one control tick, before the physics step [m, m/s, rad, rad/s, m]."""
+    """True state and set-point at one control tick, before the physics step [m, m/s, rad, rad/s, m]."""
 
     cart: float
     cart_velocity: float
@@ -30,7 +30,7 @@ class Sample(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What a state frame says [um, um/s, urad, urad/s], the set-point of that moment [m]; end stop."""
+    """Values of a state frame [um, um/s, urad, urad/s]; the set-point at that time [m]; the end stop."""
 
     cart_um: int
     cart_um_s: int
@@ -73,7 +73,7 @@ class Sensor:
         self._reported.clear()
 
     def read(self) -> Reading:
-        """Return what goes into this tick's frame."""
+        """Return the values of this tick's frame."""
         delay = self._delay + (int(self._rng.integers(0, self._jitter + 1)) if self._jitter else 0)
         sample = self._samples[-1 - min(delay, len(self._samples) - 1)]
         cart_um = self._encode(sample.cart, 0)
@@ -94,7 +94,7 @@ class Sensor:
 
     def _difference(self) -> tuple[int, int]:
         (old_cart, old_pole), (cart, pole) = self._reported[0], self._reported[-1]
-        # Right after a start the window is not full yet; then the difference runs over what there is.
+        # Right after a start the window is not full yet; then the difference covers the samples so far.
         count = max(1, len(self._reported) - 1)
         return fit((cart - old_cart) * self._rate_hz / count), fit((pole - old_pole) * self._rate_hz / count)
 

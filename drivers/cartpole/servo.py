@@ -1,4 +1,4 @@
-"""The PD position loop inside the device: what it was sent, times the factors that it does not know of."""
+"""The PD position loop in the device: received gains and limits, times hidden factors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Servo:
     """PD loop with a set-point that slews towards the target.
 
     Args:
-        parameters: What the servo parameters of the description's default command really are, by name.
+        parameters: True values of the servo parameters for the description's default command, by name.
         period_s: Control period [s].
         reach_m: No target outside plus or minus this is accepted [m].
     """
@@ -36,7 +36,7 @@ class Servo:
         self.reset(0.0)
 
     def reset(self, position: float) -> None:
-        """Start over with the set-point at the measured position [m] and no gains."""
+        """Set the set-point to the measured position [m] and all gains to 0."""
         self.setpoint = position
         self._target = position
         self._sent_stiffness = self._sent_damping = self._sent_limit = 0.0
@@ -70,7 +70,7 @@ class Servo:
         return self.setpoint != self._target
 
     def estimate(self, setpoint: float, position: float, velocity: float) -> tuple[float, bool]:
-        """Return the demand that the firmware believes in [N], and whether its effort limit cut it."""
+        """Return the force that the firmware computes, without hidden factors [N]; whether it is limited."""
         demand = self._sent_stiffness * (setpoint - position) - self._sent_damping * velocity
         if abs(demand) < self._sent_limit:
             return demand, False

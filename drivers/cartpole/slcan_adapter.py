@@ -26,7 +26,7 @@ _BUFFERED: Final = 3
 
 
 class SlcanAdapter:
-    """The adapter, the bus and the devices on it, as one device that speaks the adapter's characters.
+    """The adapter, the bus and the devices on it, as one device; its bytes are the adapter's characters.
 
     Args:
         devices: Devices on the bus, whose bytes are frames in the layout of :data:`FRAME`; the first is the

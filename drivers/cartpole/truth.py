@@ -19,7 +19,7 @@ MOST_TICKS = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CartpoleTruth:
-    """What a calibrator has to find out.
+    """Hidden values that a calibration should find.
 
     Attributes:
         profile: Name of the profile.
@@ -59,7 +59,7 @@ class CartpoleTruth:
         """Return the truth that :meth:`to_json` wrote.
 
         Raises:
-            ConfigurationError: A value is missing or means nothing.
+            ConfigurationError: A value is missing or invalid.
         """
         with reading(
             "the values", "the truth of a cart-pole", "--reveal-to writes one", error=ConfigurationError

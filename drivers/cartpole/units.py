@@ -1,4 +1,4 @@
-"""Between SI units in floats and the integers of the wire."""
+"""Converts between SI units in floats and the integers of the wire."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _U16, _U32, _I32 = 0xFFFF, 0xFFFF_FFFF, 0x7FFF_FFFF
 
 
 def to_target(command: JointCommand, sequence: int) -> protocol.Target:
-    """Round a command to the wire; what exceeds a field is clipped to it.
+    """Round a command to the wire's integers; a value beyond its field's range is clipped.
 
     Raises:
         SafetyError: A value is not finite.
@@ -30,7 +30,7 @@ def to_target(command: JointCommand, sequence: int) -> protocol.Target:
 
 
 def from_target(target: protocol.Target) -> JointCommand:
-    """Return the command that a target stands for; what the wire does not carry is 0."""
+    """Return a target as a command in SI units; quantities that the wire does not carry are 0."""
     return JointCommand(
         position_target=np.array([target.position_um / 1e6]),
         velocity_target=np.zeros(1),

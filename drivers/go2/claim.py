@@ -1,6 +1,6 @@
-"""The exclusive claim on a Go2, on the wire, by which a second commander is refused at once.
+"""An exclusive claim on a Go2, sent as messages: a second program that wants to command is refused at once.
 
-Claims are messages on a topic of our own, which robot and sport mode ignore. A claim has a life cycle:
+Claims use a topic of deal-hw, which robot and sport mode ignore. A claim has these states:
 
     asking --nobody answered for LISTEN_S--> held --every REFRESH_S--> held ... --> released
        └──── somebody holds it, or asks with a smaller number: refused

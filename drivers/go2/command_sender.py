@@ -17,16 +17,16 @@ from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand
 
 PASSIVE_COPIES: Final = 3
-"""Number of sends of the last command: it is held for ever, and single messages may be lost."""
+"""How often the last command is sent: the robot holds it for ever, and single messages may be lost."""
 
 
 class CommandSender:
-    """Sends commands, keeps the bytes of the last for its repeats, and numbers the behaviour's own.
+    """Sends commands, keeps the last one's bytes to repeat it, and numbers the behaviour's commands.
 
     Attributes:
         in_force: Bytes of the command that the motors hold; b"" before the first.
         sequence: Number of the behaviour's last command; -1 before the first.
-        echo: Which of them was in force when.
+        echo: Finds which of them was in force at a time.
         damping: Gains of the passive command, (J,) [N·m·s/rad].
         effort_limit: Effort limits of the description, (J,) [N·m].
 
@@ -68,12 +68,13 @@ class CommandSender:
         """Send the behaviour's next command.
 
         Args:
-            command: What it asks for.
-            damp_at: The joints' positions, (J,) [rad], where the robot is passive and damping goes out
-                instead; None where it is armed.
+            command: The requested command.
+            damp_at: Joint positions, (J,) [rad], if the robot is passive: damping is sent instead. None if it
+                is armed.
 
         Returns:
-            What was sent, rounded as on the wire, with the description's limits: the wire has none.
+            The sent command, rounded as on the wire. Its effort and speed limits are the description's,
+            because the wire has none.
 
         Raises:
             SafetyError: A value is not finite, or the robot is passive and was never commanded.

@@ -1,4 +1,4 @@
-"""Finding exactly one Go2 on a wire, or the reason why none is received."""
+"""Waits for the states of exactly one Go2, or finds the reason why none arrive."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ _TOO_MANY: Final = 20
 def await_robot(
     transport: TopicTransport, clock: Clock, stream: StateStream, pump: Callable[[float], None]
 ) -> None:
-    """Wait until states of one Go2 have come whose clock runs.
+    """Wait for states of one Go2 whose clock runs.
 
     Args:
         transport: Topics of the robot; open.
         clock: For waiting.
-        stream: Judges the states; as new.
+        stream: Checks the states; not used before.
         pump: Receives one message, waiting at most so long [s], and gives states to the stream; raises
-            TransportTimeoutError where none comes.
+            TransportTimeoutError if none arrives.
 
     Raises:
         TransportTimeoutError: No states come, or their clock stands still.
         WrongDeviceError: It is another robot, or there are two.
-        VersionMismatchError: The robot's firmware makes other checksums.
+        VersionMismatchError: The robot's firmware uses other checksums.
     """
     deadline_ns = clock.now_ns() + round(CONNECT_TIMEOUT_S * 1e9)
     while stream.accepted < _FIRST_STATES and (left_ns := deadline_ns - clock.now_ns()) > 0:

@@ -1,4 +1,4 @@
-"""What can be told of a Go2 and the link to it by listening, and by asking who moves it; no motor command.
+"""Checks of a Go2 and the connection to it: listens, and asks which mode is active; no motor command.
 
 Works over every transport of topics; over DDS it also reads the domain's discovery.
 """
@@ -36,7 +36,7 @@ _FEW_REFUSED: Final = 0.01
 
 @dataclass(slots=True)
 class _Heard:
-    """What came while listening."""
+    """Messages received while listening."""
 
     stamps: list[int] = field(default_factory=list)
     ticks: list[int] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Go2Doctor:
         clock: The clock of its stamps.
         seconds: How long to listen [s].
         state_check: What a state must pass.
-        simulator: What stands in the robot's place.
+        simulator: Name of a simulator in place of the robot; None for a robot.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Go2Doctor:
         self._strict, self._simulated = state_check == "strict", simulator != "none"
 
     def run(self) -> Iterator[Finding]:
-        """Yield what was found; the transport is closed at the end.
+        """Yield findings; the transport is closed at the end.
 
         Raises:
             TransportError: It cannot be opened.
@@ -157,7 +157,7 @@ class Go2Doctor:
             yield Finding("dds", Level.OK, f"{', '.join(sorted(names))}: {shown}")
 
     def _ask_mode(self) -> Generator[Finding, None, str | None]:
-        """Yield what the motion switcher tells; return the active mode's name, None without an answer."""
+        """Yield the motion switcher's answer; return the active mode's name, None without an answer."""
         services = ServiceClient(
             self._send, lambda timeout_s: services.take(self._link.receive(timeout_s)), self._clock
         )
@@ -245,7 +245,7 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
 
 
 def _judge_refused(refused: Refusals, sound: int) -> Finding:
-    """Return the one finding about all states that were refused, beside those that were sound."""
+    """Return one finding about all refused states, given the number of valid ones."""
     share = refused.count / (refused.count + sound)
     text = (
         f"{refused.count} of {refused.count + sound} messages on {topics.LOW_STATE} ({share:.1%}) are no Go2 "

@@ -41,14 +41,14 @@ ERRORS: Final[Mapping[int, str]] = {
     7008: "releasing the mode failed; lay the robot down by its remote and try again",
     7009: "setting the configuration failed",
 }
-"""Codes of responses in words."""
+"""Meanings of response codes."""
 
 _ASK_S: Final = 0.5
 """Time between repeated requests: a first one may be lost during the network's discovery [s]."""
 _PATIENCE_S: Final = 3.0
 """A switcher that is silent for this long does not exist, as in older firmware [s]."""
 _ACT_S: Final = 5.0
-"""As long as the vendor's SDK waits for an answer [s]."""
+"""Longest wait for an answer, as in the vendor's SDK [s]."""
 
 
 _UNHEARD: Final = (

@@ -42,7 +42,7 @@ def sway(
     frequency = np.exp(rng.uniform(np.log(low), np.log(high), (6, _TONES)))
     phase = rng.uniform(0.0, 2 * np.pi, (6, _TONES))
     waves = np.sin(2 * np.pi * frequency * time[:, None, None] + phase).mean(axis=2)
-    # From rest: a step of the targets would throw the robot before anything is known of it.
+    # Starts from rest: a step of the targets could throw the robot over.
     moved = np.minimum(time / EASE_S, 1.0)[:, None] * waves * (*SHIFT_M, *TURN_RAD)
     pose = np.array(DESCRIPTION.default_position)
     targets = standing_targets(robot, FEET, moved[:, :3], moved[:, 3:], pose)

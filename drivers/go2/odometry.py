@@ -51,7 +51,7 @@ def walked(trajectory: Trajectory) -> Track | None:
 def _answers(
     orientation: FloatArray, gyro: FloatArray, position: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return the velocity of the base in the world, from each foot as if it stood, (T, 4, 3) [m/s]."""
+    """Return the velocity of the base in the world by each foot, as if that foot stood, (T, 4, 3) [m/s]."""
     T = len(position)
     joints, hip = velocity.reshape(T, 4, 3), position.reshape(T, 4, 3)[..., 0]
     moved = np.einsum("tlij,tlj->tli", foot_jacobians(position), joints)

@@ -48,7 +48,7 @@ _ENOUGH: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Go2Info:
-    """What the robot says of itself.
+    """What the robot reports about itself.
 
     Attributes:
         battery: State of charge, 0 to 1.
@@ -74,7 +74,7 @@ class Go2Robot(Robot):
     motors; ``hand_back`` returns the robot to that controller. All waits here keep reading messages.
 
     Attributes:
-        info: What the robot said of itself; None before ``connect``.
+        info: What the robot reported about itself; None before ``connect``.
 
     Args:
         transport: Topics of the robot, or of a bridge to it.
@@ -178,14 +178,14 @@ class Go2Robot(Robot):
         self._states.clear()
 
     def hand_back(self, timeout_s: float) -> None:
-        """Return the robot to the mode that ``home`` released; it stands up. Nothing where none was released.
+        """Return the robot to the mode that ``home`` released, if any; the robot stands up.
 
         Raises:
             SafetyError: The robot is armed, or the service refuses.
             TransportTimeoutError: The mode does not have the robot in time.
         """
         if self._armed:
-            raise SafetyError("go2: make the robot passive before it returns to its own controller")
+            raise SafetyError("go2: the robot is armed: make it passive before you hand it back")
         self._homed, self._sender.in_force, self._passive_ns = False, b"", None
         self._takeover.hand_back(timeout_s)
 
@@ -205,7 +205,7 @@ class Go2Robot(Robot):
         if self._takeover.contested:
             raise SafetyError(self._takeover.complaint())
         if self._operator_stop:
-            raise SafetyError(f"go2: {self._operator_stop}; let go and call home() again")
+            raise SafetyError(f"go2: {self._operator_stop}; release the buttons and call home() again")
         self._fault = ""
         self._sender.damp(self._motion()[0])
         seen = self._stream.accepted
@@ -265,12 +265,12 @@ class Go2Robot(Robot):
 
     @property
     def operator_stop(self) -> str:
-        """Why the operator asked to stop by the remote since ``home``; "": nobody did."""
+        """How the operator stopped the run by the remote since ``home``; "" if not."""
         return self._operator_stop
 
     @property
     def fault(self) -> str:
-        """That another program, or a bridge, took the robot since it was armed; "": nobody did."""
+        """Text if another program or a bridge took the robot since it was armed; "" if none did."""
         return self._fault
 
     @property
@@ -322,7 +322,8 @@ class Go2Robot(Robot):
             self._take_bridge(message)
             return
         if message.channel == topics.LOW_COMMAND and self._bridged and message.attachment:
-            # Another client's: the bridge judges it. What it passes on from the robot's side has none.
+            # A command of another client has an attachment, and the bridge checks it. Commands from the
+            # robot's side have none.
             return
         self._takeover.take(message)
         if message.channel == topics.LOW_COMMAND and self._armed and not self._fault:
@@ -398,6 +399,6 @@ class Go2Robot(Robot):
 
 
 class Go2OnStandRobot(Go2Robot):
-    """The same robot with its base on a stand."""
+    """A Go2 with its base on a stand."""
 
     description: ClassVar[RobotDescription] = on_stand.DESCRIPTION

@@ -1,4 +1,4 @@
-"""The stream of LowStates: what is sound and new in it, and when it was sensed."""
+"""Selects the valid and new LowStates, and estimates when they were sensed."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from deal_hw.transport import Message
 
 PERIOD_MS: Final = 2
 RESTART_MS: Final = 1000
-"""A clock that goes back further than this was restarted; by less, a state was overtaken."""
+"""If the clock goes back further than this, it was restarted; if less, messages arrived out of order."""
 _ONE_ROBOT: Final = 0.4
-"""A larger share of states that are not new, and two robots send them."""
+"""If a larger share of states is not new, two robots send them."""
 _U32: Final = 1 << 32
 
 
 class StateStream:
-    """Judges each LowState by its bytes and its tick, and keeps the robot's time.
+    """Checks each LowState by its bytes and its tick, and keeps the robot's time.
 
     Attributes:
-        errors: Corrupt, missing, repeated and overtaken states so far.
-        accepted: Sound new states so far.
-        stale: States so far that were no newer than the one before.
+        errors: Number of corrupt, missing, repeated and out-of-order states so far.
+        accepted: Number of valid new states so far.
+        stale: Number of states so far that were not newer than the one before.
         sequence: Number of the newest state, counted in periods of the robot's clock.
         device_ns: The robot's clock at the newest state, without its wraps [ns].
 
@@ -62,7 +62,7 @@ class StateStream:
             self._refused.add(message.payload, error)
             return None
         tick = frame.tick_ms
-        # Signed: a state that was overtaken is a little older, not four thousand million milliseconds newer.
+        # Signed: a state that arrives out of order is a little older. Unsigned it would seem 2**32 ms newer.
         step = PERIOD_MS if self._tick is None else (tick - self._tick + _U32 // 2) % _U32 - _U32 // 2
         if step <= 0:
             self.errors += 1
@@ -86,19 +86,19 @@ class StateStream:
 
     @property
     def offset_ns(self) -> int:
-        """Host clock minus robot clock, at the fastest transit of the last moments [ns]."""
+        """Host clock minus robot clock, by the fastest recent message [ns]."""
         return self._offset.offset_ns
 
     @property
     def doubled(self) -> bool:
-        """Whether so many states are not new that two robots send them."""
+        """Whether so many states are not new that two robots must be sending them."""
         return self.stale > _ONE_ROBOT * self.accepted
 
     @property
     def standstill(self) -> str:
-        """What stands still in states that are not new, in words."""
+        """Text on what does not change in states that are not new."""
         return f"their clock stands still at {self.device_ns // 1_000_000} ms"
 
     def complaint(self) -> ProtocolError | None:
-        """Return what is wrong where states come and none is sound; None where none came, or some are."""
+        """Return the error if states arrive and none is valid; None if none arrived, or some are valid."""
         return None if self.accepted or not self._refused.count else self._refused.error()

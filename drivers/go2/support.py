@@ -1,4 +1,4 @@
-"""Decides what carries a Go2: the floor, or a stand that holds its body in the air.
+"""Decides what supports a Go2: the floor, or a stand that holds its body in the air.
 
 deal-hw has a robot for each (``go2``, ``go2_on_stand``), and commands for one are dangerous to the other. No
 sensor measures the support. Two quantities decide: the distance of the feet below the base, along gravity,
@@ -8,8 +8,8 @@ and the force that the legs carry, from the motors' estimated efforts.
 - A robot with folded legs lies. Legs that were folded when the robot was lifted look the same.
 - A robot whose feet reach below the belly and carry nothing is held by something else.
 
-Anything between is undecided. The foot force sensors count only against "held": on robots of this family
-they drift, and some report 0 (unitree_legged_sdk, issues 34, 50 and 86).
+Anything between is undecided. The foot force sensors can only contradict "held by something else". On robots
+of this family they drift, and some report 0 (unitree_legged_sdk, issues 34, 50 and 86).
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ class SupportConfig:
     """Limits between floor and stand. They come from the emulator; no real robot was measured."""
 
     window_s: float = 0.3
-    """The median of the states in this time is judged [s]."""
+    """The median of the states in this time is used [s]."""
 
     least_states: int = 50
     """Least number of states in that time."""
 
     level_rad: float = HELD_TILT_RAD
-    """Largest tilt of a body that is well laid down or well hung up [rad]."""
+    """Largest tilt of a body that lies level or hangs level [rad]."""
 
     joint_rad_s: float = 0.5
-    """A faster joint moves; the noise of a real one at rest is a tenth of that [rad/s]."""
+    """A joint above this speed counts as moving; noise of a real robot at rest is a tenth of it [rad/s]."""
 
     body_rad_s: float = 0.5
-    """A body that turns faster swings, and its forces are not used [rad/s]."""
+    """A body that turns faster counts as swinging; its forces are not used [rad/s]."""
 
     force_m_s2: float = 1.0
     """Largest difference of specific force and gravity [m/s²]."""
@@ -101,8 +101,8 @@ class SupportReading:
     """The support by some states.
 
     Attributes:
-        support: What carries the robot.
-        seen: The observation, in words.
+        support: What supports the robot.
+        seen: The observation, as text.
         remedy: What to do if the states do not decide; "" if they do.
     """
 
@@ -114,11 +114,11 @@ class SupportReading:
 def read_support(
     states: Sequence[LowState | LowStateFrame], config: SupportConfig | None = None
 ) -> SupportReading:
-    """Return what carries the robot, by the states of a short time.
+    """Return what supports the robot, by the states of a short time.
 
     Args:
         states: In order of time.
-        config: Where the lines are drawn.
+        config: The limits between floor and stand.
     """
     config = config or SupportConfig()
     if len(states) < config.least_states:
@@ -143,7 +143,7 @@ def read_support(
 
 
 def _judge(reach: FloatArray, load: float, feet: FloatArray, config: SupportConfig) -> SupportReading:
-    """Judge feet that reach so far below the base (4,) [m], a load [N] and foot sensors (4,)."""
+    """Decide by the feet's distances below the base (4,) [m], a load [N] and foot sensors (4,)."""
     # The second smallest, not the smallest: one leg may be folded.
     third, mean = float(np.sort(reach)[1]), float(reach.mean())
     carried = f"its legs carry {load:.0f} N of its {WEIGHT_N:.0f} N"
@@ -216,7 +216,7 @@ class SupportGuard:
         expected: FLOOR or HELD.
         clock: For waiting.
         pump: Receives one message, waiting at most this long [s]; TransportTimeoutError if none arrives.
-        config: Where the lines are drawn; None: nothing is checked.
+        config: The limits between floor and stand; None: nothing is checked.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class SupportGuard:
         self._states: list[LowStateFrame] | None = None
 
     def take(self, state: LowStateFrame) -> None:
-        """Take a new state; it is used while states are being judged."""
+        """Take a new state; it is used only during a check."""
         if self._states is not None:
             self._states.append(state)
 
@@ -240,10 +240,10 @@ class SupportGuard:
         """Refuse a robot that must not be released from its own controller.
 
         On a stand this needs certainty, because a robot that stands on the floor would fall. A robot for the
-        floor is laid down first, so it is refused only if it surely hangs.
+        floor is laid down first, so it is refused only if it certainly hangs.
 
         Raises:
-            SafetyError: The robot is carried by something else, or, for a stand, it is not sure.
+            SafetyError: The robot has another support, or, for a stand, its support is uncertain.
         """
         if self._expected is Support.HELD:
             self.require()
@@ -264,7 +264,7 @@ class SupportGuard:
                 raise SafetyError(self._refusal(found))
 
     def _read(self, config: SupportConfig) -> SupportReading:
-        """Receive new states for the window's length, and judge them."""
+        """Receive new states for the window's length, and decide."""
         states: list[LowStateFrame] = []
         until_ns = self._clock.now_ns() + round(config.window_s * 1e9)
         self._states = states

@@ -82,7 +82,7 @@ class Takeover:
             self._pump_until(self._clock.now_ns() + round(RELEASE_PAUSE_S * 1e9))
             if self._left_s(deadline_ns) <= 0:
                 raise TransportTimeoutError(
-                    f"go2: mode {name!r} did not let go of the robot within {timeout_s:g} s; lay the robot "
+                    f"go2: mode {name!r} did not release the robot within {timeout_s:g} s; lay the robot "
                     "down by its remote, or switch sport mode off in the vendor's app, and try again"
                 )
         self._await_silence(deadline_ns)
@@ -99,12 +99,12 @@ class Takeover:
 
     @property
     def foreign(self) -> int:
-        """Commands of others heard so far."""
+        """Number of other programs' commands received so far."""
         return self._foreign
 
     @property
     def contested(self) -> bool:
-        """Whether another program has commanded the motors just now."""
+        """Whether another program commanded the motors within the last :data:`LISTEN_S`."""
         return self._foreign > 0 and self._clock.now_ns() - self._foreign_ns < round(LISTEN_S * 1e9)
 
     def complaint(self) -> str:

@@ -1,7 +1,7 @@
 """The vendor's simulator unitree_mujoco in the place of a Go2, and the checks for its states.
 
-It uses the Go2's topics, and fills less of them (:mod:`fakes.unitree_mujoco` has the
-facts). An option must name the simulator. A state with a head or a battery is from a real robot, and is
+It uses the Go2's topics, but leaves parts of its states empty (:mod:`fakes.unitree_mujoco` lists them). An
+option must name the simulator. A state with a head or a battery is from a real robot, and is
 refused.
 
 | missing | what is checked instead |
@@ -52,7 +52,7 @@ class UnitreeMujocoConfig:
 
 
 class SimulatorStream(StateStream):
-    """Judges states without a tick: a state that differs is new, and its time is that of its reception.
+    """Checks states without a tick: a state that differs is new, and its time is that of its reception.
 
     The simulator publishes faster than its physics steps, so a repeated state is no error. It is skipped, and
     the limit of a state's age holds. Lost states cannot be detected.
@@ -70,7 +70,7 @@ class SimulatorStream(StateStream):
 
     @property
     def standstill(self) -> str:
-        """The constant part of states that are not new, in words."""
+        """Text on what does not change in states that are not new."""
         return "nothing in them changes"
 
     def take(self, message: Message) -> LowStateFrame | None:
@@ -114,7 +114,7 @@ def without_battery(description: RobotDescription) -> RobotDescription:
 
 
 class UnitreeMujocoRobot(Go2Robot):
-    """The driver of a Go2 in front of unitree_mujoco.
+    """The driver of a Go2, for the simulator unitree_mujoco.
 
     Args:
         transport: Topics of the simulator.
@@ -165,6 +165,6 @@ class UnitreeMujocoRobot(Go2Robot):
 
 
 class UnitreeMujocoOnStandRobot(UnitreeMujocoRobot):
-    """The same with its base held in the air, as by the simulator's elastic band."""
+    """A simulated Go2 whose base is held in the air, as by the simulator's elastic band."""
 
     description: ClassVar[RobotDescription] = without_battery(on_stand.DESCRIPTION)

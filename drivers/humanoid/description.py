@@ -127,15 +127,16 @@ def _parameters(
 
 
 def parameter_space() -> ParameterSpace:
-    """Return 50 parameters: left and right joints alike, all feet alike."""
+    """Return 50 parameters: left and right joints share theirs, and so do all feet."""
     joints = {t: tuple(j for j in JOINTS if joint_type(j) == t) for t in TABLE_11}
     return _parameters({"feet": FEET}, joints, RESTITUTION)
 
 
 def paper_space() -> ParameterSpace:
-    """Return the 92 parameters of DEAL's Table 11, each joint and each of the feet's capsules for itself.
+    """Return the 92 parameters of DEAL's Table 11: each joint and each capsule of the feet has its own.
 
-    The paper searches symmetric ones independently (its A.7). Contact x 4 is read as the four capsules.
+    The paper searches symmetric parameters independently (its section A.7). We read its "Contact x 4" as the
+    four capsules.
     """
     return _parameters({name: (name,) for name in FEET}, {j: (j,) for j in JOINTS}, PAPER_RESTITUTION)
 

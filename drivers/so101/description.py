@@ -92,9 +92,10 @@ def _rows() -> list[Parameter]:
 def parameter_space() -> ParameterSpace:
     """Return 30 parameters: servo stiffness, damping, frictionloss, armature and encoder bias of each joint.
 
-    Frictionloss, damping and armature are the published model's, which call themselves guesses. At
-    shoulder_pan and wrist_roll no gravity acts. There only the ratios of these and the stiffness are well
-    determined; the links' own inertia adds little. The bias is the calibrated zero (middle of the travel)
+    Frictionloss, damping and armature start from the published model, whose authors call them guesses.
+    Gravity has no effect at shoulder_pan and wrist_roll. There the recordings determine only the ratios of
+    these and the stiffness well; the links' own inertia adds little. The bias is the calibrated zero (middle
+    of the travel)
     minus the model's.
     """
     biases = [Parameter.encoder_bias(joint, ENCODER_BIAS_RAD) for joint in JOINTS]

@@ -43,7 +43,7 @@ class CanAddress:
         """Return the address in a port. ``can0`` alone is socketcan, a path alone is slcan.
 
         Raises:
-            ConfigurationError: It means nothing.
+            ConfigurationError: The port is not valid.
             UnknownNameError: A setting after ``?`` does not exist.
         """
         place, values = take_settings(port, {_BITRATE: 1})
@@ -66,7 +66,7 @@ def take_settings(port: str, lowest: Mapping[str, int]) -> tuple[str, dict[str, 
         lowest: The settings by name, with the lowest value of each.
 
     Returns:
-        The port without them, and those that were given.
+        The port without them, and the settings that were given.
 
     Raises:
         ConfigurationError: A value is no whole number of the allowed range.

@@ -42,7 +42,7 @@ def open_can(
         fd: Descriptor of a serial adapter that a parent process opened and set up.
 
     Raises:
-        ConfigurationError: The port means nothing.
+        ConfigurationError: The port is not valid.
     """
     if CanAddress.parse(port).interface == "slcan":
         return SlcanTransport(port, clock, accept, fd=fd)
@@ -52,16 +52,16 @@ def open_can(
 class PythonCanTransport(CanTransport):
     """An adapter that python-can drives: socketcan, virtual, pcan, kvaser and others.
 
-    The adapter's receive stamp is of the wall clock. Its age against the wall clock now is subtracted from
-    our clock; a stamp that is older than ``oldest_stamp_s`` or of the future (the wall clock was set, or the
-    adapter counts from its power-on) is replaced by the time of reading. Stamps never go back.
+    The adapter stamps frames by the wall clock. The age of a stamp, by the wall clock, is subtracted from our
+    clock. A stamp that is older than ``oldest_stamp_s`` or in the future is replaced by the time of reading:
+    the wall clock was set, or the adapter counts from its power-on. Stamps never go back.
 
     Args:
         port: See :meth:`CanAddress.parse`.
         clock: Gives the stamps.
         accept: See :class:`CanTransport`; the kernel or the adapter filters where it can.
         wall_ns: The clock of the adapter's stamps [ns].
-        oldest_stamp_s: Age up to which a stamp is believed [s]: longer than a frame waits in a buffer.
+        oldest_stamp_s: Largest age of a stamp that is used [s]: longer than a frame waits in a buffer.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class PythonCanTransport(CanTransport):
                 bus.shutdown()
 
     def reopen(self) -> None:
-        """Open the bus again where it was lost or went bus-off; one that works is left alone."""
+        """Open the bus again if it was lost or went bus-off; do nothing if it works."""
         if self._bus is not None and not self._off:
             return
         fresh = self._open_bus()
@@ -98,11 +98,11 @@ class PythonCanTransport(CanTransport):
         self._bus, self._off = fresh, False
 
     def fileno(self) -> int:
-        """Return -1: python-can takes no descriptor that was inherited."""
+        """Return -1: python-can cannot use an inherited descriptor."""
         return -1
 
     def send(self, message: Message) -> None:
-        """Hand a frame to the adapter; a full transmit buffer is an error, never a wait."""
+        """Give a frame to the adapter; never waits: a full transmit buffer is an error."""
         self._check_bus()
         frame = can.Message(
             arbitration_id=int(message.channel, 16), is_extended_id=False, data=message.payload, check=True
@@ -210,7 +210,7 @@ def check_link(name: str, root: Path = Path("/sys/class/net")) -> None:
     """Refuse a CAN network interface that is not there or not up.
 
     Raises:
-        PortNotFoundError: With the command that helps.
+        PortNotFoundError: It is missing or down; the text has the command that sets it up.
     """
     if name not in can_links(root):
         at_hand = ", ".join(can_links(root)) or "none"

@@ -31,11 +31,11 @@ _SECRET, _PUBLIC = 0o600, 0o644
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
-    """What a certificate says of itself.
+    """The contents of a certificate.
 
     Attributes:
         path: Its file.
-        name: Common name, which access is granted by.
+        name: Common name, by which access is granted.
         addresses: Addresses and host names that it is valid for.
         authority: Whether it may sign others.
         issuer: Common name of the signer.
@@ -64,12 +64,12 @@ def make_authority(folder: Path, days: float, now: datetime.datetime) -> None:
     """Make an authority in a folder: ``ca.pem``, and ``ca.key``, which signs.
 
     Args:
-        folder: Made where it is not there.
+        folder: The folder; made if missing.
         days: How long it holds.
         now: The time, UTC.
 
     Raises:
-        ConfigurationError: There is one.
+        ConfigurationError: The folder has an authority already.
         MissingExtraError: cryptography is not installed.
     """
     x509 = _x509()
@@ -98,7 +98,7 @@ def sign(folder: Path, name: str, *, addresses: Iterable[str], days: float, now:
         now: The time, UTC.
 
     Raises:
-        ConfigurationError: The name or an address is none, the files are there, or there is no authority.
+        ConfigurationError: The name or an address is not valid, the files exist, or there is no authority.
         MissingExtraError: cryptography is not installed.
     """
     x509 = _x509()
@@ -137,10 +137,10 @@ def sign(folder: Path, name: str, *, addresses: Iterable[str], days: float, now:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Return what a certificate says.
+    """Return the contents of a certificate.
 
     Raises:
-        ConfigurationError: The file cannot be read, or holds none.
+        ConfigurationError: The file cannot be read, or contains no certificate.
         MissingExtraError: cryptography is not installed.
     """
     x509 = _x509()

@@ -77,7 +77,7 @@ class DdsEndpoint:
         key: Its GUID.
         topic: Topic.
         type_name: DDS name of the topic's type.
-        type_hash: Complete XTypes hash of that type in hexadecimal; "" if it tells none.
+        type_hash: Complete XTypes hash of that type in hexadecimal; "" if it is not reported.
         writes: Whether it writes the topic.
         peer: The participant that it belongs to.
     """
@@ -91,13 +91,13 @@ class DdsEndpoint:
 
     @property
     def shown_hash(self) -> str:
-        """In words: the type's minimal hash where it is the robot's, as in the vendor's headers."""
+        """Text with the type's hash: the minimal one of the vendor's headers, if it is the robot's type."""
         if self.type_hash and self.type_hash == COMPLETE.get(self.type_name):
             return f"type hash {MINIMAL[self.type_name]}, the robot's"
-        return f"complete type hash {self.type_hash}" if self.type_hash else "type hash not told"
+        return f"complete type hash {self.type_hash}" if self.type_hash else "type hash not reported"
 
     def complaint(self, type_name: str) -> str | None:
-        """Return in words why this endpoint and a type of ours do not fit, None if they do."""
+        """Return text on why this endpoint and our type do not match; None if they match."""
         role = f"{'writer' if self.writes else 'reader'} of {self.topic} ({self.peer})"
         if self.type_name != type_name:
             return f"{role}: type {self.type_name}, not {type_name}; is it another robot or another domain?"
@@ -114,12 +114,12 @@ class DdsEndpoint:
 
 @dataclass(frozen=True, slots=True)
 class DdsSurvey:
-    """What is on the domain.
+    """The participants of a domain and their endpoints.
 
     Attributes:
         peers: Other participants.
         endpoints: Their writers and readers.
-        complaints: What does not fit, in words.
+        complaints: Texts on endpoints whose types do not match ours.
     """
 
     peers: tuple[DdsPeer, ...]
@@ -128,13 +128,13 @@ class DdsSurvey:
 
 
 class Discovery:
-    """Follows the built-in topics; each look takes only what is new (tens of us if nothing is).
+    """Follows the built-in topics; each call reads only what is new (some 10 us if nothing is).
 
     Args:
         participant: Our participant of cyclonedds; it and its endpoints are left out.
 
     Attributes:
-        entities: What must be deleted at the end.
+        entities: DDS entities to delete at the end.
     """
 
     def __init__(self, participant: Any) -> None:
@@ -178,7 +178,7 @@ class Discovery:
         )
 
     def survey(self, types: Mapping[str, str]) -> DdsSurvey:
-        """Return all that is known; ``types`` says which type a topic ought to have."""
+        """Return the survey; ``types`` maps each topic to its expected type."""
         endpoints = self.endpoints()
         found = [end.complaint(types[end.topic]) for end in endpoints if end.topic in types]
         return DdsSurvey(self.peers(), endpoints, tuple(text for text in found if text))

@@ -13,11 +13,13 @@ from deal_hw.drivers.transports.interfaces import Interface
 from deal_hw.errors import ConfigurationError, MissingExtraError, TransportError
 
 _LINGER: Final = "100 ms"
-"""How long closing waits for peers that have not confirmed the last message; Cyclone's default is 1 s."""
+"""Longest wait of closing for peers that have not confirmed the last message; Cyclone's default is 1 s."""
 
 _SEEK: Final = "1 s"
-"""How often we announce ourselves. With Cyclone's default, a cable that is plugged in again works only
-later."""
+"""Time between two announcements of our participant.
+
+With Cyclone's longer default, the connection takes longer to come back after a cable was out.
+"""
 _LOG_FATAL, _LOG_ERROR, _LOG_WARNING = 1, 2, 4
 
 
@@ -53,7 +55,7 @@ def domain_xml(number: int, interface: Interface) -> str:
 def acquire_domain(number: int, interface: Interface) -> None:
     """Open a domain, or join the one that this process has open; each call needs a release.
 
-    The environment is ignored: ``CYCLONEDDS_URI``, which set-up scripts of ROS set, often names another
+    Environment variables are ignored: scripts of ROS set ``CYCLONEDDS_URI``, which often names another
     interface.
 
     Raises:
@@ -99,7 +101,7 @@ def delete_entities(entities: Sequence[Any]) -> None:
 
 @contextmanager
 def dds_errors(what: str) -> Iterator[None]:
-    """Turn Cyclone's errors into ours."""
+    """Convert Cyclone's errors to ours."""
     from cyclonedds.core import DDSException
 
     try:

@@ -25,9 +25,9 @@ _SLICE_NS: Final = 100_000_000
 class ArrivalClock:
     """Estimates when messages arrived, which may be much earlier than they are read.
 
-    Cyclone tells when a message was written, by the writer's clock. A wait that a message ended tells how
-    that clock stands to ours, transit included; every other message tells that it cannot have arrived after
-    now. The estimate follows a clock that jumps, and never lets messages of a topic overtake each other.
+    Cyclone reports when a message was written, by the writer's clock. If a message ends a wait, it arrived
+    now: this gives the offset of the two clocks, transit included. Any other message arrived now or earlier,
+    which bounds the offset. The estimate follows a clock that jumps. Stamps of a topic never go back.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class ArrivalClock:
         Args:
             topics: For each topic its messages in order: whose clock, and its time of writing [ns].
             now_ns: Our clock [ns].
-            fresh: Whether there was no message until just now.
+            fresh: Whether the readers were empty until just now.
         """
         bounds: dict[Hashable, int] = {}
         for owner, written_ns in chain.from_iterable(topics):
@@ -68,7 +68,7 @@ class DdsSession:
     Attributes:
         writers: Topic -> handle for ``write``.
         write: Writes a payload to a handle and returns the C library's code at once.
-        discovery: Who else is there.
+        discovery: Other participants of the domain.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class DdsSession:
         self._entities.clear()
 
     def next_message(self, timeout_ns: int) -> Message | None:
-        """Return the message that arrived first, None if none comes in time [ns]."""
+        """Return the message that arrived first; None if none arrives before the timeout [ns]."""
         if not self._queue:
             self._gather(fresh=False)
         deadline_ns = time.monotonic_ns() + timeout_ns
@@ -119,7 +119,7 @@ class DdsSession:
             raise TransportError(f"waiting for DDS messages failed: {error}") from error
 
     def _gather(self, fresh: bool) -> None:
-        """Take all that the readers hold; ``fresh`` says that they were empty until just now."""
+        """Take all messages of the readers; ``fresh``: the readers were empty until just now."""
         now_ns = self._clock.now_ns()
         taken = [(topic, self._take_all(topic, reader)) for topic, reader in self._readers]
         if not any(samples for _, samples in taken):
@@ -181,7 +181,7 @@ class DdsSession:
                 reader = self._keep(DataReader(participant, topic, qos=reader_qos))
                 conditions.append(self._keep(ReadCondition(reader, self._mask)))
                 self._readers.append((name, reader))
-        # Made last, so deleted first: it detaches what it holds.
+        # Made last, so deleted first: it detaches its conditions.
         self._waitset = self._keep(WaitSet(participant))
         for condition in conditions:
             self._waitset.attach(condition)

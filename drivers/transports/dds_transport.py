@@ -1,4 +1,4 @@
-"""Topics over DDS (Cyclone DDS), as Unitree's robots speak it."""
+"""Topics over DDS (Cyclone DDS), as Unitree's robots use it."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ class DdsTransport(TopicTransport):
     """A participant of a DDS domain.
 
     The quality of service is that of Unitree's SDKs (Cyclone's defaults: writers Reliable, readers
-    BestEffort), which matches whatever the robot uses, but readers keep more than one message and writers
-    never wait.
+    BestEffort). It matches every setting of the robot. Two things differ: readers keep more than one message,
+    and writers never wait.
 
-    There is no thread of ours: Cyclone's own threads receive, and :meth:`receive` waits without the GIL.
+    This class starts no thread. Cyclone's own threads receive, and :meth:`receive` waits without the GIL.
     Those threads inherit the scheduling of the thread that opens the transport, so set the real-time
     priority before. DDS does not survive a fork; a child process opens a transport of its own.
 
     Args:
         port: Network interface, by name or IPv4 address; "lo" for this machine only.
         clock: Gives the stamps.
-        options: The domain counts.
+        options: Only the domain is used.
     """
 
     def __init__(self, port: str, clock: Clock, options: WireOptions | None = None) -> None:
@@ -50,7 +50,7 @@ class DdsTransport(TopicTransport):
         self._live: DdsSession | None = None
 
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        """Say which topics will be used; calls add up, and count from the next ``open``."""
+        """Declare the topics to use, from the next ``open`` on; calls add up."""
         for topic in (*publish, *subscribe):
             if topic not in TYPES:
                 raise UnknownNameError("DDS topic", topic, TYPES)
@@ -61,7 +61,7 @@ class DdsTransport(TopicTransport):
         """Join the domain.
 
         Raises:
-            PortNotFoundError: There is no such interface; the text lists those there are.
+            PortNotFoundError: There is no such interface; the text lists the existing ones.
             MissingExtraError: cyclonedds is not installed.
             VersionMismatchError: Our types are not the robot's; joining could crash its DDS process.
             ConfigurationError: This process has the domain open on another interface.
@@ -78,7 +78,7 @@ class DdsTransport(TopicTransport):
                 raise
 
     def close(self) -> None:
-        """Leave the domain; peers hear of it at once."""
+        """Leave the domain; peers are told at once."""
         live, self._live = self._live, None
         if live is not None:
             live.close()
@@ -121,7 +121,7 @@ class DdsTransport(TopicTransport):
         return tuple(sorted(str(peer) for peer in peers if not peer.is_ghost()))
 
     def survey(self) -> DdsSurvey:
-        """Return who else is on the domain, with which types, and what does not fit."""
+        """Return the other participants of the domain, their types, and which of these do not match."""
         return self._opened().discovery.survey(TYPES)
 
     def _opened(self) -> DdsSession:

@@ -1,13 +1,13 @@
-"""DDS types of the Go2, and the proof that they are the robot's own.
+"""DDS types of the Go2, and a check that they equal the robot's.
 
-XTypes gives each type a hash, and peers compare hashes when they meet. Three reasons to look before opening a
-domain:
+XTypes gives each type a hash, and peers compare the hashes during discovery. There are three reasons to check
+them before a domain is opened:
 
 - Unitree's IDL says ``octet``. cyclonedds-python 11 turns a field declared ``types.uint8`` into another kind
-  (TK_UINT8 instead of TK_BYTE). The hash then differs, the peer asks for the type's description, and
-  Cyclone DDS 0.10.2, which is what the robot runs, dies of a segmentation fault when it reads that kind
+  (TK_UINT8 instead of TK_BYTE). The hash then differs, and the peer asks for the type's description. The
+  robot runs Cyclone DDS 0.10.2, which crashes with a segmentation fault when it reads that kind
   (eclipse-cyclonedds/cyclonedds#1554). So octets are declared ``types.byte`` here.
-- A field in the wrong order gives another hash and a silent wire.
+- A field in the wrong order gives another hash; then no messages are exchanged, without an error.
 - The Python binding computes the hashes, so another version of it could change them.
 
 :data:`MINIMAL` are the hashes in the headers of unitree_sdk2 @ 21d0a3b. For the IDL of the test peer
@@ -145,7 +145,7 @@ STRUCTS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         },
     }
 )
-"""Struct -> field -> type in the words of IDL; a struct stands after those it holds."""
+"""Struct -> field -> type, named as in IDL; a struct comes after those that it contains."""
 
 MINIMAL: Final[Mapping[str, str]] = MappingProxyType(
     {

@@ -1,4 +1,4 @@
-"""Network interfaces of this machine, for who must name one."""
+"""Network interfaces of this machine, for options and messages that name one."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Interface:
         name: Such as ``eth0``.
         addresses: IPv4 addresses.
         up: Whether it is switched on.
-        carrier: Whether the cable is in and the other side is awake.
-        multicast: Whether it says that it can multicast; ``lo`` usually says no, and can.
+        carrier: Whether the cable is plugged in and the other side is on.
+        multicast: Whether it reports multicast; ``lo`` usually does not, although it can.
         loopback: Whether it reaches this machine only.
     """
 
@@ -51,7 +51,7 @@ def list_interfaces() -> tuple[Interface, ...]:
         addresses = _addresses(probe)
         found = []
         for _, name in socket.if_nameindex():
-            with contextlib.suppress(OSError):  # It vanished since.
+            with contextlib.suppress(OSError):  # It vanished after it was listed.
                 found.append(_interface(probe, name, addresses.get(name, ())))
     return tuple(found)
 

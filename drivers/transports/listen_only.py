@@ -1,4 +1,4 @@
-"""A path that only listens: what a dry run is given, so that nothing in it holds a way to send."""
+"""Transports that only listen. A dry run uses these, so that no part of it can send."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deal_hw.transport import Message, TopicTransport, Transport, TransportWrapp
 
 
 class ListenOnly(TransportWrapper):
-    """Wraps a transport; whoever sends through it gets an error, and nothing goes out.
+    """Wraps a transport; sending through it raises an error, and nothing is sent.
 
     Args:
         inner: The transport that could send.
@@ -19,7 +19,7 @@ class ListenOnly(TransportWrapper):
     can_send = False
 
     def send(self, message: Message) -> NoReturn:
-        """Refuse.
+        """Refuse to send.
 
         Raises:
             SafetyError: Always.
@@ -28,7 +28,7 @@ class ListenOnly(TransportWrapper):
 
 
 class ListenOnlyTopics(ListenOnly, TopicTransport):
-    """The same for topics: no publisher is declared, so that peers see none either.
+    """Wraps a transport of topics; no publisher is declared, so peers do not see one either.
 
     Args:
         inner: The transport that could send.
@@ -39,7 +39,7 @@ class ListenOnlyTopics(ListenOnly, TopicTransport):
         self._topics = inner
 
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        """Say which topics will be heard; those to publish are left out."""
+        """Declare the topics to receive; those to publish are left out."""
         self._topics.declare(subscribe=subscribe)
 
     def writers(self, topic: str) -> tuple[str, ...]:

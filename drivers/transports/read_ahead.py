@@ -1,4 +1,4 @@
-"""A thread that reads a tty, so that who waits for a deadline never waits inside the tty layer."""
+"""A thread that reads a tty, so that a thread with deadlines never waits inside the tty layer."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _READ_SIZE = 4096
 
 
 class ReadAhead:
-    """Reads a descriptor in a thread of its own and keeps what came, with its stamps.
+    """Reads a descriptor in a thread of its own and keeps the bytes with their stamps.
 
     Linux hands received bytes to a tty through a kernel worker of ordinary priority, and ``select`` and
-    ``read`` on a tty wait for that worker. On a busy machine that is tens of milliseconds, whatever the
-    priority of the process that reads. Here only this thread waits; who takes from the queue wakes up at the
-    time it asked for.
+    ``read`` on a tty wait for that worker. On a busy machine this takes tens of milliseconds, at any priority
+    of the reading process. Here only this thread waits for it. A thread that waits for the queue wakes up at
+    its own deadline.
 
     Args:
         fd: The descriptor; stays open.
@@ -34,18 +34,18 @@ class ReadAhead:
         self._thread.start()
 
     def take(self, timeout_s: float) -> tuple[int, bytes | OSError] | None:
-        """Return what came next, stamp [ns] and bytes (none: hung up) or the error; None after the time."""
+        """Return the next stamp [ns] and bytes (empty: hung up), or the error; None after the timeout."""
         try:
             arrived = self._arrived.take(timeout_s)
         except TimeoutError:
             return None
         if _is_last(arrived[1]):
-            # The thread has ended: whoever asks again shall hear it again.
+            # The thread has ended: the next call must return the same error.
             self._arrived.put(arrived)
         return arrived
 
     def stop(self) -> None:
-        """End the thread; what came and was not taken is lost."""
+        """End the thread; bytes that were not taken are lost."""
         with contextlib.suppress(OSError):
             os.write(self._wake_write, b"x")
         self._thread.join()

@@ -93,7 +93,7 @@ class SerialTransport(Transport):
                 os.close(fd)
 
     def reopen(self) -> None:
-        """Open the port by its path if the device vanished, such as after a cable was pulled and put back.
+        """Open the port again by its path if the device vanished, as when a cable was pulled and put back.
 
         The new port is opened before the dead one is closed, so a failed try loses nothing. A port that still
         works is kept, because its lock is this program's own.
@@ -122,7 +122,7 @@ class SerialTransport(Transport):
         if written < len(message.payload):
             raise TransportTimeoutError(
                 f"{self.port}: took {written} of {len(message.payload)} bytes; "
-                "the device does not drain its input"
+                "the device does not read its input"
             )
 
     def receive(self, timeout_s: float) -> Message:

@@ -1,9 +1,9 @@
 """CAN frames over a serial adapter that speaks slcan (Lawicel): CANable, CANtact, USBtin, Arduino bridges.
 
-python-can has an slcan bus, too. It reads byte by byte, hides the adapter's refusals, and never reads again
-after one byte above 0x7F. It may wait in a write. It neither locks the port nor takes one that a parent
-process opened. In a process with deadlines all this matters, so this module reads the ASCII lines itself,
-over our serial port.
+python-can has an slcan bus, too, but a process with deadlines cannot use it. It reads byte by byte, hides the
+adapter's refusals, and stops reading after one byte above 0x7F. It may wait in a write. It neither locks the
+port nor uses one that a parent process opened. So this module reads the ASCII lines itself, over our serial
+port.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ class SlcanTransport(CanTransport):
 
     def _take_refusal(self, now_ns: int) -> None:
         self.refused += 1
-        self._report("it refuses to send")
+        self._report("it refuses to send a frame")
         if now_ns - self._asked_ns > _SILENCE_NS:
             self._asked_ns = now_ns
             with contextlib.suppress(ConnectionError):

@@ -43,7 +43,7 @@ class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
         return ()
 
     def send(self, message: Message) -> None:
-        """Hand a message to the device; its next tick handles it.
+        """Give a message to the device; its next tick handles it.
 
         Raises:
             ConfigurationError: The topic was not declared.

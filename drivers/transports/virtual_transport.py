@@ -24,7 +24,7 @@ class VirtualTransport(VirtualWire[DeviceCore]):
     """A virtual wire that carries a stream of bytes."""
 
     def send(self, message: Message) -> None:
-        """Hand bytes to the device; its next tick handles them."""
+        """Give bytes to the device; its next tick handles them."""
         self._check()
         self._catch_up()
         self.device.receive(message.payload)

@@ -11,7 +11,7 @@ from deal_hw.errors import ConfigurationError
 def access_settings(
     controllers: Sequence[str], observers: Sequence[str], *, write: Sequence[str], read: Sequence[str]
 ) -> dict[str, Any]:
-    """Return settings of a session that listens; a name that is not listed may do nothing.
+    """Return settings of a session that listens; a certificate whose name is not listed has no access.
 
     Args:
         controllers: Common names of certificates that may write and read.

@@ -28,10 +28,10 @@ _NOT_YET_VALID, _EXPIRED = 9, 10
 _FLIGHTS: Final = 4
 """Most messages in both directions of a handshake."""
 _ALERTS: Final = {
-    "CERTIFICATE_REQUIRED": "it wants a certificate of ours: give --certificate and --key",
+    "CERTIFICATE_REQUIRED": "it requires a certificate of ours: give --certificate and --key",
     "CERTIFICATE_EXPIRED": (
         "it finds our certificate expired, or not valid yet: is the other computer's clock right? "
-        "`deal-hw keys show DIR` tells how long ours holds"
+        "`deal-hw keys show DIR` shows how long ours is valid"
     ),
     "UNKNOWN_CA": (
         "it does not know the authority that signed our certificate: both sides need the same ca.pem"
@@ -123,7 +123,7 @@ def _check_files(options: WireOptions) -> None:
 
 
 def own_certificate_trouble(options: WireOptions) -> tuple[int, str]:
-    """Return OpenSSL's code and words for the fault of our certificate; 0 and "" for none.
+    """Return OpenSSL's code and text for a fault of our certificate; 0 and "" for none.
 
     The check is a handshake with ourselves, in memory, because a peer's refusal would only close the
     connection.
@@ -149,10 +149,10 @@ def own_certificate_trouble(options: WireOptions) -> tuple[int, str]:
 
 
 def tls_context(options: WireOptions) -> ssl.SSLContext:
-    """Return a context from the files, which checks that they can be read and fit together.
+    """Return a TLS context from the files, after a check that they can be read and match.
 
     Raises:
-        ConfigurationError: They cannot, or do not.
+        ConfigurationError: They cannot be read, or do not match.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     for path in (options.ca, options.certificate, options.key):
@@ -271,13 +271,13 @@ def _probe(endpoint: Endpoint, timeout_s: float) -> PortNotFoundError | Transpor
 
 
 def why_no_session(endpoints: Sequence[Endpoint], options: WireOptions) -> str:
-    """Return in words why reachable end points give no session."""
+    """Return text on why reachable end points give no session."""
     for endpoint in endpoints:
         if endpoint.protocol == "tls":
             return _tls_trouble(endpoint, options)
     return (
-        "something listens there, but it is no Zenoh, or it hangs, or it speaks another protocol "
-        "(tls/ or tcp/)"
+        "something listens there, but it is not Zenoh, or it hangs, or it uses the "
+        "other protocol of tls/ and tcp/"
     )
 
 

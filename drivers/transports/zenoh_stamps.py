@@ -71,7 +71,7 @@ def read_echo(attachment: bytes) -> Echo:
     """Return the echo in a client's attachment.
 
     Raises:
-        FrameError: It is something else, or nothing.
+        FrameError: It is something else, or empty.
     """
     if len(attachment) == _ECHO_BYTES.size:
         version, kind, _, stream, sequence, session, time_ns = _ECHO_BYTES.unpack(attachment)

@@ -66,7 +66,7 @@ def test_a_fitting_endpoint_gives_no_complaint() -> None:
     [
         (endpoint(), f"type hash {MINIMAL[NAME]}, the robot's"),
         (endpoint(type_hash="00" * 14), f"complete type hash {'00' * 14}"),
-        (endpoint(type_hash=""), "type hash not told"),
+        (endpoint(type_hash=""), "type hash not reported"),
     ],
 )
 def test_the_hash_shown_is_that_of_the_docs_and_the_headers(end: DdsEndpoint, shown: str) -> None:

@@ -448,7 +448,7 @@ def test_two_servos_with_one_id_are_told() -> None:
     third.put(PRESENT_POSITION, 1234)
     wire.device.servos.append(third)
     third.put(STATUS_RETURN_LEVEL, 1)
-    with pytest.raises(WrongDeviceError, match="answers of servo 1 are corrupt again and again"):
+    with pytest.raises(WrongDeviceError, match="answers of servo 1 are corrupt at every attempt"):
         wire.robot.connect()
 
 

@@ -127,7 +127,7 @@ def test_a_mode_that_does_not_let_go_is_an_error() -> None:
     wire = FakeBench()
     wire.device.stubborn = True
     wire.robot.connect()
-    with pytest.raises(TransportTimeoutError, match="'normal' did not let go"):
+    with pytest.raises(TransportTimeoutError, match="'normal' did not release"):
         wire.robot.home(6.0)
 
 

@@ -50,7 +50,7 @@ _WIZARD = "with Dynamixel Wizard 2.0 (page 'Dynamixel servos' of the documentati
 
 @dataclass(frozen=True, slots=True)
 class ServoInfo:
-    """What a servo said of itself.
+    """What a servo reports about itself.
 
     Attributes:
         id: Its id.
@@ -67,7 +67,7 @@ class ServoInfo:
 
 @dataclass(frozen=True, slots=True)
 class DynamixelInfo:
-    """What was found on the bus.
+    """The two servos that were found on the bus.
 
     Attributes:
         cart: The servo on the belt.
@@ -121,7 +121,8 @@ class Examination:
             self._check_model(servo, answers[servo])
         infos = {}
         for servo, answer in answers.items():
-            # Checked before any write, since writes without an answer look lost.
+            # Checked before any write: a servo with another level does not answer writes, and these would
+            # look lost.
             level = self._read(servo, STATUS_RETURN_LEVEL)
             if level != _ALL_STATUS:
                 raise self._wrong(servo, STATUS_RETURN_LEVEL, level, str(_ALL_STATUS))
@@ -239,7 +240,7 @@ class Examination:
             return self._retry(question)
         except FrameError as error:
             raise WrongDeviceError(
-                f"{self._where}: the answers of servo {servo} are corrupt again and again: two servos have "
+                f"{self._where}: the answers of servo {servo} are corrupt at every attempt: two servos have "
                 "that id, another program uses the port, or the cable is bad. Connect one servo alone and "
                 "try again"
             ) from error

@@ -68,13 +68,13 @@ class Homing:
         if abs(way_m - s.rail_m) > s.rail_tolerance_m:
             raise SafetyError(
                 f"cartpole: homing found {way_m:.3f} m between the end stops, but the settings have "
-                f"{s.rail_m:g} m: check that nothing blocks the cart and that the belt does not slip, then "
-                "metres_per_revolution and rail_m"
+                f"{s.rail_m:g} m: check that nothing blocks the cart and that the belt does not "
+                "slip; then correct metres_per_revolution or rail_m"
             )
         return round((ends[0] + ends[1]) / 2)
 
     def _seek_stop(self, direction: int) -> int:
-        """Move the cart until it stands; return the position there."""
+        """Move the cart until it stops; return its position there."""
         beyond = round(direction * (self._settings.rail_m + 0.2) / abs(self._settings.metres_per_pulse))
         start = self._look()[0].present_position
         end = self._move(start + beyond)
@@ -152,8 +152,8 @@ class Homing:
         finally:
             self._servos.light(False)
 
-    def _look(self, missing: str = "the cart was still on its way") -> tuple[Block, Block]:
-        """Return both blocks after a while; refuse to go on where a servo reports an error."""
+    def _look(self, missing: str = "the cart was still moving") -> tuple[Block, Block]:
+        """Wait for one period, then return both register blocks; raise if a servo reports an error."""
         self._clock.sleep_until_ns(self._clock.now_ns() + _PERIOD_NS)
         if self._clock.now_ns() >= self._deadline_ns:
             raise TransportTimeoutError(f"cartpole: homing did not finish in time: {missing}")

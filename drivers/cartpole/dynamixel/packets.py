@@ -1,4 +1,4 @@
-"""Protocol 2.0 from the servos' side: instruction packets in, status packets out.
+"""Protocol 2.0 from the servos' side: decodes instruction packets and encodes status packets.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". The driver uses ROBOTIS' SDK instead, so that the two
 sides check each other.
@@ -21,7 +21,7 @@ _LEAST_LENGTH = 3
 
 
 class Instruction(enum.IntEnum):
-    """What a packet asks for."""
+    """Instruction of a packet."""
 
     PING = 0x01
     READ = 0x02
@@ -39,7 +39,7 @@ class Instruction(enum.IntEnum):
 
 
 class Error(enum.IntEnum):
-    """Why a servo did not do as it was told."""
+    """Reason why a servo refused an instruction."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -56,7 +56,7 @@ ALERT: Final = 0x80
 
 
 class Packet(NamedTuple):
-    """An instruction packet: to whom, what, with what; and its bytes on the wire."""
+    """An instruction packet: servo id, instruction, parameters, and its size on the wire [bytes]."""
 
     servo: int
     instruction: int
@@ -89,12 +89,12 @@ def status(servo: int, error: int, data: bytes = b"") -> bytes:
 def fast_status(parts: Sequence[tuple[int, int, bytes]], expected: int) -> bytes:
     """Return the one packet in which several servos answer a Fast Sync or Bulk Read.
 
-    Each servo appends its error, id, data and the CRC of all before; nothing is stuffed. Where one that was
-    asked is absent the packet ends before it, and lacks what its length says.
+    Each servo appends its error, id, data and the CRC of all bytes before. The packet has no stuffing bytes.
+    If a requested servo is absent, the packet ends before its part and is shorter than its length field says.
 
     Args:
         parts: Id, error and data of each servo that answers, in order.
-        expected: Bytes of data of all that were asked, four for each included.
+        expected: Bytes of all requested parts: data, and four more bytes for each servo.
     """
     out = HEADER + bytes([BROADCAST]) + (1 + expected).to_bytes(2, "little") + bytes([_STATUS])
     for servo, error, data in parts:
@@ -115,14 +115,14 @@ class PacketParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take bytes; yield the sound packets that they complete."""
+        """Take bytes; yield the valid packets that they complete."""
         self._buffer += data
         while (found := self._next()) is not None:
             if found.size:
                 yield found
 
     def _next(self) -> Packet | None:
-        """Return the next packet, one of size 0 where a broken one was left out, None where none is whole."""
+        """Return the next packet, one of size 0 for a skipped corrupt packet, None if none is complete."""
         buffer = self._buffer
         start = buffer.find(HEADER)
         if start < 0:
@@ -137,7 +137,8 @@ class PacketParser:
             return self._broken()
         size = 7 + length
         if len(buffer) < size:
-            # Stuffing keeps headers out of bodies: one here begins the next packet; this one was cut short.
+            # Stuffing keeps headers out of bodies. So a header here begins the next packet, and this packet
+            # is incomplete.
             return self._broken() if buffer.find(HEADER, len(HEADER)) > 0 else None
         whole = bytes(buffer[:size])
         if crc(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
@@ -149,7 +150,7 @@ class PacketParser:
         return Packet(whole[4], body[0], body[1:], size)
 
     def _broken(self) -> Packet:
-        """Skip a header that begins no packet: a sound one may begin inside what was taken for it."""
+        """Skip only the header of a corrupt packet, because a valid packet may begin inside it."""
         self.errors += 1
         del self._buffer[: len(HEADER)]
         return Packet(0, 0, b"", 0)

@@ -67,8 +67,8 @@ class DynamixelCartpole(Robot):
     last request is timed so that its answer arrives when the caller's time is over. So request, answer and
     command do not collide on the half-duplex wire, and the policy gets a fresh state. A state needs both
     servos. Every sample holds the belt servo's goals: a command counts as in force once the servo shows it.
-    The command's message also requests the servo's clock. This computer's own times have errors of scheduler
-    and adapter, which a calibration would take for motion.
+    The command's message also requests the servo's clock. This computer's own time stamps contain delays of
+    its scheduler and of the adapter. A calibration would read these as motion.
 
     There are two watchdogs. The belt servo's own (Bus Watchdog) stops it when this computer falls silent. The
     driver switches the torque off when states are read but no commands are sent.
@@ -250,7 +250,8 @@ class DynamixelCartpole(Robot):
     def _ask(self) -> None:
         now_ns = self._clock.now_ns()
         if self._armed and now_ns - self._alive_ns > round(self.watchdog_s * 1e9):
-            # Our own requests feed the servo's watchdog, so this check stops a caller that only reads states.
+            # Our own requests keep the servo's watchdog quiet. So this check stops the motor if a caller only
+            # reads states.
             self.passive()
             self._watchdog = True
         self._asked = self._servos
@@ -357,7 +358,7 @@ class DynamixelCartpole(Robot):
             if self._ticks[servo].restarted:
                 self._lose_position(
                     f"servo {servo} restarted: its torque is off and its position is lost. Check the supply "
-                    "(a motor that starts may pull it down) and start again, which homes anew"
+                    "(a motor that starts may pull it down). Start again; the servos are then homed again"
                 )
         if self._armed and not blocks[self._servos[0]].torque_enable:
             self._lose_position(
@@ -437,7 +438,7 @@ class DynamixelCartpole(Robot):
 
     @property
     def fault(self) -> str:
-        """A servo's fault that forbids to continue; "" for none. Latched until armed again."""
+        """Fault of a servo after which the host must not continue; "" for none. Latched until armed again."""
         return self._fault
 
     @property

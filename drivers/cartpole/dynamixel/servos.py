@@ -52,7 +52,7 @@ class Servos:
 
     @property
     def stamp_ns(self) -> int:
-        """When the newest bytes came [ns]."""
+        """Arrival time of the newest bytes [ns]."""
         return self._bus.stamp_ns
 
     def ask(self, servos: Sequence[int]) -> int:
@@ -82,7 +82,7 @@ class Servos:
                         f"cartpole: {error}; check that both servos are powered, and the cable"
                     ) from error
             else:
-                raise TransportTimeoutError("cartpole: the servos' answer did not come in time")
+                raise TransportTimeoutError("cartpole: the servos' answer did not arrive in time")
 
     def take_tick(self, deadline_ns: int) -> int | None:
         """Return the belt servo's clock at the reception of a goal [ms]; as :meth:`Bus.take`."""
@@ -118,7 +118,7 @@ class Servos:
 
         Raises:
             TransportTimeoutError: It does not show them before the deadline.
-            ProtocolError: It refuses.
+            ProtocolError: It refuses a value.
         """
         cart = self._settings.cart_id
         while True:
@@ -141,12 +141,12 @@ class Servos:
                     raise
 
     def torque_off(self) -> None:
-        """Switch the torque of both off; waits for nothing."""
+        """Switch the torque of both servos off; never waits."""
         off = dict.fromkeys((self._settings.cart_id, self._settings.pole_id), b"\0")
         self._bus.post([(TORQUE_ENABLE.address, off)])
 
     def light(self, on: bool) -> None:
-        """Switch the pole servo's LED; waits for nothing."""
+        """Switch the pole servo's LED; never waits."""
         self._bus.post([(LED.address, {self._settings.pole_id: bytes([on])})])
 
 

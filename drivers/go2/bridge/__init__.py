@@ -1,1 +1,1 @@
-"""What runs on the robot's own computer: DDS on its side, Zenoh on the network's, and a judge between."""
+"""The bridge on the robot's own computer: DDS to the robot, Zenoh to the network, a check of each command."""

@@ -1,4 +1,4 @@
-"""Who may command the robot through the bridge, and when the bridge damps it. Pure: time is an argument.
+"""Who may command the robot through the bridge, and when the bridge damps it. It does no I/O.
 
     IDLE ----a controller's damping----> CONTROLLED ----silence----> DAMPING ----a controller's damping--> ...
       ▲                                      │                          │
@@ -76,10 +76,10 @@ class Admission:
         self._age_ns = round(config.command_age_s * 1e9)
         self._silence_ns = self._age_ns - round(config.margin_s * 1e9)
         self._release_ns = round(config.release_s * 1e9)
-        self.control, self.reason = Control.IDLE, "nobody has taken the robot over yet"
+        self.control, self.reason = Control.IDLE, "nobody controls the robot yet"
         self.admitted = 0
         self.refused: Counter[str] = Counter()
-        self.last_refusal = self._refusal = ""  # Of all; since the last command that passed.
+        self.last_refusal = self._refusal = ""  # The last of all, and the last since an admitted command.
         self._holder: int | None = None
         self._stiff = False
         self._last_ns = 0

@@ -1,4 +1,4 @@
-"""The bridge: two transports, a thread that passes states on, and a loop that judges and damps."""
+"""The bridge: two transports, a thread that passes states on, and a loop that checks commands and damps."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ _ASK_S: Final = 2.0
 _RECEIVE_S: Final = 0.1
 _JOIN_S: Final = 2.0
 _MOST_MESSAGES: Final = 64
-"""Messages judged before each check for silence; a flood of messages must not delay the damping."""
+"""Messages checked before each check for silence; a flood of messages must not delay the damping."""
 
 
 class Go2Bridge:
     """Carries a Go2's messages between its own network and another, and keeps it safe.
 
     Attributes:
-        admission: The judge; only the thread that steps changes it.
+        admission: Checks the commands; only the thread that calls :meth:`step` changes it.
         counts: Messages that passed, by topic.
         unsent: Messages that a transport did not take.
         latest_ns: Largest delay of a check for silence [ns].
@@ -136,14 +136,15 @@ class Go2Bridge:
         """Serve until the next check for silence is due, and check.
 
         Raises:
-            DealHwError: The robot's side broke down.
+            DealHwError: The transport to the robot failed.
         """
         while (left_ns := self._due_ns - self._clock.now_ns()) > 0:
             with contextlib.suppress(TransportTimeoutError):
                 self._take(self._network.receive(left_ns * 1e-9))
         if self._failure is not None:
             raise self._failure
-        # Even when late, received messages are judged first: they show that the controller is not silent.
+        # Received messages are always checked first, even when late: they show that the controller is not
+        # silent.
         with contextlib.suppress(TransportTimeoutError):
             for _ in range(_MOST_MESSAGES):
                 self._take(self._network.receive(0.0))
@@ -235,7 +236,7 @@ class Go2Bridge:
     # At the beginning.
 
     def _ask_who_moves_it(self) -> None:
-        """Damp the robot at once if nobody controls it, since an earlier bridge may have died during a walk.
+        """Damp the robot at once if nobody controls it; an earlier bridge may have died during a walk.
 
         A robot whose own controller is released holds its last command for ever. If its own controller is
         active, or another program commands it, the bridge sends nothing.

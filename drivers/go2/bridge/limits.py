@@ -27,7 +27,7 @@ def is_damping(command: LowCommand) -> bool:
 
 
 class CommandLimits:
-    """Judges commands one by one.
+    """Checks commands one by one.
 
     Args:
         description: The robot, with its limits.
@@ -70,7 +70,8 @@ class CommandLimits:
                 f"motor modes {command.mode.tolist()}; allowed are {MODE_OFF} (off) and {MODE_SERVO} (servo)"
             )
         kp, kd = command.stiffness, command.damping
-        # Without a gain a target has no effect; the vendor's "stop" values are far outside any range.
+        # Without a gain a target has no effect. It is not checked: the vendor's "stop" values are outside any
+        # range.
         target = np.where(kp > 0.0, command.position, 0.5 * (self._low + self._high))
         none = np.zeros_like(kp)
         for name, value, low, high, unit in (
@@ -81,7 +82,7 @@ class CommandLimits:
         ):
             if text := self._outside(name, value, low, high, unit):
                 return text
-        # A brake alone only removes energy, at any joint speed.
+        # Damping alone only removes energy, at any joint speed.
         if is_damping(command):
             return ""
         if frame is None:
@@ -91,7 +92,7 @@ class CommandLimits:
         return self._outside("torque now", torque, -self._predicted, self._predicted, "N·m")
 
     def _outside(self, name: str, value: FloatArray, low: FloatArray, high: FloatArray, unit: str) -> str:
-        # Written so that a measured NaN lies outside, too.
+        # Written so that a measured NaN counts as outside, too.
         wrong = ~((value >= low) & (value <= high))
         if not wrong.any():
             return ""

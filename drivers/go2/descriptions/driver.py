@@ -99,7 +99,7 @@ DRIVER: Final[RobotDescription] = dataclasses.replace(
             + "; measured positions may be 0.15 rad outside: lying calves at -2.81 rad in "
             "motor_state_data_example_sit.py of hanlinniu/unitree_sdk2_python @ 4becdb1"
         ),
-        "target_step": "the way of a hip or thigh at its top speed, 30.1 rad/s, in a control period of 20 ms",
+        "target_step": "motion of a hip or thigh at its top speed, 30.1 rad/s, in a control period of 20 ms",
         "silence_s": "assumed: ten control periods; the robot holds its last target meanwhile",
         **LEG_SOURCES,
     },

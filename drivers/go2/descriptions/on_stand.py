@@ -1,4 +1,4 @@
-"""The real Go2 with its base on a stand: targets at 50 Hz, states at 500 Hz, no floor.
+"""The real Go2 with its base on a stand: targets at 50 Hz, states at 500 Hz, feet in the air.
 
 The stand must hold the base level and still, because the model's base does not move. ``go2_suspended`` is
 the 200 Hz recording of iit-DLSLab.
@@ -21,9 +21,9 @@ from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 
 MOTOR_HZ: Final = 1000.0
 LEAST_SHARE: Final = 0.1
-"""Least share of the motor in the damping on the stand."""
+"""Smallest share of the motor in the damping measured on the stand."""
 WIDEST: Final = 10.0
-"""Draws of the stand's result are not cut off within this factor of the model's own values."""
+"""Draws of a stand's result are kept if they lie within this factor of the model's own values."""
 REACH_RAD: Final[Mapping[str, float]] = {"hip": 0.3, "thigh": 0.4, "calf": 0.5}
 """Largest distance of excitations from the standing pose; all legs then stay 3 cm apart."""
 

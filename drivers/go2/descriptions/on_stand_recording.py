@@ -70,8 +70,8 @@ def parameter_space() -> ParameterSpace:
     """Return 48 parameters: stiffness, damping, frictionloss and armature of each joint.
 
     Damping is the damping at the joint for kd = 1.5: the sum of the motor's and of the joint's viscous
-    friction (0.6 in the source's model). No recording determines the two alone. Delay and armature are
-    confounded in this recording: read both with the report's correlation.
+    friction (0.6 in the source's model). No recording determines the two alone. This recording hardly
+    separates delay and armature: read both with the report's correlation.
     """
     return _space(_EACH, bias=False)
 

@@ -1,4 +1,4 @@
-"""Commands that an emulated Go2 received, with times: a test computes the time from a fault to damping."""
+"""Commands that an emulated Go2 received, with times. Tests compute the time from a fault to damping."""
 
 from __future__ import annotations
 

@@ -21,9 +21,9 @@ class Go2Emulator:
     """Runs a device core behind a transport; device time follows the clock, tick by tick.
 
     Attributes:
-        slips: Times that this process was stalled and device time stood still.
+        slips: How often this process stalled and device time stood still.
         late: Ticks that began more than a millisecond late.
-        latest_ns: The latest of them [ns].
+        latest_ns: Largest delay of them [ns].
         unsent: Messages that the transport did not take.
 
     Args:

@@ -29,7 +29,7 @@ MODE_OFF: Final = 0x00
 MODE_SERVO: Final = 0x01
 POSITION_STOP: Final = 2.146e9
 VELOCITY_STOP: Final = 16000.0
-"""Stop values of the vendor's examples for motors without a command, with kp = kd = 0."""
+"""Position and velocity in the vendor's examples for motors without a command; kp = kd = 0 there."""
 _LARGEST: Final = 1e30
 """Bound on the sum of squares of a command's numbers; stop values have 5.5e19."""
 

@@ -27,7 +27,7 @@ class Refusals:
 
     Attributes:
         count: Number of refused states.
-        first: Reason of the first refusal, in words; "" before.
+        first: Reason of the first refusal, as text; "" before.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Refusals:
 
     @property
     def by_rule(self) -> bool:
-        """Whether most have a Go2's length and encoding, but not its head or checksum."""
+        """Whether most refused states have a Go2's length and encoding: then head or checksum differ."""
         return 2 * self._ruled > self.count
 
     @property

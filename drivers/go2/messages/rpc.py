@@ -100,16 +100,16 @@ def decode_request(payload: bytes) -> Request:
 
 CLAIM_TEXTS: Final = {"id": 200, "who": 200, "state": 200}
 STATUS_TEXTS: Final = {"control": 40, "reason": 400}
-"""Texts of a claim, and of the bridge's status (who controls the robot, and why) -> most characters."""
+"""Texts of a claim and of the bridge's status (who controls the robot, and why) -> most characters."""
 
 
 def encode_note(values: Mapping[str, Any]) -> bytes:
-    """Return a message between deal-hw's own programs: JSON in a request that nobody answers."""
+    """Return a message between deal-hw's own programs: JSON in a request without an answer."""
     return encode_request(Request(identity=0, api=0, parameter=json.dumps(dict(values)), no_reply=True))
 
 
 def read_note(payload: bytes, texts: Mapping[str, int]) -> dict[str, str] | None:
-    """Return texts of such a message, each cut to its most characters; None where one is missing."""
+    """Return the texts in such a message, each cut to its largest length; None if one is missing."""
     try:
         values = json.loads(decode_request(payload).parameter)
     except (FrameError, ValueError, RecursionError):
@@ -138,7 +138,8 @@ def decode_response(payload: bytes) -> Response:
 
 
 def _aligned(at: int) -> int:
-    # CDR aligns from the end of the 4-byte header, which is itself a whole word.
+    # CDR aligns from the end of the 4-byte header. That header is a whole word, so offsets from the start are
+    # aligned too.
     return -(-at // 4) * 4
 
 
@@ -154,7 +155,7 @@ def _text_of(payload: bytes, name: str, at: int) -> tuple[str, bytes]:
     text, at = _sequence(payload, name, at)
     binary, at = _sequence(payload, name, at)
     if len(payload) - at > 3:
-        raise FrameError(f"{name}: {len(payload) - at} bytes too many")
+        raise FrameError(f"{name}: {len(payload) - at} bytes too many at its end")
     if not text.endswith(b"\0"):
         raise FrameError(f"{name}: the text does not end with a zero byte")
     try:
@@ -177,6 +178,6 @@ def _sequence(payload: bytes, name: str, at: int) -> tuple[bytes, int]:
 def _check(payload: bytes, name: str, least: int) -> None:
     if len(payload) < least:
         raise FrameError(f"{name}: {len(payload)} bytes, at least {least} are needed")
-    # The header's last byte may say how many bytes of padding end the payload.
+    # The header's last byte may give the number of padding bytes at the payload's end.
     if payload[:3] != CDR_HEADER[:3]:
         raise FrameError(f"{name}: the CDR header is {payload[:4].hex(' ')}, expected {CDR_HEADER.hex(' ')}")

@@ -11,7 +11,7 @@ from deal_hw.drivers.go2.messages.wire import CDR_HEADER, HEAD
 from deal_hw.errors import FrameError, VersionMismatchError
 
 Simulator = Literal["none", "unitree_mujoco"]
-"""A simulator in the place of a robot."""
+"""Name of the simulator."""
 UNITREE_MUJOCO: Final = (
     "no head, no battery: the simulator unitree_mujoco sends such states. If it runs there, add "
     "`--simulator unitree_mujoco`, which says what replaces the checks that its states do not allow. "

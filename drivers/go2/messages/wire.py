@@ -69,7 +69,7 @@ def check_frame(payload: bytes, name: str, *, head: bool = True) -> None:
     Args:
         payload: The received bytes.
         name: "LowCmd" or "LowState".
-        head: Whether the message's own head counts.
+        head: Whether to check the message's own head, too.
 
     Raises:
         FrameError: Wrong length, header or head; the message names it.
