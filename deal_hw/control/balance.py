@@ -1,7 +1,8 @@
 """How well a cart-pole was balanced, from its reported states: the task of the DEAL paper's Table 2.
 
-The task is frozen: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). It is
-judged by the reported states, since a robot has no others.
+The task never changes, so that results can be compared: 10 s of balancing from the home pose (cart in the
+middle, pole upright, at rest). The result is computed from the reported states, the only ones that a real
+robot has.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ CART, POLE = 0, 1
 
 TASK_SECONDS = 10.0
 FALLEN_RAD = 0.5
-"""A pole beyond this angle has fallen: no cart of this size can raise it again."""
+"""A pole beyond this angle counts as fallen [rad]: no cart of this size can raise it again."""
 
 
 _SLACK_S = 0.1
@@ -51,7 +52,7 @@ def wrapped_angle(angle: FloatArray) -> FloatArray:
 def balance_result(
     position: FloatArray, velocity: FloatArray, period_s: float, duration_s: float | None = None
 ) -> BalanceResult:
-    """Judge one run.
+    """Return the result of one run.
 
     Args:
         position: Reported joint positions (cart, pole), (T, 2).
@@ -78,7 +79,7 @@ def balance_result(
 
 
 def recorded_balance(trajectory: Trajectory) -> BalanceResult | None:
-    """Judge a recording from its first to its last sample; None if it has fewer than two."""
+    """Return the result of a recording, from its first to its last sample; None if it has fewer than two."""
     if len(trajectory.device_s) < 2:
         return None
     period_s = float(np.median(np.diff(trajectory.device_s)))

@@ -79,10 +79,10 @@ class RichConfig:
         Segment(start=0.5, stop=0.75, stiffness=2.5, damping=0.5, effort_limit=0.15, speed_limit=2.5),
         Segment(start=0.75, stop=1.0, stiffness=2.5, damping=0.5, effort_limit=0.05, speed_limit=2.5),
     )
-    """Parts of the run with other gains and limits; the first that fits counts. By default the second half
-    runs with low effort limits and a high speed limit, for a limit that is never reached leaves no trace in
-    the recording; and stiff and little damped, for a cart that creeps never asks for the effort that is
-    allowed. Page 'Choose a motion' of the documentation has the figures."""
+    """Parts of the run with other gains and limits; the first part that contains the time is used. By default
+    the second half has low effort limits and a high speed limit, because a recording shows a limit only where
+    it is reached. It also has high stiffness and low damping, because a slow cart never reaches the effort
+    limit. Page 'Choose a motion' of the documentation has the figures."""
 
     def __post_init__(self) -> None:
         low, high = self.hold_s
@@ -104,7 +104,7 @@ class RichBehaviour:
 
     Args:
         description: The robot.
-        balance: What balances at first; None starts with the set-points at once.
+        balance: Behaviour that balances at first; None starts with the set-points at once.
         config: The motion.
         seed: Seed of the set-points; ``reset`` repeats them.
     """
@@ -179,7 +179,7 @@ class ChirpBehaviour:
         self._default = np.array(description.default_position)[list(description.actuated_index)]
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """No memory to clear."""
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
         """Return the set-point at this time; the phase is the integral of a linearly growing frequency."""

@@ -35,7 +35,7 @@ HELD_FACTOR = 8.0
 """Factor on low commanded effort limits, from two steps up."""
 
 FINEST = 0.5
-"""Half a step: between a step that hardly moves and one that trips, it may do neither."""
+"""Half a step, tried between a level that hardly moves the robot and one that trips the safety module."""
 
 ATTEMPTS = 4
 
@@ -162,16 +162,16 @@ class Attempt:
 
     @property
     def enough(self) -> bool:
-        """Whether the recording is complete and moves enough."""
+        """Whether the recording is complete and has enough motion."""
         return not self.shortfalls and not self.tripped
 
 
 class ExcitationLevelSearch:
-    """Chooses excitation levels until a recording is complete and moves enough: ask (`level`) and tell.
+    """Chooses excitation levels until a recording is complete and has enough motion (ask and tell).
 
     Args:
         level: First level.
-        attempts: Most recordings.
+        attempts: Largest number of recordings.
         rearm: Whether another recording may follow a trip of the safety module. On a real robot a person must
         check it first.
 
@@ -195,7 +195,7 @@ class ExcitationLevelSearch:
     def tell(self, found: tuple[str, ...], tripped: str = "") -> bool:
         """Take the outcome of the recording at `level`; return whether to record again at the new level.
 
-        Afterwards `words` has the problem and the next step.
+        Afterwards `words` is a text on the problem and the next step.
 
         Args:
             found: Result of :func:`shortfalls`.

@@ -9,7 +9,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 MARGIN = 0.9
-"""Used share of a limit; noise and the transition from balancing need the rest."""
+"""Share of a limit that an excitation may use; noise and the transition from balancing need the rest."""
 
 
 def centre(description: RobotDescription) -> FloatArray:

@@ -17,7 +17,7 @@ from deal_hw.types import BodyState, FloatArray, IntArray, RobotState
 LOST_WINDOW_S = 1.0
 """Time window in which a motor's missed commands are counted [s]."""
 UNIT_TOLERANCE = 0.01
-"""A quaternion's norm may differ from 1 by this; single precision takes less than 1e-6 of it."""
+"""A quaternion's norm may differ from 1 by this; single precision changes it by less than 1e-6."""
 
 _NEVER = 2**63 - 1
 
@@ -55,7 +55,7 @@ class LegChecks:
         self._lost: deque[tuple[int, IntArray]] = deque()
 
     def failures(self, state: RobotState, *, arming: bool = False) -> dict[str, str]:
-        """Return flag name -> reason in words for all that is wrong.
+        """Return flag name -> reason as text, for each failed check.
 
         Args:
             state: The newest state; its device clock is the time.

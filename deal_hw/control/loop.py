@@ -1,4 +1,4 @@
-"""The control loop: one class for collecting, deploying, replaying and for benches in virtual time."""
+"""The control loop: one class for collecting, deploying and replaying, and for benches in virtual time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ that stall."""
 
 
 class OperatorStop(BaseException):
-    """The operator requested a stop while the loop waited for the robot; not an error, hence no Exception."""
+    """The operator requested a stop during a wait for the robot; no error, so not a subclass of Exception."""
 
 
 class ControlLoop:
@@ -45,7 +45,7 @@ class ControlLoop:
     Args:
         robot: The robot; the loop connects and disconnects it.
         behaviour: Source of the commands.
-        safety: Judges every command.
+        safety: Checks every command.
         clock: The clock of deadlines and stamps; virtual for benches.
         sink: Takes each cycle's record.
         config: Settings.
@@ -109,7 +109,7 @@ class ControlLoop:
             if isinstance(err, TransportError) and running:
                 # The connection is lost while commands are sent. This counts as a trip of the safety module:
                 # it is latched, and the passive command is sent over any connection there is.
-                outcome, reason, error = Outcome.TRIPPED, f"the link is lost: {reason}", ""
+                outcome, reason, error = Outcome.TRIPPED, f"the connection is lost: {reason}", ""
                 self.note("passive", reason, flags=["link_lost"])
         finally:
             # The robot comes first, before any step that might fail.
@@ -147,10 +147,11 @@ class ControlLoop:
             self._commanding = True
             self._robot.arm(c.arm_timeout_s)
             self.note("armed", "the motors follow commands")
-            # Data that waited in buffers are old; the first cycle uses only later ones.
+            # States that waited in buffers are old; the first cycle uses only newer ones.
             self._drain()
             self._await_state()
-        # The recording starts with the sample that the first command uses, not with the setting up by hand.
+        # The recording starts with the sample that the first command uses, not while the robot is set up by
+        # hand.
         self._pending = self._pending[-1:]
 
     def _await_state(self) -> None:

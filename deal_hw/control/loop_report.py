@@ -36,7 +36,7 @@ class LoopConfig:
     home_timeout_s: float = 20.0
     arm_timeout_s: float = 1.0
     state_timeout_s: float = 1.0
-    """How long to wait for the first state sample [s]."""
+    """Longest wait for the first state sample [s]."""
     passive: PassiveConfig = field(default_factory=PassiveConfig)
     """How the passive command is repeated at the end, until the robot confirms it."""
     record_wire: bool = True
@@ -59,7 +59,7 @@ class LoopReport:
         reason: The reason, for the operator.
         passive_confirmed: Whether the robot itself reported that its motors no longer follow commands; also
         True if it was never commanded.
-        loop_timing: How regular it was.
+        loop_timing: How regular the loop's cycles were.
         clipped: Number of cycles in which a limit changed the command, by limit.
         cycles_sent: Commands sent.
         error: Name of the error's class, after a failure.

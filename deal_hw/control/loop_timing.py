@@ -34,7 +34,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopTimingReport:
-    """How regular a run was.
+    """How regular the cycles of a run were.
 
     Attributes:
         rate_hz: The requested rate [Hz].
@@ -102,7 +102,7 @@ class LoopTimingReport:
             f"overruns    {self.overruns}, beyond one period {self.overruns_beyond_period}",
             f"state age   {ms(self.state_age)}",
             f"states      {self.states}, cycles without {self.cycles_without_state}",
-            f"link        {self.transport_errors} errors",
+            f"transport   {self.transport_errors} errors",
             f"losses      {self.losses} records refused by the recorder",
         ]
 

@@ -24,7 +24,7 @@ class PassiveConfig:
     """How long the command is repeated without an answer of the robot [s]. This must be longer than a network
     takes to come back: Zenoh tries its end point once a second, a restarting switch takes about 20 s."""
     confirm_s: float = 0.05
-    """How long to wait for the robot's confirmation of a command, and at most to read older samples [s]."""
+    """Longest wait for the robot's confirmation of a command, and longest time to read older samples [s]."""
     confirmations: int = 3
     """Number of successive commands that the robot must confirm. A stiff robot without load looks damped, so
     one state that arrives when the connection returns, before any command, is no proof: with one
@@ -61,8 +61,8 @@ def make_passive(
 ) -> bool:
     """Send the passive command until the robot reports that its motors no longer follow commands.
 
-    A send that raises is one failed attempt; the transport is then opened again. Never raises, since its
-    callers already handle a worse problem.
+    A send that raises is one failed attempt; the transport is then opened again. Never raises, because its
+    callers already handle a more serious problem.
 
     Args:
         robot: Connected, or at least with a transport that was open.

@@ -1,4 +1,4 @@
-"""Standing up before a behaviour and lying down after it, for robots with legs; the safety filter judges it.
+"""Standing up before a behaviour and lying down after it, for robots with legs; both pass the safety filter.
 
 A robot with legs starts and ends lying, so that limp legs are harmless. Targets move between poses along a
 smooth curve. It starts at the measured pose of the first cycle, so any lying pose is fine.

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
-"""Sent by the kernel when the parent dies; no other sender exists, so the recorded reason is true."""
+"""Signal that the kernel sends when the parent dies; nothing else sends it, so the cause is certain."""
 FIFO_PRIORITY = 50
 SUPERVISOR_PRIORITY = FIFO_PRIORITY + 1
 """Above the control process, since it must be able to kill one that blocks a processor."""
 TRANSPORT_PRIORITY = FIFO_PRIORITY - 10
-"""Priority of the supervisor's transport threads, since its damping must be sent on a busy machine, too."""
+"""Priority of the supervisor's transport threads, because damping must be sent on a busy machine, too."""
 _MCL_ONFAULT = 4
 
 
@@ -132,7 +132,7 @@ def die_with_parent(parent_pid: int) -> None:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
     # The parent may have died before the call above; then no signal ever comes.
     if os.getppid() != parent_pid:
-        raise ProcessLookupError(f"the parent process {parent_pid} is gone")
+        raise ProcessLookupError(f"the parent process {parent_pid} has ended")
 
 
 def kill_self_after(seconds: float) -> None:

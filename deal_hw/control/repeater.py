@@ -9,7 +9,7 @@ from deal_hw.robot import Robot
 class Repeater:
     """Repeats the current command when it is due; in the loop's thread, between its cycles.
 
-    A robot's drives hold the last command for ever, but need it often. The same command is repeated, so
+    A robot's motors hold the last command for ever, but should get it often. The same command is repeated, so
     recording and calibration have one command per cycle.
 
     Attributes:

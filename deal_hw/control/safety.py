@@ -1,8 +1,8 @@
 """Safety between policy and motors: checks each cycle, clips what can be clipped, trips on the rest.
 
 Pure: no I/O, no torch, and time is an argument. Limits are data of the robot (``description.limits``).
-Clipping changes a command and reports it. A trip sends no more commands, latches and gives its reason as
-text.
+Clipping changes a command and reports it. After a trip no more commands are sent; it is latched, and its
+reason is a text.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class CycleInput:
         action_age_ns: How long the policy took [ns].
         transport_errors: Transport errors since the connection, as the robot counts them.
         stop_reason: Reason of a requested stop, by the operator or on their behalf; "" without one.
-        fault: A problem seen by the driver that forbids to continue; "" for none.
+        fault: A problem seen by the driver, after which the run must not continue; "" for none.
         command_age_ns: Time since the last sent or repeated command [ns]; -1: none yet. Used on robots with
         legs only.
     """
@@ -113,7 +113,7 @@ class Safety:
             self._config.link_error_share * self._config.transport_error_window_s * description.state_rate_hz
         )
         self.reason = ""
-        """Why it is passive, in words."""
+        """Why it is passive, as text."""
         self._reset(0)
 
     def _reset(self, now_ns: int) -> None:
@@ -146,11 +146,11 @@ class Safety:
         self._start = self._previous = cycle.state.position[self._index]
 
     def step(self, cycle: CycleInput, wanted: JointCommand | None) -> SafetyDecision:
-        """Judge one cycle.
+        """Check one cycle.
 
         Args:
             cycle: The cycle's inputs.
-            wanted: The requested command; None if there is none yet.
+            wanted: The requested command; None before the first.
         """
         self._begin(cycle)
         failures = self._failures(cycle, wanted)
@@ -260,7 +260,7 @@ class Safety:
         if not self._seen_armed and now_ns - self._armed_ns < self._config.confirm_s * 1e9:
             return
         if Status.WATCHDOG in status:
-            found["device_watchdog"] = "the device's watchdog stopped its motors because commands stayed away"
+            found["device_watchdog"] = "the device's watchdog stopped its motors because no commands came"
         if Status.ARMED not in status:
             found["device_disarmed"] = "the device disarmed itself"
 
@@ -303,6 +303,6 @@ class Safety:
             age_ns = min(age_ns, cycle.command_age_ns)
         if age_ns > self._command_age_ns:
             found["command_stale"] = (
-                f"no command has gone out for {age_ns * 1e-6:.0f} ms, at most "
+                f"no command was sent for {age_ns * 1e-6:.0f} ms, at most "
                 f"{self._command_age_ns * 1e-6:g} ms are allowed"
             )

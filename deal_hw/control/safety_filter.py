@@ -102,7 +102,7 @@ class SafetyFilter:
         self._effort = None if legs is None else np.asarray(legs.effort)
 
     def accepts(self, command: JointCommand) -> bool:
-        """Return whether every number is finite, except the speed or effort limits a robot lacks."""
+        """Return whether every number is finite, except limits of speed or effort that the robot lacks."""
         limited = {
             name: np.where(sent == self._maxima[name], 0.0, sent)
             for name in ("speed_limit", "effort_limit")

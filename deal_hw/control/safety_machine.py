@@ -1,4 +1,4 @@
-"""The safety state machine: pure, with time as an argument, on flags whose False means no failure.
+"""The safety state machine. Time is an argument; a flag is True for a failure.
 
     DISARMED --arm--> EASING_IN --time--> ACTIVE
                           |                  |
@@ -35,14 +35,15 @@ class SafetyState(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyFlags:
-    """Possible failures in one cycle; False means no failure. Reasons are listed in this order.
+    """Possible failures in one cycle; True means failed. Reasons are listed in this order.
 
     Attributes:
         operator_stop: The operator asked to stop.
         no_state: No state sample has arrived yet.
         state_stale: The newest state is too old, or was delayed on its way.
         clock_jump: The device's clock jumped, as after a restart.
-        device_fault: The device reports a fault, or the driver saw a problem that forbids to continue.
+        device_fault: The device reports a fault, or the driver saw a problem after which the run must not
+            continue.
         device_watchdog: The device stopped its motors because no commands arrived.
         device_disarmed: The device reports that its motors do not follow commands.
         position: A joint is outside its trip range.

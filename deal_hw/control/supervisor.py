@@ -1,4 +1,4 @@
-"""The supervisor: starts and watches the control process, and makes the robot passive if that one cannot.
+"""The supervisor: starts and watches the control process; makes the robot passive if that process cannot.
 
 It owns the port as long as it lives. No other program can then take the robot, and the passive command can
 still be sent after the control process has died. It never sends while the control process lives: two writers
@@ -74,10 +74,11 @@ class Supervisor:
 
     Args:
         module: The control process's module, run with ``python -m``.
-        plan: Its orders, as plain JSON values; it reads them from its standard input.
+        plan: Its settings, as plain JSON values; it reads them from its standard input.
         port_fd: The open port, which it inherits; None if each process opens its own connection.
         passive: Sends the passive command through the port and returns whether the robot confirmed it. Called
-        only after the control process has died, with its last phase and whether it tried the same in vain.
+        only after the control process has died, with its last phase and whether it tried the same without
+        success.
         The function decides whether to send.
         recorder: The recorder, ready; None to record nothing.
         on_beat: Called with each heartbeat.
@@ -196,8 +197,8 @@ class Supervisor:
             if select.select([status], [], [], min(_POLL_S, max(left_s, 0.0) + 1e-3))[0]:
                 while (message := status.receive()) is not None:
                     self._take(message)
-            # Only after a wait without messages: a supervisor that was itself delayed finds old heartbeats
-            # first.
+            # Only after a wait without messages: if the supervisor itself was delayed, old heartbeats are
+            # still waiting.
             elif self._clock.now_ns() > self._stale_ns:
                 self._kill(child, f"it sent no heartbeat while {self._phase}")
                 return

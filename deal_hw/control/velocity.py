@@ -19,7 +19,7 @@ AXES = ("x", "y", "yaw")
 LARGEST = (1.0, 0.5, 1.0)
 """Largest velocity that may be requested: ahead, to the left [m/s], turning left [rad/s]."""
 KEY_LIFE_S = 0.6
-"""How long a key counts after its last press [s]; longer than the first pause of a key repeat."""
+"""How long a key counts after its last press [s]; longer than the delay before a terminal repeats a key."""
 KEYS = {
     "w": (0.5, 0.0, 0.0),
     "s": (-0.5, 0.0, 0.0),
@@ -64,7 +64,7 @@ class FixedVelocity:
         return self._velocity
 
     def reach(self) -> FloatArray:
-        """Return it twice, (2, 3)."""
+        """Return this velocity as lowest and highest, (2, 3)."""
         return np.stack([self._velocity, self._velocity])
 
 

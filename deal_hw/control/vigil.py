@@ -16,7 +16,7 @@ real-time priority a busy machine may delay it by about 0.4 s."""
 
 
 class SupervisorVigil:
-    """Listens to the supervisor in a thread, since the control process may wait for the robot for seconds.
+    """Listens to the supervisor in a thread, because the control process may wait seconds for the robot.
 
     Args:
         status: The channel to the supervisor.
@@ -38,7 +38,7 @@ class SupervisorVigil:
         self._thread = threading.Thread(target=self._listen, name="supervisor vigil", daemon=True)
 
     def start(self) -> None:
-        """Listen from now on; the thread has the caller's priority."""
+        """Start to listen; the thread has the caller's priority."""
         self._thread.start()
 
     def messages(self) -> list[str]:

@@ -179,8 +179,8 @@ def ease(time_s: FloatArray, duration_s: float, ease_s: float) -> FloatArray:
 
     Args:
         time_s: Times since the window began, (T,).
-        duration_s: Its length.
-        ease_s: Time of the rise, and of the fall; 0 for none.
+        duration_s: Its length [s].
+        ease_s: Time of the rise, and of the fall [s]; 0 for none.
     """
     inside = (time_s >= 0) & (time_s <= duration_s)
     if ease_s <= 0:
@@ -219,13 +219,14 @@ def multisine(
 ) -> Tones:
     """Return a multisine with Schroeder phases, other harmonics for each joint.
 
-    Random are the start within the period and the sign; neither changes spectrum or peak.
+    The start within the period and the sign are random; neither changes spectrum or peak.
 
     Args:
         amplitude: Peak of each joint's sum over its period, (A,) [m or rad].
         low_hz: Lowest frequency.
         high_hz: Highest frequency.
-        base_hz: All frequencies are multiples of it; one over the signal's length, so that joints differ.
+        base_hz: All frequencies are multiples of it: 1 / length of the signal, so that the joints' signals
+            are orthogonal.
         tilt: Amplitudes fall with frequency to this power; 0 is flat, 1 equal speeds.
         rng: Draws beginning and sign of each joint.
 

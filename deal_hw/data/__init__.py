@@ -1,1 +1,1 @@
-"""Recordings: our own episodes, imports from other formats, checks of both, and export."""
+"""Recordings: deal-hw's own episodes, imports from other formats, checks of both, and export."""

@@ -1,4 +1,4 @@
-"""A run: one folder with what was run, with what, and what came out."""
+"""A run: one folder with settings, seeds, versions, recordings and results."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _PACKAGES = (
 class RunFolder:
     """``runs/<name>/`` with ``run.json``, ``dataset/``, ``calibration/`` and ``policies/``.
 
-    ``run.json`` is written at the start with status "running" and again at the end, so that a run that was
-    killed says so.
+    ``run.json`` is written at the start with status "running" and again at the end. So a killed run keeps the
+    status "running".
 
     Args:
         path: The folder.
@@ -69,11 +69,11 @@ class RunFolder:
     def start(
         self, settings: Mapping[str, Any], seeds: Mapping[str, int], argv: Sequence[str] | None = None
     ) -> None:
-        """Create the folders and write what is about to run.
+        """Create the folders and write the settings of the run.
 
         Args:
             settings: Plain JSON values.
-            seeds: Every seed that is used, by its use.
+            seeds: Every used seed, by its purpose.
             argv: The command line; this process's by default.
 
         Raises:
@@ -99,11 +99,11 @@ class RunFolder:
         self._save()
 
     def finish(self, status: str = "finished", **results: Any) -> None:
-        """Write how the run ended.
+        """Write the result of the run.
 
         Args:
             status: "finished", "failed" or "interrupted".
-            results: Plain JSON values worth finding in ``run.json``, such as seconds per stage.
+            results: Plain JSON values to keep in ``run.json``, such as seconds for each stage.
         """
         self._record.update(status=status, end_utc=_now(), **results)
         self._save()
@@ -145,7 +145,7 @@ class RunFolder:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what is installed, without importing it."""
+    """Return the versions of installed packages, without importing them."""
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:

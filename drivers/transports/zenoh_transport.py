@@ -296,7 +296,7 @@ class ZenohTransport(TopicTransport):
 
     def _gone(self) -> TransportLostError:
         return TransportLostError(
-            f"{self.port}: the connection is lost: the bridge or emulator stopped, or the network is down; "
+            f"{self.port}: no connection: the bridge or emulator stopped, or the network is down; "
             "Zenoh keeps trying to connect"
         )
 

@@ -222,7 +222,9 @@ def test_a_full_disk_ends_the_recording_and_says_what_is_left(
         recorder.write(CYCLE)
         with monkeypatch.context() as patch:
             patch.setattr("os.write", full)
-            with pytest.raises(DatasetError, match=r"No space left .* look at it with: deal-hw data info"):
+            with pytest.raises(
+                DatasetError, match=r"No space left .* check the file with: deal-hw data info"
+            ):
                 getattr(recorder, step)()
 
 

@@ -459,7 +459,7 @@ def test_a_go2_whose_link_is_lost_in_the_run_trips_at_once_and_is_damped_once_it
     rig.at = at
     report = rig.run(hand_back=True)
     assert (report.outcome, report.error, report.passive_confirmed) == (Outcome.TRIPPED, "", True)
-    assert report.reason == "the link is lost: virtual wire: the device vanished"
+    assert report.reason == "the connection is lost: virtual wire: the device vanished"
     assert rig.kinds[-2:] == [STIFF, DAMPING]
     assert "handing back" not in dict(rig.beats)
 

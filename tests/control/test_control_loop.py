@@ -240,7 +240,7 @@ def test_a_cable_that_is_pulled_fails_with_what_to_do(rig: Any) -> None:
 
     report = make_loop(rig, balance(pull)).run()
     assert (report.outcome, report.error) == (Outcome.TRIPPED, "")
-    assert report.reason == "the link is lost: virtual wire: the device vanished"
+    assert report.reason == "the connection is lost: virtual wire: the device vanished"
     assert not report.passive_confirmed
     assert ("passive", report.reason) in rig.events
     assert rig.device.armed

@@ -337,7 +337,7 @@ def test_a_stall_trips_and_its_record_still_fits(stall_ms: int) -> None:
     rig.sink = stall  # type: ignore[method-assign]
     report = rig.loop().run()
     assert report.outcome is Outcome.TRIPPED
-    assert report.reason.startswith(f"no command has gone out for {stall_ms} ms")
+    assert report.reason.startswith(f"no command was sent for {stall_ms} ms")
     assert all(len(encode(record)) < 128 * 1024 for record in rig.records)
     assert ("passive", report.reason) in rig.events
     states = [state.sequence for record in rig.records for state in record.states]

@@ -346,7 +346,9 @@ def test_a_cable_that_is_pulled_is_named_and_the_data_are_whole(
     emulator = start_emulator("--vanish-after-s", "0.6")
     report = run(emulator, tmp_path)
     assert (report.outcome, report.exit_code) == (Outcome.TRIPPED, 3)
-    assert report.episodes[0].reason.startswith(f"the link is lost: {emulator.port}: the device vanished")
+    assert report.episodes[0].reason.startswith(
+        f"the connection is lost: {emulator.port}: the device vanished"
+    )
     facts = Dataset.open(tmp_path).episodes[0].facts
     assert facts["passive_confirmed"] is False
     assert any(

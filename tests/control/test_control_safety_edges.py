@@ -148,7 +148,7 @@ def armed_with(description: RobotDescription, config: SafetyConfig | None = None
         (
             {"state": state(T0 + 20 * MS, status=ARMED | Status.WATCHDOG)},
             "device_watchdog",
-            "the device's watchdog stopped its motors because commands stayed away",
+            "the device's watchdog stopped its motors because no commands came",
         ),
         (
             {"state": state(T0 + 20 * MS, status=Status.HOMED)},

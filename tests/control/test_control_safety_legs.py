@@ -493,7 +493,7 @@ def test_commands_that_stay_away_trip(armed: Safety, age_ms: float, trips: bool)
     assert verdict.flags == (("command_stale",) if trips else ())
     assert (verdict.state is SafetyState.PASSIVE) is trips
     if trips:
-        assert verdict.reason == f"no command has gone out for {age_ms:.0f} ms, at most 100 ms are allowed"
+        assert verdict.reason == f"no command was sent for {age_ms:.0f} ms, at most 100 ms are allowed"
 
 
 @pytest.mark.parametrize("age_ms", [-1, 5000])
@@ -506,7 +506,7 @@ def test_commands_count_from_the_first_cycle_after_arming(safety: Safety, age_ms
         assert step(safety, at_ms, command_age_ns=age_ns).send
     verdict = step(safety, 4100.1, command_age_ns=age_ns)
     assert verdict.flags == ("command_stale",)
-    assert verdict.reason == "no command has gone out for 100 ms, at most 100 ms are allowed"
+    assert verdict.reason == "no command was sent for 100 ms, at most 100 ms are allowed"
 
 
 def test_a_command_just_now_counts(armed: Safety) -> None:

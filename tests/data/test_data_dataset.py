@@ -93,7 +93,7 @@ def test_episode_of_a_killed_collector_is_taken_in(
     shutil.copy(write_episode("torn.mcap", torn=True), folder / "episodes" / "000001.mcap")
     dataset = Dataset.open(folder, notes.append)
     assert len(notes) == 2
-    assert "no footer" in notes[0] and "taken in with" in notes[1]
+    assert "no footer" in notes[0] and "it was added, with" in notes[1]
     assert dataset.episodes[1].states > 580
     assert "its collector was killed" in dataset.episodes[1].note
     notes.clear()

@@ -128,7 +128,7 @@ def test_event_data_are_a_json_object(make_cycle: Callable[[int], CycleRecord], 
     assert good[:-4] == head + text
     sized = head[:-12] + head[-12:].replace(len(text).to_bytes(4, "little"), len(data).to_bytes(4, "little"))
     body = sized + data
-    with pytest.raises(ProtocolError, match="does not hold what its head says"):
+    with pytest.raises(ProtocolError, match="does not match its head"):
         decode(body + zlib.crc32(body).to_bytes(4, "little"))
 
 

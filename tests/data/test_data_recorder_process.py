@@ -144,7 +144,7 @@ def test_full_disk_is_reported_while_the_socket_is_drained(tmp_path: Path, make_
     assert resource.getrlimit(resource.RLIMIT_FSIZE) == (soft, hard)
     assert not outcome.complete
     assert handle.process.returncode == 3
-    assert "File too large; what was written before is kept" in outcome.errors[0]
+    assert "File too large; the data written before are kept" in outcome.errors[0]
     assert path.stat().st_size <= 20_000
     assert verify(path).sound
 

@@ -161,7 +161,7 @@ def test_full_disk_leaves_the_original(write_episode: WriteEpisode) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))
     try:
         with pytest.raises(
-            DatasetError, match="cannot be repaired: File too large; the original is untouched"
+            DatasetError, match="cannot be repaired: File too large; the original is unchanged"
         ):
             repair(path)
     finally:

@@ -92,7 +92,7 @@ def test_many_messages_are_read_as_each_of_them(table: tuple[RosMessageType, lis
 @pytest.mark.parametrize(
     ("other", "what"),
     [
-        (([1.0], [2.0, 3.0], []), "position is not laid out alike"),
+        (([1.0], [2.0, 3.0], []), "position has not the same layout"),
         (([1.0, 2.0], [3.0], [4.0]), "different lengths"),
     ],
 )

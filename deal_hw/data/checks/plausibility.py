@@ -32,7 +32,7 @@ MAX_DUPLICATES = 0.05
 MOVES = {"rad": 0.02, "m": 0.002}
 """A joint with a smaller range of positions does not move [rad or m]."""
 FAR = {"rad": 1.0, "m": 0.2}
-"""No servo stays this far from its command all the time [rad or m]."""
+"""A position that is always farther from its command than this is reported [rad or m]."""
 FROZEN_S = 0.5
 DEGREES = 180 / np.pi
 SCALE_TOLERANCE = 0.25

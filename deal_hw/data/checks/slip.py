@@ -10,7 +10,7 @@ is fitted to the whole recording. It is fitted again with the commands of a part
 shift that clearly reduces this predictor's error, and on which most joints agree.
 
 Backlash delays small motions more than large ones, so a part with small motions looks slipped. But then the
-shift does not make the parts alike: a predictor of the part alone is better by more.
+shift does not make the parts alike: a predictor of that part alone reduces the error much further.
 """
 
 from __future__ import annotations
@@ -41,16 +41,17 @@ FEWEST_PARTS: Final = 8
 FINEST_S: Final = 0.005
 MOST_SAMPLES: Final = 30_000
 CLEAR: Final = 0.5
-"""Least decrease of the error's logarithm, divided by the shifted part's share of the recording. Clean
-recordings reach 0.4 for shifts of 10 ms (a noise-free cart-pole) and 0.06 to 0.22 for longer ones (real arms,
-the latter where one presses on a table); slips of 20 to 60 ms under brisk motion 0.5 to 7; slow motion shows
-none."""
+"""Least decrease of the error's logarithm, divided by the shifted part's share of the recording. Recordings
+without a slip reach 0.4 for shifts of 10 ms (a noise-free cart-pole). For longer shifts they reach 0.06 to
+0.22 (real arms; 0.22 where one presses on a table). Slips of 20 to 60 ms reach 0.5 to 7 under fast motion;
+slow motion does not show them."""
 GLARING: Final = 1.5
 """From this value on, most of a fit's residual comes from the slip, so the recording is refused if it is also
 :data:`ALIKE`."""
 ALIKE: Final = 0.7
-"""Least decrease by the shift, of the decrease by the shift and a predictor of the part alone, for a refusal.
-Slips of brisk motion: 0.76 to 0.97 (one of steps 0.67); pendulum and cart-pole with backlash: up to 0.68."""
+"""Smallest share for a refusal: decrease of the error by the shift alone, over the decrease by the shift
+together with a predictor of the part's own. Slips under fast motion: 0.76 to 0.97 (one of steps: 0.67).
+Pendulum and cart-pole with backlash: up to 0.68."""
 AGREE: Final = 0.75
 """Share of the joints that must agree on about the same shift."""
 GAP_PERIODS: Final = 3.0
@@ -66,7 +67,7 @@ class Slip:
         begin_s: Start of the part [s].
         end_s: Its end [s].
         later_s: Additional delay; negative: less delay [s].
-        clear: How much better the shift explains the recording, see :data:`CLEAR`.
+        clear: How much the shift reduces the error, see :data:`CLEAR`.
         agree: Share of the joints that agree on about this shift.
         alike: How alike the shift makes the part and the rest, see :data:`ALIKE`.
     """

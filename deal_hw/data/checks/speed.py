@@ -1,4 +1,4 @@
-"""Whether recorded velocities are the slopes of the recorded positions: units, signs, and the clock."""
+"""Checks that recorded velocities are the slopes of the recorded positions: units, signs, clock."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ def export_foxglove(
         links: Names of the B links, the world first.
         stamps_ns: Host clock of the T moments [ns].
         poses: Positions (T, B, 3) [m] and quaternions w x y z (T, B, 4) in the world; NaN where unknown.
-        shapes: What to draw.
+        shapes: The shapes to draw.
         rate_hz: Most moments per second.
 
     Raises:
@@ -220,7 +220,7 @@ def _write_shapes(writer: Writer, links: Sequence[str], shapes: Sequence[Drawn],
 
 
 def scene_update(shape: Drawn, frame: str, at_ns: int) -> bytes:
-    """Return a ``foxglove.SceneUpdate`` that draws one shape in a frame for ever, in CDR."""
+    """Return a ``foxglove.SceneUpdate`` that draws one shape in a frame for ever, as CDR."""
     values: list[tuple[str, object]] = [("uint32", 0), ("uint32", 1)]
     values += zip(("int32", "uint32"), divmod(at_ns, 10**9), strict=True)
     values += [("string", frame), ("string", shape.name), ("int32", 0), ("uint32", 0), ("bool", True)]
@@ -234,7 +234,7 @@ def scene_update(shape: Drawn, frame: str, at_ns: int) -> bytes:
 
 
 def _primitives(shape: Drawn) -> dict[str, list[list[tuple[str, object]]]]:
-    """Return what draws a shape, by list of the entity: type and value of each field in a row."""
+    """Return the primitives of a shape by list of the entity: type and value of each field, in order."""
     w, x, y, z = shape.quaternion
     turn, color = (x, y, z, w), tuple(shape.color)
     radius, half = float(shape.size[0]), float(shape.size[1])

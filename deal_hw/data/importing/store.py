@@ -44,7 +44,7 @@ def write_dataset(
         episodes: Our own episodes of the same robot, to copy unchanged.
 
     Raises:
-        DatasetError: It belongs to another robot or cannot be written.
+        DatasetError: It belongs to another robot, or cannot be written.
         ConfigurationError: The recordings' joints are not the description's.
     """
     values = description.to_json() if isinstance(description, RobotDescription) else dict(description)

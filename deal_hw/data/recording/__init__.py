@@ -1,1 +1,1 @@
-"""Episodes: written as MCAP while they happen, repaired after a kill, checked, read back; datasets."""
+"""Episodes and datasets: written as MCAP during a run, repaired after a kill, checked, read."""

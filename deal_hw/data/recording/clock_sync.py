@@ -1,4 +1,4 @@
-"""Relates the device's clock to the host's, from nothing but a recording.
+"""Estimates the relation of the device's clock to the host's from a recording alone.
 
 Every state sample bounds the relation from one side: it cannot arrive before it was sent. Every command that
 the device reports in force bounds it from the other: it cannot be received before it was sent. All straight
@@ -21,7 +21,7 @@ from deal_hw.types import FloatArray, Trajectory
 STAMP_RESOLUTION_S = 2e-6
 """Device stamps and ages are whole microseconds; each bound is loosened by that much."""
 JUMP_S = 5e-3
-"""Smaller changes of a clock are not told from changes of delay."""
+"""Smaller changes of a clock [s] cannot be distinguished from changes of delay."""
 _JUMP_WINDOW_S = 5.0
 _JUMP_MARGIN_S = 0.25
 Bounds = tuple[FloatArray, FloatArray]
@@ -30,7 +30,7 @@ Bounds = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class ClockJump:
-    """One clock was set: from one sample to the next the difference of the clocks changed for good.
+    """A jump: one clock was set, so the clocks' difference changed permanently between two samples.
 
     Attributes:
         index: The first sample after it.
@@ -45,15 +45,15 @@ class ClockJump:
 
 @dataclass(frozen=True, slots=True)
 class ClockSync:
-    """How the host's clock follows from the device's, on the time bases of a Trajectory.
+    """Relation of the host's clock to the device's, on the time bases of a Trajectory.
 
     Attributes:
         reference_s: Device time at which ``offset_s`` holds [s].
         offset_s: Host minus device at the reference [s].
-        offset_uncertainty_s: Half of what is possible [s]; infinite without commands (one-sided), where the
-            offset still holds the smallest delay of a state sample.
+        offset_uncertainty_s: Half of the possible range [s]; infinite without commands (one-sided). The
+            offset then still contains the smallest delay of a state sample.
         drift_ppm: Host seconds gained per million device seconds.
-        drift_uncertainty_ppm: Half of what is possible; infinite where that is unbounded.
+        drift_uncertainty_ppm: Half of the possible range; infinite if that is unbounded.
         jumps: Where a clock was set; the estimate then holds for the longest stretch without one.
     """
 
@@ -100,7 +100,7 @@ def synchronize(trajectory: Trajectory) -> ClockSync:
 
 
 def command_bounds(trajectory: Trajectory, start: int = 0, stop: int | None = None) -> Bounds:
-    """Return for each command seen in force its device time of reception and sending minus reception [s].
+    """Return the bounds by commands: device time of reception, and send minus reception time [s].
 
     Args:
         trajectory: A recording.
@@ -128,10 +128,10 @@ def command_bounds(trajectory: Trajectory, start: int = 0, stop: int | None = No
 
 
 def find_jumps(device_s: FloatArray, difference_s: FloatArray) -> tuple[ClockJump, ...]:
-    """Find where host minus device changed for good.
+    """Find the jumps, where host minus device time changed permanently.
 
-    A delay also changes the difference, but only until the samples are on time again: a jump is where the
-    smallest difference of the seconds before and of the seconds after differ. A device clock that runs
+    A delay also changes the difference, but only until the samples are on time again. So a jump is where the
+    smallest difference of the seconds before differs from that of the seconds after. A device clock that runs
     backwards is always a jump.
 
     Args:
@@ -165,7 +165,7 @@ def find_jumps(device_s: FloatArray, difference_s: FloatArray) -> tuple[ClockJum
 def _least_near(
     device_s: FloatArray, difference_s: FloatArray, start: int, stop: int, side: int
 ) -> float | None:
-    """Return the smallest difference in the seconds nearest to one side of a place; None if too few."""
+    """Return the smallest difference in the seconds before or after a place; None if too few samples."""
     part, values = device_s[start:stop], difference_s[start:stop]
     if part.size < 2 or part[-1] - part[0] < _JUMP_MARGIN_S:
         return None
@@ -177,7 +177,10 @@ def _longest_stretch(samples: int, jumps: tuple[ClockJump, ...]) -> tuple[int, i
     edges = [0, *(jump.index for jump in jumps), samples]
     start, stop = max(itertools.pairwise(edges), key=lambda pair: pair[1] - pair[0])
     if stop - start < 2:
-        raise InsufficientDataError(f"{len(jumps)} clock jumps leave no stretch to relate the clocks")
+        raise InsufficientDataError(
+            f"{len(jumps)} clock jumps leave no part long enough to relate the clocks; do not set clocks "
+            "while recording"
+        )
     return start, stop
 
 
@@ -195,7 +198,7 @@ def _reconcile(upper: Bounds, lower: Bounds) -> tuple[Bounds, float, float]:
         slack_s = max(2 * slack_s, 1e-5)
     raise InsufficientDataError(
         f"stamps of states and commands contradict each other by more than {JUMP_S} s: "
-        "something was received before it was sent. Was a clock set meanwhile? Record again"
+        "something was received before it was sent. Probably a clock was set meanwhile; record again"
     )
 
 
@@ -233,7 +236,7 @@ def _is_above(a: tuple[float, float], b: tuple[float, float], c: tuple[float, fl
 
 
 def _envelope_slope(hull: Bounds, reference_s: float) -> float:
-    """Return the slope of the hull's edge at the reference: of all lines below the samples the nearest."""
+    """Return the slope of the hull's edge at the reference: the highest line below all samples there."""
     if hull[0].size < 2:
         return 0.0
     edge = int(np.clip(np.searchsorted(hull[0], reference_s) - 1, 0, hull[0].size - 2))

@@ -28,14 +28,14 @@ SCHEMA_VERSION = 1
 POLICY_FOLDER = "policies"
 _WHAT = "the index of a dataset"
 _INDEX_BYTES = 64 * MIB
-"""That of 10,000 episodes has some 30 MB [B]."""
+"""Largest index [B]; that of 10,000 episodes has some 30 MB."""
 _LOCK_NAME = ".lock"
 Notify = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class _Version:
-    """What every index has, whichever version of deal-hw wrote it."""
+    """The part of an index that every version of deal-hw writes."""
 
     schema_version: int
 
@@ -61,13 +61,13 @@ class _Index:
 class Dataset:
     """A folder of episodes; made by :meth:`create_or_open` or :meth:`open`.
 
-    A collector closes it, or uses it in a ``with``: until then no other can append to it.
+    A collector closes it or uses it in a ``with`` block; until then no other collector can append to it.
 
     Attributes:
         folder: Where it is.
         description: ``RobotDescription.to_json()`` of its robot.
         digest: Digest of the description.
-        episodes: What the index says of each episode, in order.
+        episodes: Entry of the index for each episode, in order.
     """
 
     def __init__(
@@ -90,11 +90,11 @@ class Dataset:
     def create_or_open(
         cls, folder: Path, description: RobotDescription | Mapping[str, Any], notify: Notify = print
     ) -> Self:
-        """Open a dataset for a collector, creating it where there is none; holds its lock until closed.
+        """Open a dataset for a collector; it is created if missing, and locked until closed.
 
         Args:
             folder: The dataset.
-            description: Of the robot about to be recorded, or its plain JSON values.
+            description: Description of the robot to record, or its plain JSON values.
             notify: Called with a sentence for each repair.
 
         Raises:
@@ -127,7 +127,7 @@ class Dataset:
 
     @classmethod
     def open(cls, folder: Path, notify: Notify = print) -> Self:
-        """Open a dataset for reading; repairs what a killed collector left unless a collector is at work.
+        """Open a dataset for reading; recordings of a killed collector are repaired, unless one is recording.
 
         Args:
             folder: The dataset.
@@ -139,13 +139,13 @@ class Dataset:
         folder = Path(folder)
         if not (folder / INDEX_NAME).is_file():
             raise DatasetError(
-                f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, "
-                "`deal-hw data import` one of files"
+                f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, and "
+                "`deal-hw data import` makes one from files"
             )
         try:
             lock = _lock(folder)
         except OSError:
-            lock = -1  # A read-only copy is still good to read.
+            lock = -1  # A read-only copy can still be read.
         try:
             dataset = cls._load(folder, lock, notify)
             if lock >= 0:
@@ -186,18 +186,18 @@ class Dataset:
         return read_episode(self.path(index))
 
     def policy_path(self, digest: str) -> Path:
-        """Return where a policy is kept; ``digest`` is its file's SHA-256 or the first 16 digits of that."""
+        """Return the path of a kept policy; ``digest`` is its file's SHA-256 or the first 16 digits of it."""
         return self.folder / POLICY_FOLDER / f"{digest[:16]}.onnx"
 
     def keep_policy(self, file: Path, digest: str) -> Path:
-        """Keep a copy of the policy that moves the robot; one that is kept already is left as it is.
+        """Keep a copy of the policy that moves the robot; an existing copy is not changed.
 
         Args:
             file: The policy's file.
             digest: SHA-256 of its bytes.
 
         Raises:
-            DatasetError: It cannot be copied, or the file is another one now.
+            DatasetError: It cannot be copied, or the file was changed since it was checked.
         """
         self._require_lock()
         path = self.policy_path(digest)
@@ -223,14 +223,14 @@ class Dataset:
     def note_episode(
         self, path: Path, facts: Mapping[str, Any] | None = None
     ) -> tuple[EpisodeInfo, Episode | None]:
-        """Take a finished recording into the index, repairing it where its recorder was killed.
+        """Add a finished recording to the index; it is repaired first if its recorder was killed.
 
         Args:
-            path: As :meth:`next_episode_path` gave it.
+            path: Path returned by :meth:`next_episode_path`.
             facts: Plain JSON values to keep with it: outcome, loop_timing, task, ...
 
         Returns:
-            What the index says, and the recording; None if there is no sample in it.
+            The index's entry, and the recording; None if it contains no sample.
 
         Raises:
             DatasetError: It is not in this dataset's folder or cannot be read.
@@ -245,7 +245,7 @@ class Dataset:
         return info, episode
 
     def close(self) -> None:
-        """Let other collectors in; idempotent."""
+        """Release the dataset for other collectors; idempotent."""
         if self._lock >= 0:
             os.close(self._lock)
             self._lock = -1
@@ -262,18 +262,18 @@ class Dataset:
         return summarize(path, file, note, facts)
 
     def _adopt(self) -> None:
-        """Take in recordings that no index names: their collector was killed."""
+        """Add recordings that the index does not name, because their collector was killed."""
         known = {episode.file for episode in self.episodes}
         found = sorted((self.folder / "episodes").glob("[0-9]*.mcap"))
         strays = [f"episodes/{path.name}" for path in found if f"episodes/{path.name}" not in known]
         for file in strays:
             try:
-                info, _ = self._take(file, "taken in after its collector was killed")
+                info, _ = self._take(file, "added to the index after its collector was killed")
             except DatasetError as error:
                 self._notify(f"{self.folder / file} is left out: {error}")
                 continue
             self._notify(
-                f"{self.folder / file} was not in the index; taken in with {info.states} state samples"
+                f"{self.folder / file} was not in the index; it was added, with {info.states} state samples"
             )
             self.episodes = (*self.episodes, info)
         if strays:
@@ -310,9 +310,9 @@ class Dataset:
 
 
 def _lock(folder: Path) -> int:
-    """Return the descriptor of the taken lock, or -1 where another process has it.
+    """Return the descriptor of the lock, or -1 if another process holds it.
 
-    The kernel drops the lock when its holder dies, so that a killed collector locks nobody out.
+    The kernel drops the lock when its holder dies, so a killed collector does not block others.
     """
     descriptor = os.open(folder / _LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:

@@ -1,4 +1,4 @@
-"""What the index of a dataset says of one episode."""
+"""The entry of a dataset's index for one episode."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from deal_hw.errors import ConfigurationError, EmptyRecordingError, Insufficient
 from deal_hw.schema import STRICT
 
 _MOST_JUMPS = 20
-"""So many jumps of a clock the index names; a recording of nothing else must not fill it."""
+"""Largest number of clock jumps in an entry; a recording with very many must not fill the index."""
 _VERDICT = {"name", "severity", "message"}
 _CLOCK = {"offset_s", "drift_ppm", "offset_uncertainty_s", "drift_uncertainty_ppm"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeInfo:
-    """What ``dataset.json`` says of one episode.
+    """The entry of ``dataset.json`` for one episode.
 
     Attributes:
         file: Path inside the dataset, such as "episodes/000000.mcap".
         purpose: Why it was recorded, such as "collect" or "deploy".
-        policy_digest: Digest of the policy that commanded; "" where none did.
+        policy_digest: Digest of the policy that commanded; "" for none.
         wall_utc: Wall-clock time at its start, ISO 8601.
         duration_s: Device time from the first to the last sample [s].
         states: State samples.
@@ -35,13 +35,14 @@ class EpisodeInfo:
         cycles: Control cycles.
         verdicts: The telemetry checks, as ``telemetry_checks.CheckResult.to_json`` writes them.
         excitation: Movement, as ``excitation.Excitation.to_json`` writes it.
-        clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20
-            jumps at most; None where it cannot be told.
-        note: What the operator should know, such as a repair.
-        facts: What the collector adds: outcome, loop_timing, task, ...
+        clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20 jumps at most;
+            None if unknown.
+        note: A note for the operator, such as on a repair.
+        facts: Values that the collector adds: outcome, loop_timing, task, ...
 
     Raises:
-        ConfigurationError: The file is elsewhere, a verdict is none, or the clock's numbers are missing.
+        ConfigurationError: The file is outside the dataset, a verdict is invalid, or the clock's numbers are
+            missing.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
@@ -85,9 +86,9 @@ def _is_number(value: object) -> bool:
 def summarize(
     path: Path, file: str, note: str = "", facts: Mapping[str, Any] | None = None
 ) -> tuple[EpisodeInfo, Episode | None]:
-    """Read an episode; return what the index says of it, and the episode.
+    """Read an episode; return its entry for the index, and the episode.
 
-    One without samples gives zeros and a note, and None.
+    Without samples the entry has zeros and a note, and the episode is None.
 
     Args:
         path: The file.
@@ -142,6 +143,6 @@ def _clock(episode: Episode) -> Mapping[str, Any] | None:
 
 
 def motion_of(metadata: Mapping[str, Any]) -> str:
-    """Return what was played in a recording, by its metadata or its facts; "" where that is not said."""
+    """Return the motion of a recording, from its metadata or its facts; "" if unknown."""
     # Until November 2026 it was called a profile.
     return str(metadata.get("motion") or metadata.get("profile") or "")

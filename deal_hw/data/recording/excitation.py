@@ -1,4 +1,4 @@
-"""How much a recording moves the robot: what calibration needs to see."""
+"""How much the robot moves in a recording. Calibration needs enough motion."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Excitation:
 
 
 def excitation(trajectory: Trajectory) -> Excitation:
-    """Summarise how much a recording moves the robot; values that are not finite are left out."""
+    """Return how much the robot moves in a recording; values that are not finite are left out."""
     velocity = np.where(np.isfinite(trajectory.velocity), trajectory.velocity, 0.0)
     targets = trajectory.position_target
     return Excitation(

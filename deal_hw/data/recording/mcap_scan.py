@@ -1,8 +1,8 @@
-"""Reads MCAP files that may be torn, damaged or made to harm, record by record, without trusting any of them.
+"""Reads MCAP files that may be incomplete, damaged or malicious, record by record.
 
-The readers of the mcap library stop at the first thing that is wrong; this one goes on with the next chunk,
-and says which byte ranges it could not use. Whatever the bytes are, time is linear in the size of the file,
-and so is what all chunks hold together (:data:`MAX_RATIO`).
+The readers of the mcap library stop at the first error. This one continues with the next chunk, and reports
+the byte ranges that it could not use. For any bytes, its time is linear in the size of the file, and so is
+the size of all unpacked chunks together (:data:`MAX_RATIO`).
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from mcap.stream_reader import CRCValidationError, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 MAX_CHUNK_BYTES = 16 << 20
-"""Longest record, and the most that a chunk may hold [B]. The recorder closes a chunk at 1 MiB."""
+"""Largest record, and largest unpacked chunk [B]. The recorder closes a chunk at 1 MiB."""
 MAX_RATIO = 256
-"""Decompressed, the chunks of a file may have so many times its size. A Go2 at rest that sends the same bytes
-all the time reaches 46."""
+"""Largest size of all unpacked chunks, as a multiple of the file's size. A Go2 at rest, which sends the same
+bytes all the time, reaches 46."""
 _FREE_BYTES = 2 << 20
-"""So much the chunks may have whatever the ratio: more than the longest chunk of the recorder [B]."""
+"""Unpacked size that is allowed at any ratio: more than the recorder's longest chunk [B]."""
 _TRIES = 4
-"""Bytes of unusable records that are looked into, per byte of the file: a damaged chunk is met twice, in its
-place and in the search for the next one. Only a file of records that overlap each other needs more."""
+"""Bytes of unusable records that are read, per byte of the file. A damaged chunk is read twice: at its place,
+and in the search for the next one. Only a file with records that overlap needs more."""
 
 _PREFIX = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII4sQ")
-"""Of a zstd chunk, behind its prefix: first and last stamp, size, CRC, the compression's name, length."""
+"""Head of a zstd chunk, after its prefix: first and last stamp, size, CRC, the compression's name, length."""
 _CHUNK_MARK = struct.pack("<I", 4) + b"zstd"
 _CHUNK_MARK_OFFSET = _PREFIX.size + 8 + 8 + 8 + 4
 """From a chunk record's first byte to its compression name: prefix, start, end, uncompressed size, CRC."""
-# A flipped bit in a compressed frame's head can announce any size, hence the last two.
+# A flipped bit in the head of a compressed frame can announce any size; this raises the last two.
 _PARSE_ERRORS = (
     McapError,
     CRCValidationError,
@@ -71,7 +71,7 @@ _TYPES: dict[int, type[McapRecord]] = {
 
 @dataclass(frozen=True, slots=True)
 class FoundRecord:
-    """One readable record; a chunk comes with what is in it.
+    """One readable record; a chunk comes with its contents.
 
     Attributes:
         offset: Where it starts in the file.
@@ -91,8 +91,8 @@ class Lost:
     Attributes:
         offset: Where they start.
         size: How many.
-        reason: Why the first of them could not.
-        torn: They are the unfinished end of a file, not damage.
+        reason: Why the first of them could not be used.
+        torn: True for the incomplete end of a file, False for damage.
     """
 
     offset: int
@@ -102,10 +102,10 @@ class Lost:
 
 
 def scan(data: bytes) -> Iterator[FoundRecord | Lost]:
-    """Yield the records of a file in order, and what lies between them unreadable: one :class:`Lost` a place.
+    """Yield the records of a file in order, and one :class:`Lost` for each unreadable place between them.
 
-    Ends after the footer; a file without one ends with a torn :class:`Lost` (of size 0 if it was cut between
-    records). Records of other kinds (message indexes, summary) are passed over: a writer makes them anew.
+    Ends after the footer. A file without one ends with a torn :class:`Lost`, of size 0 if it was cut between
+    records. Records of other kinds (message indexes, summary) are skipped, because a writer makes them again.
     """
     lost: Lost | None = None
     for item in _Scanner(data).items():
@@ -125,7 +125,7 @@ def scan(data: bytes) -> Iterator[FoundRecord | Lost]:
 
 
 class _Scanner:
-    """Goes through a file once, and knows where the next readable chunk is."""
+    """Reads a file once, and remembers where the next readable chunk is."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -136,7 +136,7 @@ class _Scanner:
         self._searched = 0
 
     def items(self) -> Iterator[FoundRecord | Lost]:
-        """Yield what is found and lost; what is lost may come in pieces."""
+        """Yield found records and lost bytes; lost bytes may come in several pieces."""
         data, offset, in_data_section = self._data, len(MCAP0_MAGIC), True
         while True:
             if offset + _PREFIX.size > len(data):
@@ -144,7 +144,7 @@ class _Scanner:
                 return
             opcode, size = _PREFIX.unpack_from(data, offset)
             end = offset + _PREFIX.size + size
-            # A record of zeros is none: its length says nothing, and there may be millions of them.
+            # Zeros are no record: their length field has no meaning, and there may be millions of them.
             result = self._parse(offset, end) if opcode and end <= len(data) else None
             if not in_data_section and result is None:
                 yield Lost(offset, len(data) - offset, "the index is cut off", torn=True)
@@ -170,27 +170,28 @@ class _Scanner:
             offset = end
 
     def _skip(self, offset: int, end: int | None, reason: str) -> Lost:
-        """Return what to pass over from an unusable record on; its end is None where it cannot be known.
+        """Return the bytes to skip from an unusable record on; ``end``: the record's end, None if unknown.
 
-        The length may be what is wrong: the next readable chunk decides where to go on if it comes earlier.
+        The record's length may be wrong. So reading continues at the next readable chunk if that comes
+        earlier.
         """
         chunk = self._next_chunk(offset + 1)
         if self._left <= 0:
-            # Nobody writes such a file; going on would take quadratic time.
+            # No recorder writes such a file, and reading on would take quadratic time.
             return Lost(offset, len(self._data) - offset, "broken records that overlap", torn=True)
         stops = [stop for stop in (chunk, end) if stop is not None]
         stop = min(stops, default=len(self._data))
         return Lost(offset, stop - offset, reason, torn=not stops)
 
     def _parse(self, offset: int, end: int) -> FoundRecord | str | bool:
-        """Return the record, why it is unusable, or True for a kind that is passed over."""
+        """Return the record, or why it is unusable, or True for a kind that is skipped."""
         if self._chunk is not None and self._chunk.offset == offset:
             return self._chunk
         opcode, body = self._data[offset], self._view[offset + _PREFIX.size : end]
         kind = _TYPES.get(opcode)
         if kind is None:
             sound = _is_message_index(body) if opcode == Opcode.MESSAGE_INDEX else opcode in _SUMMARY_ONLY
-            return sound or "a record that makes no sense"
+            return sound or "a record of an unknown kind"
         if kind is Chunk and (wrong := self._refuse_chunk(body)):
             return wrong
         if len(body) > MAX_CHUNK_BYTES:
@@ -201,17 +202,17 @@ class _Scanner:
         return result
 
     def _refuse_chunk(self, body: memoryview) -> str:
-        """Return in no time why a chunk is not worth decompressing; "" where it is."""
+        """Return why a chunk cannot be unpacked, without unpacking it; "" if it can."""
         if len(body) < _CHUNK_HEAD.size:
             return "a chunk of a wrong length"
         _, _, size, _, name_size, name, packed_size = _CHUNK_HEAD.unpack_from(body)
-        # A length that grew would swallow the chunks behind it.
+        # A wrong, larger length would include the chunks after it.
         if (name_size, name) != (4, b"zstd") or len(body) != _CHUNK_HEAD.size + packed_size:
             return "a chunk of a wrong length"
         if size > min(MAX_CHUNK_BYTES, self._room):
             return f"a chunk that announces {size} bytes in {packed_size}"
         try:
-            # The decompressor takes the memory that the frame asks for, not what it is told to.
+            # The decompressor allocates the size in the frame's head, not the size in the chunk's head.
             announced = zstandard.get_frame_parameters(body[_CHUNK_HEAD.size :]).content_size
         except zstandard.ZstdError as error:
             return _damaged(Chunk, error)
@@ -247,7 +248,7 @@ def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> Found
         record: McapRecord = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
         builder = RecordBuilder()
         record.write(builder)
-        # The library reads past the end of a record without complaint; only the way back shows it.
+        # The library reads past the end of a record without an error; only encoding it again shows that.
         same = builder.end()[_PREFIX.size :] == body
     except _PARSE_ERRORS as error:
         return _damaged(kind, error)

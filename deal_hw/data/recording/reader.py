@@ -30,7 +30,7 @@ from deal_hw.transport import Message
 from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
 
 _BLOCK = 4096
-"""So many messages are decoded at once."""
+"""Number of messages that are decoded at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,14 +39,14 @@ class CycleTable:
 
     Attributes:
         cycle: Number, (N,).
-        deadline_s: When each should have started, (N,) [s].
-        start_s: When each started, (N,) [s].
+        deadline_s: Time at which each should have started, (N,) [s].
+        start_s: Time at which each started, (N,) [s].
         state_age_s: Age of the newest state when the action was computed, (N,) [s]; NaN where there was none.
         flags: :class:`~deal_hw.data.recording.record.CycleFlag` bits, (N,).
-        lost: Hand-overs to the recorder refused so far, (N,).
+        lost: Number of records that the recorder refused so far, (N,).
         safety_state: Name of the safety filter's state, N entries.
-        action: What the policy returned, (N, K); NaN where nothing.
-        requested_position: Position targets asked for, (N, A); NaN where none. Filled in dry runs too.
+        action: Action of the policy, (N, K); NaN for none.
+        requested_position: Requested position targets, (N, A); NaN for none. Dry runs have them, too.
     """
 
     cycle: IntArray
@@ -67,7 +67,7 @@ class Episode:
     Attributes:
         path: The file.
         description: ``RobotDescription.to_json()`` of the robot.
-        metadata: What the recorder was told: purpose, policy, task, ...
+        metadata: Values given to the recorder: purpose, policy, task, ...
         wall_utc: Wall-clock time, ISO 8601, at ``anchor_ns``.
         anchor_ns: Host clock when the recording was opened [ns].
         start_ns: Host clock at the zero of ``Trajectory.receive_s`` [ns].
@@ -97,8 +97,9 @@ def read_trajectory(path: Path) -> Trajectory:
 def read_episode(path: Path) -> Episode:
     """Read an episode.
 
-    ``Trajectory.metadata`` holds, beside what the recorder was told: ``description``, ``lost_frames`` (state
-    samples that never arrived), ``hand_over_losses`` (cycles that the recorder did not get) and ``start_ns``.
+    ``Trajectory.metadata`` holds the values given to the recorder, and ``description``, ``lost_frames``
+    (state samples that never arrived), ``hand_over_losses`` (cycles that the recorder did not get) and
+    ``start_ns``.
 
     Raises:
         EmptyRecordingError: There is no state sample in it.
@@ -129,7 +130,7 @@ def check_description(values: Mapping[str, Any]) -> None:
     """Check that a description given as JSON names a robot and its joints.
 
     Raises:
-        ConfigurationError: It does not.
+        ConfigurationError: It does not name them.
     """
     names = [*_names(values, "joint_names"), *_names(values, "actuated")]
     if not names or not isinstance(values.get("name"), str):
@@ -154,7 +155,7 @@ def _records(path: Path) -> Iterator[FoundRecord]:
             state = "is torn" if item.torn else "is damaged"
             raise TornRecordingError(
                 f"{path} {state} at byte {item.offset} ({item.reason}); "
-                f"mend it with: deal-hw data repair {path}"
+                f"repair it with: deal-hw data repair {path}"
             )
         yield item
 
@@ -186,9 +187,9 @@ class _Content:
     """What a recording contains.
 
     Attributes:
-        preamble: What the recorder was told.
-        state: The state samples, one at least.
-        body: What was sensed of the body; None for robots without one.
+        preamble: Values given to the recorder.
+        state: The state samples, at least one.
+        body: Sensor values of the body; None for robots without legs.
         rows: Values of the other messages, by topic.
     """
 
@@ -199,7 +200,7 @@ class _Content:
 
 
 class _Table:
-    """The messages of a type that has no text; a long recording has too many to decode each on its own."""
+    """The messages of a type without text; a long recording has too many to decode them one by one."""
 
     def __init__(self, kind: RosMessageType) -> None:
         self._kind = kind
@@ -244,11 +245,16 @@ def _collect(path: Path) -> _Content:
                 rows[topic].append(message_type(topic).decode(message.data))
     if preamble is None:
         raise DatasetError(
-            f"{path} does not say what it holds (no metadata {METADATA_NAME!r}): not by deal-hw"
+            f"{path} has no metadata {METADATA_NAME!r}: it was not written by deal-hw, or is damaged; "
+            "import a "
+            "foreign file with `deal-hw data import`"
         )
     state, body = (table.records() for table in tables.values())
     if state is None:
-        raise EmptyRecordingError(f"{path} holds no state sample; was the robot silent? Record again")
+        raise EmptyRecordingError(
+            f"{path} contains no state sample: the robot sent none; check it with `deal-hw doctor` and "
+            "record again"
+        )
     return _Content(preamble, state, body, rows)
 
 
@@ -303,7 +309,7 @@ def _episode(path: Path, content: _Content) -> Episode:
 
 
 def _body(table: npt.NDArray[np.void], state: npt.NDArray[np.void]) -> BodyTrajectory:
-    """Return what was sensed of the body at each state sample, found by stamp and number."""
+    """Return the body's sensor values at each state sample, matched by stamp and number."""
     row_of = {key: row for row, key in enumerate(_keys(table))}
     row = np.array([row_of.get(key, -1) for key in _keys(state)])
     columns = {}
@@ -356,13 +362,13 @@ def _cycles(rows: Mapping[str, Sequence[tuple[Any, ...]]], start_ns: int, actuat
 
 
 def lost_frames(sequence: IntArray) -> int:
-    """Return how many state samples never arrived, from the numbers of those that did."""
+    """Return the number of state samples that never arrived, from the sequence numbers of the others."""
     steps = np.diff(sequence)
     return int(np.sum(steps[steps > 1] - 1))
 
 
 def hand_over_losses(cycles: CycleTable) -> int:
-    """Return how many cycles are missing, from their numbers and from the sender's own count."""
+    """Return the number of missing cycles, from their sequence numbers and from the sender's own count."""
     if not cycles.cycle.size:
         return 0
     missing = int(np.sum(np.maximum(np.diff(cycles.cycle) - 1, 0)))

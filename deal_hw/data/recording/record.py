@@ -1,4 +1,4 @@
-"""What one control cycle hands to the recorder: one datagram in a static binary layout.
+"""The record of one control cycle for the recorder: one datagram in a static binary layout.
 
 The control process must not wait for disk, compression or a schema, so a cycle leaves it as one datagram over
 a non-blocking Unix socket. The layout is little-endian, versioned and closed by a CRC-32; nothing in it is
@@ -61,13 +61,13 @@ _scalars = operator.attrgetter(*_SCALARS)
 
 
 class CycleFlag(enum.IntFlag):
-    """What was unusual in a cycle; the bits of :attr:`CycleRecord.flags`."""
+    """Unusual events in a cycle; the bits of :attr:`CycleRecord.flags`."""
 
     NONE = 0
     OVERRUN = 1
     """The cycle started more than one period after its deadline."""
     CLIPPED = 2
-    """The safety filter changed what was asked for."""
+    """The safety filter changed the requested command."""
     NO_STATE = 4
     """No state sample arrived since the last cycle."""
     POLICY_LATE = 8
@@ -80,24 +80,24 @@ class CycleFlag(enum.IntFlag):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleRecord:
-    """Everything of one control cycle that is worth keeping; all stamps on the host's monotonic clock.
+    """The recorded values of one control cycle; all stamps are on the host's monotonic clock.
 
     Attributes:
         cycle: Number of the cycle, from 0.
-        deadline_ns: When the cycle should have started [ns].
-        start_ns: When it started [ns].
+        deadline_ns: Time at which the cycle should have started [ns].
+        start_ns: Time at which it started [ns].
         states: The samples received since the last cycle, in order of arrival.
-        action: What the policy returned, (K,); None without a policy or an action.
-        requested: The command requested of the safety filter; None where none was.
-        sent: The command really sent; None where none was (disarmed, dry run).
-        sent_sequence: Number of the command sent; -1 where none was.
-        sent_ns: When it was sent [ns]; -1 where none was.
-        state_age_ns: Age of the newest state when the action was computed [ns]; -1 where there was none.
+        action: Action of the policy, (K,); None without a policy or an action.
+        requested: The command given to the safety filter; None for none.
+        sent: The command that was sent; None for none (disarmed, dry run).
+        sent_sequence: Number of the sent command; -1 for none.
+        sent_ns: Time at which it was sent [ns]; -1 for none.
+        state_age_ns: Age of the newest state when the action was computed [ns]; -1 without a state.
         safety_state: Name of the safety filter's state.
         flags: :class:`CycleFlag` bits.
-        events: What happened in the cycle.
+        events: Events in the cycle.
         wire: Raw bytes since the last cycle, channels "rx" and "tx".
-        lost: Hand-overs to the recorder refused so far; a sender counts them.
+        lost: Number of records that the recorder refused so far, counted by the sender.
     """
 
     cycle: int
@@ -122,7 +122,7 @@ def encode(record: CycleRecord) -> bytes:
 
     Raises:
         ConfigurationError: Arrays do not fit each other, a number is out of range, or the datagram is too
-            long. A sender in a control loop counts this as a loss like a refused hand-over.
+            long. A sender in a control loop counts this like a record that the recorder refused.
     """
     try:
         body = _encode_body(record)
@@ -134,7 +134,7 @@ def encode(record: CycleRecord) -> bytes:
     if size > MAX_DATAGRAM_BYTES:
         raise ConfigurationError(
             f"cycle {record.cycle}: the record has {size} bytes, at most {MAX_DATAGRAM_BYTES} fit; "
-            "hand over fewer raw bytes or events at once"
+            "send fewer raw bytes or events in one cycle"
         )
     return body + _CRC.pack(zlib.crc32(body))
 
@@ -198,7 +198,7 @@ def decode(datagram: bytes) -> CycleRecord:
         return _decode_body(body)
     except (struct.error, ValueError, RecursionError) as error:
         raise ProtocolError(
-            f"cycle record of {len(datagram)} bytes does not hold what its head says: {error}"
+            f"cycle record of {len(datagram)} bytes does not match its head: {error}"
         ) from error
 
 
@@ -337,7 +337,7 @@ def _decode_command(cursor: _Cursor, actuated: int) -> JointCommand:
 
 
 def _encode_event(event: Event) -> bytes:
-    # The control loop must not die of an odd value in a note for the operator: it goes in as its text.
+    # A value that JSON cannot hold must not end the control loop, so its text is recorded instead.
     try:
         data = json.dumps(dict(event.data), default=str).encode() if event.data else b""
     except (TypeError, ValueError):
@@ -351,7 +351,7 @@ def _decode_event(cursor: _Cursor) -> Event:
     texts = cursor.text(kind), cursor.text(message)
     values = json.loads(cursor.take(data)) if data else {}
     if not isinstance(values, dict):
-        raise ValueError(f"an event's data are a JSON {type(values).__name__}, no object")
+        raise ValueError(f"an event's data are a JSON {type(values).__name__}, not an object")
     return Event(stamp_ns, *texts, values)
 
 

@@ -1,10 +1,10 @@
-"""Writes an episode as MCAP, in small chunks that are on their way to the disk every 50 ms.
+"""Writes an episode as MCAP, in small chunks that are handed to the kernel every 50 ms.
 
-Messages are logged on the wall clock, as other programs expect it; the monotonic stamps are inside. Beside
-our own messages stand the same values as standard ones (JointState, foxglove.Log, tf).
+Log times are on the wall clock, as other programs expect; the messages contain the monotonic stamps. The file
+has our own messages, and the same values as standard ones (JointState, foxglove.Log, tf).
 
-A chunk goes to the kernel in one piece and is never touched again, so that a killed recorder loses the chunk
-in progress and nothing else. What remains has no footer: :mod:`deal_hw.data.recording.repair` writes one.
+A chunk goes to the kernel in one piece and is never changed afterwards. So a killed recorder loses only the
+chunk in progress. Its file has no footer: :mod:`deal_hw.data.recording.repair` writes one.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from deal_hw.types import JointCommand, RobotState
 from deal_hw.version import __version__
 
 FLUSH_INTERVAL_S = 0.05
-"""Longest time a record waits for its chunk to be closed: half the loss that is allowed, so that a busy
-machine may be late by as much again."""
+"""Longest time until the chunk of a record is closed [s]: half of the allowed loss, so that a busy machine
+may be late by the other half."""
 FORMAT_VERSION = 2
 """Since 2 log times are on the wall clock and standard messages are written; both versions read alike."""
 METADATA_NAME = "deal-hw"
@@ -69,7 +69,7 @@ class EpisodeRecorder:
         metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
         clock: The host's monotonic clock, on which all stamps are.
         flush_interval_s: Longest time a record waits for its chunk to be closed [s].
-        wall_ns: The wall clock, ns since 1970; asked once, when the file is opened.
+        wall_ns: The wall clock [ns since 1970]; read once, when the file is opened.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class EpisodeRecorder:
         self._file: _ChunkFile | None = None
 
     def open(self) -> None:
-        """Create the file and write what describes the episode.
+        """Create the file and write the episode's description and metadata.
 
         Raises:
             DatasetError: The file exists or cannot be written.
@@ -126,9 +126,11 @@ class EpisodeRecorder:
         """Add one cycle; closes the chunk when it is due.
 
         Raises:
-            DatasetError: The disk is full or gone; what was flushed before is kept and closed properly.
+            DatasetError: The disk is full or gone; data flushed before are kept, and the file is closed
+                properly.
         """
-        # Counted from the cycle's own stamp: after a stall a queue is taken at once, and is old already.
+        # Counted from the cycle's own stamp: after a stall the queued cycles arrive together and are already
+        # old.
         self._wait_since(record.start_ns)
         for message in record.wire:
             self._add(
@@ -218,8 +220,8 @@ class EpisodeRecorder:
             self._file.seal()
         self._file = None
         return DatasetError(
-            f"recording to {self.path} stopped after {self.cycles} cycles: {error.strerror}; what was "
-            "written before is kept. Free some space, then look at it with: deal-hw data info"
+            f"recording to {self.path} stopped after {self.cycles} cycles: {error.strerror}; the data "
+            "written before are kept. Free some space, then check the file with: deal-hw data info"
         )
 
     def _wait_since(self, stamp_ns: int) -> None:
@@ -229,7 +231,8 @@ class EpisodeRecorder:
     def _preamble(self) -> dict[str, str]:
         # Whole microseconds, as wall_utc has them: the difference can be taken from the file again.
         host_ns, wall_ns = self._clock.now_ns(), self._read_wall_ns() // 1000 * 1000
-        # One difference for the whole episode: a wall clock that is set meanwhile must not bend its times.
+        # One difference for the whole episode: if the wall clock is set meanwhile, the log times must not
+        # jump.
         self._wall_minus_host_ns = wall_ns - host_ns
         wall = datetime.datetime.fromtimestamp(wall_ns / 1e9, datetime.timezone.utc)
         return {
@@ -303,7 +306,7 @@ class EpisodeRecorder:
 
 
 class _PackedIndex:
-    """The index of the chunks as the bytes that end up in the file, 0.2 KiB each; mcap's Writer fills it."""
+    """The index of the chunks, kept as bytes of the file, 0.2 KiB for each chunk; mcap's Writer fills it."""
 
     def __init__(self) -> None:
         self._data = RecordBuilder()
@@ -319,7 +322,7 @@ class _PackedIndex:
 
 
 class _ChunkFile:
-    """A file that is appended to whole flush by whole flush, so that it can always be cut at the last one."""
+    """A file that grows by whole flushes, so that it can always be cut at the end of the last one."""
 
     def __init__(self, path: Path) -> None:
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -347,7 +350,7 @@ class _ChunkFile:
         os.close(self._descriptor)
 
     def seal(self) -> None:
-        """Cut what a failed flush left and end the file properly; the last chunks make room if they must."""
+        """Cut the rest of a failed flush and end the file properly; on a full disk drop the last chunks."""
         end = _ending()
         for size in self._flushed[:0:-1]:
             try:
@@ -356,7 +359,7 @@ class _ChunkFile:
                     break
                 os.ftruncate(self._descriptor, size)
             except OSError:
-                continue  # Without an ending the file is torn but whole up to here; repair reads it.
+                continue  # Without an ending the file is complete up to here, and repair can read it.
         os.close(self._descriptor)
 
 

@@ -23,10 +23,10 @@ class RecorderOutcome:
     """How a recording ended.
 
     Attributes:
-        complete: Every hand-over that was taken is in the file, and the file is closed properly.
+        complete: Every accepted record is in the file, and the file is closed properly.
         cycles: Cycles written.
         states: State samples written.
-        errors: What went wrong, in words.
+        errors: Errors, as texts.
     """
 
     complete: bool
@@ -69,10 +69,10 @@ class RecorderHandle:
         if self._errors:
             raise DatasetError(f"the recorder cannot start: {self._errors[0]}")
         if not self._ready:
-            raise DatasetError(f"the recorder process did not come up within {timeout_s} s")
+            raise DatasetError(f"the recorder process did not start within {timeout_s} s")
 
     def errors(self) -> tuple[str, ...]:
-        """Return what went wrong so far, such as a full disk; polls the status pipe, never waits."""
+        """Return the errors so far, such as a full disk; polls the status pipe, never waits."""
         self._poll(0.0)
         return tuple(self._errors)
 

@@ -1,11 +1,11 @@
 """The recorder process: receives one datagram per control cycle and writes the episode until the peer closes.
 
-``recorder_launch`` starts it as ``python -m deal_hw.data.recording.recorder_process``. Whatever happens here,
-the socket is drained to its end: a control loop must never feel its recorder.
+``recorder_launch`` starts it as ``python -m deal_hw.data.recording.recorder_process``. Even after an error
+the socket is read to its end, because the recorder must never slow the control loop.
 
-It reports on ``--status-fd``, one JSON object a line with a key ``kind``: "ready", "error" (with
-``message``), and "finished" (with ``complete``, ``cycles``, ``states``, ``unreadable``). Exit codes: 0 all
-written; 3 the recording is incomplete.
+It reports on ``--status-fd``, one JSON object on each line with a key ``kind``: "ready", "error" (with
+``message``), and "finished" (with ``complete``, ``cycles``, ``states``, ``unreadable``). Exit codes: 0 if
+everything was written, 3 if the recording is incomplete.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from deal_hw.errors import DealHwError, ProtocolError
 
 EXIT_OK, EXIT_INCOMPLETE = 0, 3
 TERM_GRACE_S = 2.0
-"""How long after SIGTERM the peer may go on: the control process ends by the same signal, with last words."""
+"""How long the peer may still send after SIGTERM [s]: the control process ends by the same signal, and its
+last records follow."""
 
 
 class RecorderProcess:
@@ -68,7 +69,7 @@ class RecorderProcess:
         return EXIT_INCOMPLETE if incomplete else EXIT_OK
 
     def _receive(self) -> bool:
-        """Take what is at hand, waiting until the next chunk is due; return False when it is over."""
+        """Take the waiting records, or wait until the next chunk is due; return False at the end."""
         wait_s = self._recorder.due_in_s() if self._recorder is not None else None
         if self._stop_at_ns is not None:
             left_s = (self._stop_at_ns - self._clock.now_ns()) * 1e-9
@@ -104,7 +105,7 @@ class RecorderProcess:
         self._attempt("write", record)
 
     def _attempt(self, method: str, *arguments: Any) -> bool:
-        """Call the recorder; after its first error it is not called again, and the rest is only drained."""
+        """Call the recorder; after its first error it is not called again: further records are dropped."""
         if self._recorder is None:
             return False
         try:
@@ -140,7 +141,7 @@ def _write_quietly(descriptor: int, data: bytes) -> None:
     try:
         os.write(descriptor, data)
     except OSError:
-        pass  # Nobody listens any more; the episode matters more than the report.
+        pass  # Nobody reads the reports any more. The episode is more important.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
-"""Mends an episode that was torn by a kill or damaged on disk, and checks whole ones.
+"""Repairs an episode that was cut off by a kill or damaged on disk, and checks complete ones.
 
-Both take time in proportion to the file, and memory for the file and one chunk of it.
+Both need time in proportion to the file's size, and memory for the file and one of its chunks.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from deal_hw.errors import DatasetError
 
 REPAIR_NAME = "deal-hw.repair"
 _SHOWN = 3
-"""Damaged places that a sentence names; it counts the others."""
+"""Number of damaged places that a message names; it counts the others."""
 _KEPT = 100
-"""Damaged places and holes that a report lists; it counts the others."""
+"""Number of damaged places and holes that a report lists; it counts the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
-    """What a check or repair of a file found.
+    """Result of a check or repair of a file.
 
     Attributes:
         path: The file.
-        repaired: It was rewritten.
-        torn: It had no footer.
+        repaired: Whether it was rewritten.
+        torn: Whether it had no footer.
         messages: Readable messages.
         chunks: Readable chunks.
-        damaged: Damaged places, in words; of more than 100 the first.
-        places: How many there are.
+        damaged: Damaged places, as texts; at most the first 100.
+        places: Number of all damaged places.
         lost_bytes: Bytes that could not be used.
-        lost_spans_s: Stretches of the recording in which messages are missing, host time since the first [s];
-            of more than 100 the first.
-        holes: How many there are.
-        missing_s: How long they are together [s].
-        original: Where the original was kept; None where it was not.
+        lost_spans_s: Begin and end of each hole, where messages are missing: host time since the first
+            message [s]; at most the first 100.
+        holes: Number of all holes.
+        missing_s: Total length of the holes [s].
+        original: Path of the kept original; None if it was not kept.
     """
 
     path: Path
@@ -64,11 +64,11 @@ class RepairReport:
 
     @property
     def sound(self) -> bool:
-        """Nothing is wrong with the file."""
+        """Whether the file has no error."""
         return not self.torn and not self.damaged
 
     def describe(self) -> str:
-        """Return one line for the operator, however much is damaged."""
+        """Return one line for the operator, also if many places are damaged."""
         if self.sound:
             return f"{self.path}: sound, {self.messages} messages in {self.chunks} chunks"
         wrong = [*self.damaged[:_SHOWN]]
@@ -103,10 +103,10 @@ def verify(path: Path) -> RepairReport:
 
 
 def repair(path: Path) -> RepairReport:
-    """Rewrite a torn or damaged file from what is readable; a sound one is left alone.
+    """Rewrite an incomplete or damaged file from its readable parts; a valid file is not changed.
 
-    The original stays as ``.torn`` until the new file is whole and in place. After damage other than a torn
-    end it is kept for good: another tool may get more out of it.
+    The original stays as ``.torn`` until the new file is complete and in place. After damage other than a
+    missing end it is kept, because another tool may be able to read more of it.
 
     Raises:
         EmptyRecordingError: It has 0 bytes.
@@ -125,14 +125,14 @@ def repair(path: Path) -> RepairReport:
             file.flush()
             os.fsync(file.fileno())
         if not verify(fresh).sound:
-            raise DatasetError(f"{path}: the repaired copy does not verify; the original is untouched")
+            raise DatasetError(f"{path}: the repaired copy has errors, too; the original is unchanged")
         os.link(path, kept)
         os.replace(fresh, path)
         if not report.damaged:
             kept.unlink()
     except (OSError, struct.error) as error:
-        why = error.strerror if isinstance(error, OSError) else f"its numbers fit no MCAP file ({error})"
-        raise DatasetError(f"{path} cannot be repaired: {why}; the original is untouched") from error
+        why = error.strerror if isinstance(error, OSError) else f"MCAP cannot hold its numbers ({error})"
+        raise DatasetError(f"{path} cannot be repaired: {why}; the original is unchanged") from error
     finally:
         fresh.unlink(missing_ok=True)
     return replace(report, repaired=True, original=kept if report.damaged else None)
@@ -181,7 +181,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
                 mismatches.append("the checksum over the whole recording does not match")
         elif isinstance(item.record, Footer) and _is_index_damaged(data, item.offset, item.record):
             mismatches.append("the checksum of the index does not match")
-        # Chunks have checksums of their own; the index only fills in what nothing else knows.
+        # Chunks have checksums of their own; the index is used only for names that no chunk contains.
         if isinstance(item.record, Metadata) and item.record.name == METADATA_NAME:
             version = item.record.metadata.get("format_version", "")
         if isinstance(item.record, Schema):
@@ -203,7 +203,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
             channels.setdefault(number, channel)
     if not header.library.startswith("deal-hw"):
         raise DatasetError(
-            f"{path} was written by {header.library!r}; only recordings of deal-hw can be mended"
+            f"{path} was written by {header.library!r}; only recordings of deal-hw can be repaired"
         )
     damaged = [f"{loss.reason} at byte {loss.offset}" for loss in losses if not loss.torn] or mismatches
     if nameless := sum(count for channel, count in counts.items() if channel not in channels):
@@ -231,7 +231,7 @@ def _is_index_damaged(data: bytes, offset: int, footer: Footer) -> bool:
 
 
 def _known() -> tuple[dict[int, Schema], dict[int, Channel]]:
-    """Return the schemas and channels as a recorder numbers them, for a file whose first chunk is damaged."""
+    """Return schemas and channels with a recorder's numbers, for a file whose first chunk is damaged."""
     schemas: dict[str, Schema] = {}
     channels: dict[int, Channel] = {}
     for number, (topic, kind) in enumerate(CHANNELS.items(), start=1):
@@ -247,7 +247,7 @@ def _known() -> tuple[dict[int, Schema], dict[int, Channel]]:
 
 
 def _rewrite(data: bytes, findings: _Findings, file: IO[bytes]) -> None:
-    """Write all that is readable, chunk by chunk, and what was lost."""
+    """Write the readable parts, chunk by chunk, and a note on the lost ones."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile=findings.header.profile, library=LIBRARY)
     schemas = {

@@ -1,11 +1,10 @@
 """The messages inside an episode file: ROS 2 message definitions and their CDR encoding.
 
-Each type is data, a list of fields; the ros2msg text that goes into the file and the bytes of a message both
-follow from it, so that they cannot disagree. rerun, Foxglove and mcap_ros2 decode the messages from that
-text alone.
+Each type is a list of fields. Both the ros2msg text in the file and the bytes of a message are made from this
+list, so they always agree. rerun, Foxglove and mcap_ros2 need only that text to decode the messages.
 
-Beside our own types stand messages of ROS 2 and Foxglove, so that other programs plot an episode: fields in a
-row, whatever is nested in the definition, since CDR writes nested messages without anything in between.
+Messages of ROS 2 and Foxglove are included, so that other programs can plot an episode. Their nested fields
+are listed one after another here, because CDR writes nested messages without anything in between.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy.typing as npt
 from deal_hw.errors import ProtocolError, UnknownNameError
 
 _HEADER = b"\x00\x01\x00\x00"
-"""CDR encapsulation, little-endian; alignment counts from its end."""
+"""CDR header, little-endian; alignment counts from its end."""
 _SCALARS = {
     "int64": struct.Struct("<q"),
     "int32": struct.Struct("<i"),
@@ -32,7 +31,7 @@ _SCALARS = {
 }
 _LENGTH = _SCALARS["uint32"]
 _ALIKE = "alike: "
-"""Before the name of a vector: its length, in :meth:`RosMessageType.decode_all`."""
+"""Prefix of a field's name in :meth:`RosMessageType.decode_all`: the field is a vector's length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class RosMessageType:
         name: ROS 2 name.
         fields: Pairs of ros2msg type (int64, int32, uint32, uint8, bool, float64, string, string[], uint8[],
             float64[]) and name.
-        text: The ros2msg text where messages are nested; "" where it follows from the fields.
+        text: The ros2msg text if messages are nested; "" if it follows from the fields.
     """
 
     name: str
@@ -91,10 +90,12 @@ class RosMessageType:
         try:
             return tuple(cursor.value(kind) for kind, _ in self.fields)
         except (struct.error, ValueError) as error:
-            raise ProtocolError(f"{self.name}: {len(data)} bytes do not hold the message: {error}") from error
+            raise ProtocolError(
+                f"{self.name}: {len(data)} bytes do not contain the message: {error}"
+            ) from error
 
     def decode_all(self, messages: Sequence[bytes]) -> npt.NDArray[np.void]:
-        """Return messages without text as records with the fields' names, (N,); all are laid out alike.
+        """Return messages without text as records with the fields' names, (N,); all have the same layout.
 
         Raises:
             ProtocolError: The bytes are not such messages, or they or their vectors differ in length.
@@ -106,11 +107,11 @@ class RosMessageType:
         for name in layout.names or ():
             if name.startswith(_ALIKE) and np.any(found[name] != found[name][0]):
                 what = name.removeprefix(_ALIKE)
-                raise ProtocolError(f"{self.name}: {what} is not laid out alike in all messages")
+                raise ProtocolError(f"{self.name}: {what} has not the same layout in all messages")
         return found
 
     def _layout(self, data: bytes) -> np.dtype[np.void]:
-        """Return where each field is in messages like this one, and what tells that another is like it."""
+        """Return the place of each field in messages like this one, with the lengths to compare."""
         fields: list[tuple[str, Any, int]] = [(f"{_ALIKE}encapsulation", _LENGTH.format, 0)]
         at = len(_HEADER)
         for (kind, name), value in zip(self.fields, self.decode(data), strict=True):
@@ -277,7 +278,7 @@ TRANSFORM = RosMessageType(
     f"{_SECTION}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
     f"{_SECTION}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n" + _HEADER_TEXT,
 )
-"""A list of one transform."""
+"""The transforms of one moment: a list with one entry."""
 
 STANDARD: Mapping[str, RosMessageType] = {
     "/joint_states": JOINT_STATE,
@@ -286,7 +287,7 @@ STANDARD: Mapping[str, RosMessageType] = {
     "/log": LOG,
     "/tf": TRANSFORM,
 }
-"""Topics for other programs; ours read the others, which hold more."""
+"""Topics for other programs; deal-hw reads the other topics, which contain more."""
 
 CHANNELS: Mapping[str, RosMessageType] = {
     "/robot": ROBOT,
@@ -302,15 +303,15 @@ CHANNELS: Mapping[str, RosMessageType] = {
 }
 """Topic -> type, in the order in which a recorder registers them: the n-th has channel id n, from 1.
 
-Repair relies on that order where the part of a file that names the channels is damaged: append, never
-reorder.
+Repair relies on that order if the part of a file that names the channels is damaged. So append, and never
+change the order.
 """
 
 FIRST_CHANNELS = 9
-"""So many of them recordings of format version 1 have."""
+"""Number of these topics in recordings of format version 1."""
 
 OLD_TOPICS: Mapping[str, str] = {"/command/asked": "/command/requested"}
-"""Topics by the names that recordings of November 2026 have."""
+"""Topic names in recordings of November 2026 -> present names."""
 
 
 def message_type(topic: str) -> RosMessageType:

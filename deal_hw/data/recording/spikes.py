@@ -1,19 +1,20 @@
-"""Spikes: one to three samples that jump away and come back, as no joint can.
+"""Spikes: one to three samples that jump away and come back, faster than the joint can move.
 
 An encoder that loses a bit, a bus that swaps two answers, or a driver that returns 0 before its first read
-leave single samples radians off. A least-squares fit pays more for three of them than for all other samples
-together, so they are left out, and it is said which.
+leave single samples that are wrong by radians. Three of them can change a least-squares fit more than all
+other samples together. So they are left out, and reported.
 
-The rule needs only the recording. A joint with speed v at most can be v (b - a) / 2 away from both the sample
-before, at time a, and the one after, at b. One to three samples are a spike where each of them lies more than
-``ratio`` times as far from both, v being the largest of
+The rule needs only the recording. A joint whose speed is at most v can be at most v (b - a) / 2 away from
+both the sample before, at time a, and the one after, at time b. One to three samples are a spike if each is
+more than ``ratio`` times as far from both. Here v is the largest of
 
-- the median speed of the samples around, so that chatter near half the sampling rate is no spike;
-- the speed from the sample before to the one after, so that a jump for good is none;
+- the median speed of the samples around, so that oscillation near half the sampling rate is not a spike;
+- the speed from the sample before to the one after, so that a permanent jump is not a spike;
 - the joint's fastest motion elsewhere in the recording: the largest speed that two steps in a row reach.
 
 Real motion, contacts and quantisation reach a ratio of 1 (18 joints of a real SO-101 and a real Go2, nine
-recordings). A joint that hardly moves says nothing of its speed, therefore ``speed`` and ``least``.
+recordings). A joint that hardly moves does not show its speed. Therefore ``speed`` and ``least`` are limits
+of their own.
 """
 
 from __future__ import annotations
@@ -33,25 +34,27 @@ _TOLD = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpikeSettings:
-    """What counts as a spike."""
+    """Definition of a spike."""
 
     ratio: float = 5.0
-    """So many times farther than the joint's own motion takes it. Real recordings reach 1."""
+    """Distance from both neighbours, over the largest distance that the joint's own motion reaches; more is a
+    spike. Real recordings reach 1."""
 
     speed: Mapping[str, float] = field(default_factory=lambda: {"rad": 10.0, "m": 1.0})
-    """A joint may be so fast although the recording does not show it [rad/s or m/s]: twice a hobby servo."""
+    """Speed that is always possible, even if the recording does not show it [rad/s or m/s]: twice that of a
+    hobby servo."""
 
     least: Mapping[str, float] = field(default_factory=lambda: {"rad": 0.1, "m": 0.01})
-    """Smaller jumps stay in, however fast the sampling is [rad or m]: coarse encoders, noise."""
+    """Smaller jumps are never spikes, at any sampling rate [rad or m]: coarse encoders, noise."""
 
     longest: int = 3
-    """Samples of the longest spike."""
+    """Number of samples of the longest spike."""
 
     around: int = 6
-    """Steps before, and as many after, whose median speed counts."""
+    """Number of steps before, and after, for the median speed."""
 
     most: float = 0.02
-    """Share of samples from which on the recording is refused: that sensor cannot be used."""
+    """With a larger share of spikes the recording is refused: that sensor cannot be used."""
 
 
 DEFAULT_SPIKES = SpikeSettings()
@@ -59,12 +62,12 @@ DEFAULT_SPIKES = SpikeSettings()
 
 @dataclass(frozen=True, slots=True)
 class Spike:
-    """A run of samples of one joint that is not to be believed.
+    """Successive samples of one joint that cannot be true.
 
     Attributes:
         rows: Its samples.
         joint: Index of the joint.
-        size: How far the farthest of them lies off the line between its neighbours [rad or m].
+        size: Largest distance of its samples from the line between its neighbours [rad or m].
     """
 
     rows: tuple[int, ...]
@@ -78,11 +81,10 @@ def find_spikes(
     """Return the spikes of a recording, in order of time.
 
     Args:
-        time_s: Stamps, (T,) [s]. Samples with the stamp of the one before are not looked at.
-        position: Measured positions, (T, J); samples with one that is not finite are not looked at.
-        units: "rad" or "m" of each joint, (J,); joints of a damaged recording with another unit are not
-            looked at.
-        settings: What counts.
+        time_s: Stamps, (T,) [s]. Samples with the stamp of the one before are ignored.
+        position: Measured positions, (T, J); samples with one that is not finite are ignored.
+        units: "rad" or "m" of each joint, (J,); joints of a damaged recording with another unit are ignored.
+        settings: Definition of a spike.
     """
     rows = np.flatnonzero(np.isfinite(time_s) & np.isfinite(position).all(axis=1))
     rows = rows[np.diff(time_s[rows], prepend=-np.inf) > 0]
@@ -99,7 +101,7 @@ def find_spikes(
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Samples that lie off: how far from the line through their neighbours, and the speed that it takes."""
+    """Successive suspect samples: distance from the line between their neighbours, and the needed speed."""
 
     rows: range
     size: float
@@ -107,7 +109,7 @@ class _Run:
 
 
 def _of_joint(time_s: FloatArray, position: FloatArray, unit: str, settings: SpikeSettings) -> list[_Run]:
-    # Mirrored at both ends, so that a first sample that was never read has neighbours on two sides.
+    # Mirrored at both ends, so that a wrong first sample has neighbours on two sides, too.
     pad = settings.longest
     t = np.pad(time_s, pad, mode="reflect", reflect_type="odd")
     x = np.pad(position, pad, mode="reflect")
@@ -124,7 +126,7 @@ def _of_joint(time_s: FloatArray, position: FloatArray, unit: str, settings: Spi
             return []
         onward = np.where(velocity[1:] * velocity[:-1] > 0, np.minimum(speed[1:], speed[:-1]), 0.0)
         for run in runs:
-            # Two steps that touch the run: from the one before the step into it on.
+            # Pairs of steps that touch the run, from the step before the one into it.
             onward[max(run.rows.start - 2, 0) : run.rows.stop] = 0.0
         fastest = float(np.max(onward))
     return [
@@ -137,7 +139,7 @@ def _of_joint(time_s: FloatArray, position: FloatArray, unit: str, settings: Spi
 def _runs(
     t: FloatArray, x: FloatArray, speed: FloatArray, length: int, unit: str, settings: SpikeSettings
 ) -> Iterator[_Run]:
-    """Yield the runs of so many samples that lie off by what the samples around them do not explain."""
+    """Yield the runs of a given length whose jump the samples around them do not explain."""
     before, after = x[: -length - 1], x[length + 1 :]
     run = np.stack([x[1 + k : x.size - length + k] for k in range(length)])
     off = np.min(np.minimum(np.abs(run - before), np.abs(run - after)), axis=0)
@@ -155,7 +157,7 @@ def _runs(
 
 
 def describe(spikes: Sequence[Spike], time_s: FloatArray, joints: Sequence[str], units: Sequence[str]) -> str:
-    """Return what was found in words: joint, size, time and number of samples of each."""
+    """Return text with joint, size, time and number of samples of each spike."""
     told = [
         f"{joints[s.joint]} {s.size:+.3g} {units[s.joint]} at {time_s[s.rows[0]]:.3f} s"
         + (f" ({len(s.rows)} samples)" if len(s.rows) > 1 else "")
@@ -166,7 +168,7 @@ def describe(spikes: Sequence[Spike], time_s: FloatArray, joints: Sequence[str],
 
 
 def sound(spikes: Sequence[Spike], count: int) -> Mask:
-    """Return which of so many samples belong to no spike, (T,)."""
+    """Return which samples belong to no spike, (T,)."""
     kept = np.ones(count, dtype=bool)
     kept[[row for spike in spikes for row in spike.rows]] = False
     return kept
@@ -199,6 +201,6 @@ def without_spikes(trajectory: Trajectory, settings: SpikeSettings = DEFAULT_SPI
 
 
 def position_units(trajectory: Trajectory) -> tuple[str, ...]:
-    """Return the unit of each position, "rad" where the recording does not say, (J,)."""
+    """Return the unit of each position, "rad" if the recording does not name it, (J,)."""
     units = trajectory.metadata.get("description", {}).get("position_units")
     return tuple(units) if units else ("rad",) * len(trajectory.joint_names)

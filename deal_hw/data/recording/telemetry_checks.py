@@ -1,8 +1,9 @@
-"""Telemetry checks: what in a recording would mislead a calibration.
+"""Telemetry checks find errors in a recording that would mislead a calibration.
 
-A check returns one :class:`CheckResult`: "ok", "warn" (usable, but know it) or "fail" (calibrate refuses).
-Clamping by the device is data and never fails; clamping by our own safety filter is flagged, because the
-policy was not obeyed.
+A check returns one :class:`CheckResult`: "ok", "warn" (usable, with a limitation) or "fail" (``calibrate``
+refuses the recording).
+Limits of the device are part of the data and never fail. Limits of deal-hw's own safety filter are reported,
+because then the robot did not get the policy's commands.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ MIN_DURATION_S = 2.0
 MAX_GAP_S = 0.05
 FROZEN_S = 0.5
 CLIP_TOLERANCE = 1e-5
-"""Differences between asked and sent below this are the wire's rounding [m or rad]."""
+"""Smaller differences between requested and sent are the wire's rounding [m or rad]."""
 
 
 class Severity(str, enum.Enum):
-    """How bad it is."""
+    """Severity of a finding."""
 
     OK = "ok"
     WARN = "warn"
     FAIL = "fail"
 
     def __str__(self) -> str:
-        """Return the word, as format and print do for text."""
+        """Return the value, as for a plain text."""
         return str(self.value)
 
 
@@ -43,8 +44,8 @@ class CheckResult:
 
     Attributes:
         name: The check.
-        severity: How bad it is.
-        message: One sentence with the numbers and, where something is wrong, what to do.
+        severity: Its severity.
+        message: One sentence with the numbers and, if something is wrong, what to do.
     """
 
     name: str
@@ -100,7 +101,7 @@ def spikes_verdict(
     units: Sequence[str],
     settings: SpikeSettings,
 ) -> CheckResult:
-    """Say which samples jump away and come back; arguments as of :func:`find_spikes`."""
+    """Check for samples that jump away and come back; arguments as of :func:`find_spikes`."""
     found = find_spikes(time_s, position, units, settings)
     if not found:
         return CheckResult("spikes", Severity.OK, "no position jumps away and comes back")
@@ -113,11 +114,13 @@ def spikes_verdict(
         return CheckResult(
             "spikes",
             Severity.FAIL,
-            f"{text}; that is {count / time_s.size:.1%} of all samples: the sensor or its line fails. Mend "
-            "it and record again",
+            f"{text}; that is {count / time_s.size:.1%} of all samples: the sensor or its cable fails. "
+            "Repair it and record again",
         )
     return CheckResult(
-        "spikes", Severity.WARN, f"{text}. Calibration leaves them out (--spike-ratio); check sensor and line"
+        "spikes",
+        Severity.WARN,
+        f"{text}. Calibration leaves them out (--spike-ratio); check the sensor and its cable",
     )
 
 
@@ -163,7 +166,7 @@ def _finite(trajectory: Trajectory) -> CheckResult:
 def _clock(trajectory: Trajectory) -> CheckResult:
     back = int(np.sum(np.diff(trajectory.device_s) < 0))
     if back:
-        text = f"the device clock ran backwards {back} times; did the device restart? Record again"
+        text = f"the device clock ran backwards {back} times; probably it restarted. Record again"
         return CheckResult("clock", Severity.FAIL, text)
     jumps = find_jumps(trajectory.device_s, trajectory.receive_s - trajectory.device_s)
     if jumps:
@@ -173,7 +176,7 @@ def _clock(trajectory: Trajectory) -> CheckResult:
     repeated = int(np.sum(np.diff(trajectory.device_s) == 0))
     if repeated:
         severity = Severity.FAIL if repeated > 0.02 * trajectory.device_s.size else Severity.WARN
-        text = f"{repeated} samples repeat the device time of the one before; is the device stuck?"
+        text = f"{repeated} samples repeat the device time of the one before; check that the device measures"
         return CheckResult("clock", severity, text)
     return CheckResult("clock", Severity.OK, "the clocks of device and host run evenly")
 
@@ -208,7 +211,7 @@ def _jitter(trajectory: Trajectory) -> CheckResult:
     text = f"samples arrive {p50 * 1e3:.2f} ms (p50), {p99 * 1e3:.2f} ms (p99) after the fastest one"
     if p99 > 0.02:
         return CheckResult(
-            "jitter", Severity.WARN, f"{text}; control was late, the device's own stamps are not"
+            "jitter", Severity.WARN, f"{text}; control was late, but the device's own stamps are not affected"
         )
     return CheckResult("jitter", Severity.OK, text)
 
@@ -223,7 +226,8 @@ def _frozen(trajectory: Trajectory) -> CheckResult:
     if not found:
         return CheckResult("frozen", Severity.OK, "no position stands still while others move")
     text = (
-        f"positions without any change while other joints move: {', '.join(found)}; is the sensor connected?"
+        f"positions without any change while other joints move: {', '.join(found)}; check that the sensor "
+        "is connected"
     )
     whole = any(not np.any(np.diff(column)) for column in trajectory.position.T)
     return CheckResult("frozen", Severity.FAIL if whole else Severity.WARN, text)
@@ -244,14 +248,14 @@ def _commands(trajectory: Trajectory) -> CheckResult:
     sent = trajectory.sent_sequence
     if not sent.size:
         return CheckResult(
-            "commands", Severity.WARN, "no command was sent; the motors were passive all along"
+            "commands", Severity.WARN, "no command was sent; the motors were passive in the whole recording"
         )
     inside = sent[sent <= (seen[-1] if seen.size else -1)]
     arrived = float(np.mean(np.isin(inside, seen))) if inside.size else 0.0
     text = f"{arrived:.1%} of the commands were seen in force"
     if arrived < 0.5:
         return CheckResult(
-            "commands", Severity.FAIL, f"{text}; the device does not get them. Check the line to it"
+            "commands", Severity.FAIL, f"{text}; the device does not get the others. Check the cable to it"
         )
     return CheckResult("commands", Severity.WARN if arrived < 0.98 else Severity.OK, text)
 
@@ -259,7 +263,10 @@ def _commands(trajectory: Trajectory) -> CheckResult:
 def _clamped_by_device(trajectory: Trajectory) -> CheckResult:
     effort = np.mean((trajectory.status & int(Status.EFFORT_CLAMPED)) != 0)
     speed = np.mean((trajectory.status & int(Status.SPEED_CLAMPED)) != 0)
-    text = f"the device's own limits were in force: effort {effort:.1%}, speed {speed:.1%} of the time (data)"
+    text = (
+        f"the device's own limits were in force: effort {effort:.1%}, speed {speed:.1%} of the time; "
+        "this is no error"
+    )
     return CheckResult("clamped_by_device", Severity.OK, text)
 
 
@@ -270,7 +277,7 @@ def _clamped_by_us(trajectory: Trajectory) -> CheckResult:
     text = f"our safety filter changed {count} of {clipped.size} commands"
     if count > 0.05 * clipped.size:
         return CheckResult(
-            "clamped_by_us", Severity.WARN, f"{text}; ask for smaller targets or raise its limits"
+            "clamped_by_us", Severity.WARN, f"{text}; request smaller targets or raise its limits"
         )
     return CheckResult("clamped_by_us", Severity.OK, text)
 
@@ -281,9 +288,9 @@ def _stopped(trajectory: Trajectory) -> CheckResult:
     stops = float(np.mean((trajectory.status & int(Status.AT_END_STOP)) != 0))
     text = f"watchdog {watchdog:.1%}, fault {fault:.1%}, at an end stop {stops:.1%} of the time"
     if watchdog or fault:
-        return CheckResult("stopped", Severity.WARN, f"{text}; the motors were off then, use the part before")
+        return CheckResult("stopped", Severity.WARN, f"{text}; the motors were off then: use the part before")
     if stops:
-        return CheckResult("stopped", Severity.WARN, f"{text}; the model's end stops must fit")
+        return CheckResult("stopped", Severity.WARN, f"{text}; check the model's end stops")
     return CheckResult("stopped", Severity.OK, text)
 
 
@@ -291,5 +298,5 @@ def _hand_over(trajectory: Trajectory) -> CheckResult:
     lost = int(trajectory.metadata.get("hand_over_losses", 0))
     text = f"{lost} control cycles did not reach the recorder"
     if lost:
-        text += "; their samples are missing. Is the disk slow or the computer overloaded?"
+        text += "; their samples are missing. Check for a slow disk or an overloaded computer"
     return CheckResult("hand_over", Severity.WARN if lost else Severity.OK, text)
