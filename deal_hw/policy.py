@@ -368,7 +368,7 @@ class ObservationBuilder:
             self._base = np.roll(self._base, 1, axis=0)
             self._base[0] = base_features(position[..., :BASE_SIZE], velocity[..., :BASE_SIZE])
             self._base = np.where(self._fresh[..., None], self._base[:1], self._base)
-        # The history of a new member is filled with its present state, since there is no other.
+        # The history of a new member is filled with its present state, because it has no past.
         fresh = self._fresh[..., None]
         self._position = np.where(fresh, self._position[:1], self._position)
         self._velocity = np.where(fresh, self._velocity[:1], self._velocity)

@@ -45,7 +45,7 @@ class Robot(abc.ABC):
         """Close the transport. Does not send ``passive``; the caller sends it as the last command."""
 
     def reopen(self) -> None:  # noqa: B027
-        """Open a lost transport again; the knowledge of the robot stays.
+        """Open a lost transport again; the driver keeps what it knows about the robot.
 
         Raises:
             TransportError: It cannot be opened now; a later attempt may succeed.
@@ -104,7 +104,7 @@ class Robot(abc.ABC):
 
     @property
     def fault(self) -> str:
-        """A problem that forbids to continue, such as another program's commands; "": none."""
+        """A problem after which the run must not continue, such as another program's commands; "": none."""
         return ""
 
     @property

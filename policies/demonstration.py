@@ -1,4 +1,4 @@
-"""pi_0 in the loop of a target or of a population: policies as plain functions of the state.
+"""Demonstration policies (pi_0 in the DEAL paper) in closed loop with simulated robots.
 
 It needs numpy only. The callables fit :data:`deal_hw.sim.recordings.target.Behaviour` and the calibrator's
 population policies without importing either. States are those of

@@ -1,7 +1,7 @@
 """Evaluation of balancing policies: the paper's Table 2, batched over many robots.
 
-The task is fixed: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). It is
-judged by the reported states, because a real robot has no others.
+The task is fixed: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). The
+results use the reported states, because a real robot has no others.
 """
 
 from __future__ import annotations

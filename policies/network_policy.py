@@ -30,7 +30,7 @@ class NetworkPolicy:
         return self._spec
 
     def reset(self) -> None:
-        """Do nothing: the observation carries the past."""
+        """Do nothing: past values are part of the observation."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,)."""

@@ -73,7 +73,7 @@ class OnnxPolicy:
         return bool(self._session.get_inputs()[0].shape[0] != 1)
 
     def reset(self) -> None:
-        """Do nothing: the observation carries the past."""
+        """Do nothing: past values are part of the observation."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,).

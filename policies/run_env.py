@@ -133,7 +133,7 @@ class RunEnv(LocomotionEnv):
 
 
 class HumanoidEnv(RunEnv):
-    """The same for the humanoid, which starts standing, not settled: settling would let it fall.
+    """The running task of the humanoid. It starts standing, without settling, because it would fall.
 
     Staying up is worth as much as a speed of one metre per second, and its 21 motors cost less.
     """

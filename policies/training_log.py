@@ -1,4 +1,4 @@
-"""TensorBoard's files of a training."""
+"""Writes TensorBoard files during a training."""
 
 from __future__ import annotations
 

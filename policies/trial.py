@@ -225,7 +225,7 @@ class TrialPolicy:
         return reply
 
     def _obituary(self) -> str:
-        """Return how the process died, in words."""
+        """Return text on how the process ended."""
         try:
             code = self._child.wait(_DYING_S)
         except subprocess.TimeoutExpired:
@@ -293,7 +293,7 @@ def _try(policy: TrialPolicy, behaviour: PolicyBehaviour, probe: Probe, allowed_
     """Return a policy's time from a state to a command [s]."""
     times = [_time_command(policy, behaviour, probe)]
     while times[0] > allowed_s and len(times) < _REPEATS:
-        # One late action may be an accident: cold pages and caches.
+        # One late action may have another cause, such as cold caches, so only the median counts.
         times.append(_time_command(policy, behaviour, probe))
     if median(times) > allowed_s:
         raise PolicyError(

@@ -104,7 +104,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self._scale = np.array(layout.action_scale)
         self._default = np.array(layout.default_position)[list(description.actuated_index)]
         if description.actuation == "motor":
-            # An action is an effort: a motor has no reference pose.
+            # For a motor an action is an effort, so there is no reference pose.
             self._default = np.zeros_like(self._default)
 
     @abc.abstractmethod

@@ -33,7 +33,7 @@ import torch
 KEYS = ("time", "dof_pos", "des_dof_pos")
 JOINTS = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
 COLUMNS = """\
-# Suspended Go2 of iit-DLSLab/sim2real-robot-identification (BSD-3-Clause): what the arrays of the NPZ mean.
+# Suspended Go2 of iit-DLSLab/sim2real-robot-identification (BSD-3-Clause): meaning of the arrays in the NPZ.
 # Leg by leg as its collecting script writes them; the hips of the right legs are commanded against the left.
 time: time
 position: dof_pos

@@ -44,7 +44,7 @@ MODEL = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_rol
 JAW_CLOSED_RAD = -0.174533
 JAW_TRAVEL_RAD = 1524 * 2 * math.pi / 4096
 COLUMNS = """\
-# SO-101 of isaac-sim2real/sage (Apache-2.0): what the arrays of the NPZ files mean.
+# SO-101 of isaac-sim2real/sage (Apache-2.0): meaning of the arrays in the NPZ files.
 # Signs (1 or -1) and offsets [rad] against your model are not known: check them before you trust a fit.
 time: time
 command_time: command_time

@@ -47,9 +47,9 @@ GOES_WRONG_AT_S = 0.4
 """Beginning of a policy's fault [s]."""
 
 Expect = Literal["goes on", "passive", "contested", "untouched", "unhomed", "stiff"]
-"""Expected ends: the run finished; the robot is passive and stays so; the same while another program goes on
-commanding; nothing was sent; no motor was commanded; the robot holds its last command, because only its own
-side could help."""
+"""Expected ends: the run finished; the robot is passive and stays so; the same while another program
+continues to command; nothing was sent; no motor was commanded; the robot holds its last command, because only
+a program on its own side could stop it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -152,7 +152,7 @@ class Rig(ABC):
 
     @abstractmethod
     def untouched(self, report: Mapping[str, Any]) -> str:
-        """Return the commands to the robot, in words; "" for none."""
+        """Return the commands to the robot, as text; "" for none."""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
         """Return the time of the emulator's own fault [host ns]; -1: there was none."""
@@ -274,7 +274,7 @@ class Rig(ABC):
             due_ns = begun_ns + round(offset_s * 1e9)
             time.sleep(max(due_ns - time.monotonic_ns(), 0) * 1e-9)
         if not begun_ns or (self.phase != ENDING and self.run.poll() is not None):
-            raise SpoiledError(f"the run ended before its phase {self.phase!r} was through")
+            raise SpoiledError(f"the run ended before its phase {self.phase!r} was over")
 
     def control_pid(self) -> int:
         """Return the control process's pid once it exists; -1 where the run ended before."""

@@ -36,7 +36,7 @@ RATE_HZ = 50.0
 
 @dataclass(frozen=True, kw_only=True)
 class MeasureLoopTiming:
-    """Measure the control loop_timing and print it as JSON."""
+    """Measure the timing of the control loop and print it as JSON."""
 
     minutes: float = 10.0
     """Length of the run [min]."""
@@ -67,7 +67,7 @@ def _late_cycles(recording: Episode) -> list[tuple[int, int]]:
 
 
 def _judge(overruns: list[tuple[int, int]], seen: Account) -> list[dict[str, Any]]:
-    """Return each overrun (due, started) [ns] with the longest pause of any processor while it was late."""
+    """Return each overrun (due, started) [ns] with the longest pause of any processor during it."""
     return [
         {
             "late_ms": (started - due) * 1e-6,

@@ -203,7 +203,7 @@ def verdict(rss: float, held: float | None, most: float) -> str:
     if rss < most and (held is None or held < most):
         return "flat"
     if held is not None and held < most:
-        return "nothing more is held; malloc keeps freed memory"
+        return "held memory does not grow; malloc keeps freed memory"
     return "grows"
 
 

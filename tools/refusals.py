@@ -1,4 +1,4 @@
-"""List every refusal of the product: its place, type and words.
+"""List every refusal of the product: function, type and message.
 
     python tools/refusals.py                        # print the table
     python tools/refusals.py --write                # rewrite tests/house/refusals.txt

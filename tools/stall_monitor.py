@@ -1,4 +1,4 @@
-"""Stall monitor beside a measurement: was a program late, or did the whole machine pause?
+"""Stall monitor: distinguishes a late program from a pause of the whole machine during a measurement.
 
     python tools/stall_monitor.py --seconds 60 --least-ms 1
 

@@ -52,8 +52,8 @@ Own least-squares loops of the folder: candidates for a person to judge
     imported by name).
     accepting: it is a ``for`` or ``while`` statement with an ``if`` in it that compares and then breaks,
     returns or continues.
-    The list is to be read, its length is not the figure: a hand-written Levenberg-Marquardt loop is in it,
-    and so are a Kalman filter and a Riccati equation. A loop whose solve is two calls away, or comes in as
+    Read the list; its length alone means nothing. It contains a hand-written Levenberg-Marquardt loop, but
+    also a Kalman filter and a Riccati equation. A loop whose solve is two calls away, or comes in as
     an argument, is not found.
 """
 

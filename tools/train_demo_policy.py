@@ -119,15 +119,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="environment steps; by default those of the shipped policy")
     parser.add_argument("--members", type=int, help="by default those of the shipped policy")
-    parser.add_argument("--judged", type=int, default=JUDGED, help="robots that the policy is judged by")
+    parser.add_argument("--judged", type=int, default=JUDGED, help="robots on which the policy is evaluated")
     parser.add_argument("--out", type=Path)
     parser.add_argument(
         "--checkpoint",
         type=Path,
         help="a .safetensors file to keep while it trains; its networks are shipped beside the policy",
     )
-    parser.add_argument("--resume", action="store_true", help="go on from --checkpoint")
-    parser.add_argument("--judge", action="store_true", help="train nothing, judge the file that is there")
+    parser.add_argument("--resume", action="store_true", help="continue from --checkpoint")
+    parser.add_argument("--judge", action="store_true", help="do not train: evaluate the existing file")
     args = parser.parse_args()
     path = args.out or ASSETS / f"{FILES[args.robot]}.onnx"
     if args.judge:

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""`deal` with a diffusion step in place of its Kalman step: does diffusion evolution work then?
+"""Test `deal` with a diffusion step in place of its Kalman step.
 
     python tools/try_diffusion_regression.py --seeds 0-4 --out diffusion_regression.json
 

@@ -60,7 +60,7 @@ class _Panel:
     """One panel.
 
     Attributes:
-        title: What was calibrated.
+        title: Name of the calibrated robot.
         field: The drawn field of a row.
         label: Label of the axis of values.
         mark: Meaning of a mark, with the range ratio.

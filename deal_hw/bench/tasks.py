@@ -60,7 +60,7 @@ class Case:
         fit_truth: Noise-free positions and velocities at the demonstration's samples, (T, C) each.
         heldout_truth: Noise-free positions at the held-out samples, (T, C).
         channel_std: True standard deviation of the measured channels, (M,); None without noise.
-        refused: Number of drawn truths that could not demonstrate.
+        refused: Number of drawn truths whose robot could not perform the demonstration.
         truth: The emulated robot's truth, if there is an emulator.
         policy: The policy that produced all commands of the demonstration; None for other commands.
         excitation_levels: Level of each attempt at a demonstration; the best one is used.
@@ -126,14 +126,14 @@ def make_case(
         range_ratio: Ratio of the search range.
         space: Name of the parameter set; the task's default.
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
-        by_policy: The shipped policy demonstrates the robot, as in the paper, instead of motions that excite
-            more. The cart-pole's demonstration always begins with its policy.
+        by_policy: The shipped policy moves the robot, as in the paper, instead of motions with more
+            excitation. The cart-pole's demonstration always begins with its policy.
         checkpoint: The file of another policy that demonstrates instead of the shipped one.
         seconds: Length of the demonstration [s]; a held-out motion has `DEMONSTRATION_S`.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
-        CalibrationError: No drawn truth could demonstrate.
+        CalibrationError: No drawn robot could perform the demonstration.
     """
     return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, checkpoint, seconds))
 

@@ -1,4 +1,4 @@
-"""``deal-hw bench verdict``: is a right model called right, and a wrong one wrong, for the right reason?
+"""``deal-hw bench verdict``: tests whether calibrations accept right models and name the fault of wrong ones.
 
 Robots in plain MuJoCo, each with its own truth, are calibrated as a user would: from CSV files and an MJCF,
 with default settings. Without a fault the model can explain everything; each fault is an effect that the
@@ -116,7 +116,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             row |= {"colour": "said", "named": names(kind, fault, [], said), "said": said}
             return row
         except DealHwError as err:
-            # Refused before any work: as good as red, if the message names the fault.
+            # Refused before any work: counts as red, and as named if the message names the fault.
             named = names(kind, fault, [], [str(err)])
             return row | {"colour": "refused", "named": named, "refusal": str(err)}
     causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[: SETTINGS.causes]]

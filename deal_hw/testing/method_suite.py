@@ -121,7 +121,7 @@ class MethodSuite:
         return case.run(case.short_budget)
 
     def test_recovers_a_known_cartpole(self, case: MethodCase) -> None:
-        """The truth is found within the stated tolerance, from a range whose centre is further off."""
+        """The truth is found within the stated tolerance, from a range whose midpoint is further off."""
         if case.tolerance is None:
             pytest.skip("this method does not read the data")
         result = case.run(case.budget)
@@ -191,7 +191,7 @@ class MethodSuite:
             try:
                 result = case.run(case.short_budget, progress=_stop_at(stops), checkpoint=store)
             except _StopRunError:
-                assert stops <= len(short.trace), "a resumed run goes on for ever"
+                assert stops <= len(short.trace), "a resumed run does not end"
         assert stops == len(short.trace) + 1
         np.testing.assert_array_equal(result.estimate, short.estimate)
         np.testing.assert_array_equal(result.interval, short.interval)
@@ -213,7 +213,7 @@ class MethodSuite:
         assert path.read_bytes() == before
 
     def test_damaged_checkpoint_is_refused(self, case: MethodCase, tmp_path: Path) -> None:
-        """A torn file, or one that never was a checkpoint, is an error that names the file."""
+        """An incomplete file, or one that is no checkpoint, gives an error that names the file."""
         if case.open_store is None:
             pytest.skip("this method's states are kept in memory")
         path = tmp_path / "checkpoint.npz"

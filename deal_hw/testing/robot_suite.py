@@ -29,14 +29,13 @@ class RobotBench:
     """A robot under test and faulty robots, none of them connected.
 
     Attributes:
-        robot: A driver in front of a device (or its emulator) that works.
-        foreign: A driver in front of another kind of device.
-        newer: A driver in front of a device with a newer version of the protocol.
-        silent: A driver in front of a device that sends nothing.
+        robot: A driver that is connected to a device (or its emulator) that works.
+        foreign: A driver that is connected to another kind of device.
+        newer: A driver that is connected to a device with a newer version of the protocol.
+        silent: A driver that is connected to a device that sends nothing.
         unplug: Pulls the cable of ``robot``.
         corrupt: Makes the next frame from ``robot``'s device arrive corrupt.
-        greets: Whether ``connect`` sends a message to the device. For a robot without such a message it only
-            listens.
+        greets: Whether ``connect`` sends a message to the device; False if it only listens.
     """
 
     robot: Robot

@@ -77,7 +77,7 @@ class TrainerSuite:
         assert case.score(case.train(case.config)) >= case.learned
 
     def test_a_hardly_trained_policy_does_not_pass(self, case: TrainerCase, short: Policy) -> None:
-        """The bar of the test above is one that only learning reaches."""
+        """The score of the test above is reached only by learning."""
         assert case.score(short) < case.learned
 
     def test_policy_carries_layout_and_digest(self, case: TrainerCase, short: Policy) -> None:

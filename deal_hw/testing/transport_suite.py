@@ -105,7 +105,7 @@ class TransportSuite:
             pair.near.close()
 
     def test_reopening_a_path_that_works_loses_nothing(self, pair: TransportPair) -> None:
-        """Whoever is in doubt may open again: bytes pass in both directions afterwards."""
+        """An open transport may be opened again: bytes pass in both directions afterwards."""
         with pair.near as near:
             near.reopen()
             pair.send(b"x")
@@ -205,7 +205,7 @@ class TopicTransportSuite:
         assert stamps == sorted(stamps)
 
     def test_open_and_close_may_be_repeated(self, pair: TopicPair) -> None:
-        """Opening an open transport and closing a closed one do nothing; a second life works as the first."""
+        """Opening an open transport and closing a closed one do nothing; opened again, it works as before."""
         for _ in range(2):
             pair.near.close()
             with _met(pair):
@@ -256,7 +256,7 @@ class TopicTransportSuite:
                 near.send(Message(pair.down, pair.payload(pair.down, number), 0))
 
     def test_a_peer_that_leaves_is_silence_and_heard_again_when_back(self, pair: TopicPair) -> None:
-        """The near end stays open: a robot that restarts is found without help."""
+        """The near end stays open: a robot that restarts is found again automatically."""
         with _met(pair):
             pair.far.close()
             _all_at_hand(pair, pair.near)
@@ -266,7 +266,7 @@ class TopicTransportSuite:
             meet(pair)
 
     def test_reopening_a_path_that_works_loses_nothing(self, pair: TopicPair) -> None:
-        """Whoever is in doubt may open again: messages pass in both directions afterwards."""
+        """An open transport may be opened again: messages pass in both directions afterwards."""
         with _met(pair):
             pair.near.reopen()
             meet(pair)

@@ -1,4 +1,4 @@
-"""The only import of rerun: if rerun is missing, the error names the extra."""
+"""The only module that imports rerun; if rerun is missing, its error names the extra to install."""
 
 from __future__ import annotations
 

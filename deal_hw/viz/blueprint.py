@@ -31,7 +31,7 @@ class Plot:
         name: Title, with the unit.
         origin: Entity at the root of the contents.
         contents: Entities in it.
-        curves: What is drawn.
+        curves: The drawn curves.
         within: Largest range of the y axis.
     """
 
@@ -127,7 +127,7 @@ def joint_groups(names: Sequence[str], most: int) -> dict[str, list[int]]:
 def _grids(name: str, plots: Sequence[Sequence[Plot]], trajectory: Trajectory, joints: Sequence[str]) -> Any:
     """Return the plots of each joint, on tabs if there are many."""
     columns = time_columns(trajectory.duration_s)
-    # Wide plots are two below each other; more were too low for labels.
+    # At most two wide plots are below each other; with more, the plots were too low for labels.
     most = max(columns * (1 + columns) // len(plots[0]), 1) if plots else 1
     tabs = []
     for group, members in joint_groups(joints, most).items():
@@ -149,7 +149,7 @@ def _joints(
     for j, (joint, unit) in enumerate(zip(trajectory.joint_names, description.position_units, strict=True)):
         measured = getattr(trajectory, quantity)[:, j]
         low, high = _span(measured)
-        # The prediction of a model that diverges must not hide what was measured.
+        # A prediction that diverges must not hide the measured curve.
         reach = high - low or np.inf
         shown, errors = [(trajectory.device_s, measured)], []
         if overlay is not None:
@@ -281,7 +281,7 @@ def _robot(description: RobotDescription, bodies: FloatArray | None) -> Any:
         origin="/world",
         name="Robot: measured solid, predictions as ghosts",
         eye_controls=eye,
-        # A robot on the floor needs one to stand on.
+        # A robot on the floor is drawn with a floor.
         line_grid=rrb.LineGrid3D(visible=description.floating_base is not None, spacing=0.25),
         background=rrb.Background(kind=rrb.components.BackgroundKind.SolidColor, color=palette.SKY),
     )

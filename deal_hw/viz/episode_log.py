@@ -7,7 +7,7 @@ Entities, J joints and any number of parameter sets (``nominal``, ``calibrated``
     /joints/<joint>/error/<set>                predicted minus measured position; also /velocity_error
     /joints/<joint>/effort                     N or N·m, the device's own estimate
     /commands/<joint>/{requested,sent}             position targets, when the device received them
-    /status/<bit>                              what the robot says of itself
+    /status/<bit>                              status bits that the robot reports
     /status/safety                             state of the safety filter
     /loop_timing/{command_period,state_period,state_age,lateness}    ms
     /events                                    text log
@@ -244,7 +244,7 @@ def log_scene(
     """Write the robot in 3D: the real one, and a transparent one for each parameter set.
 
     Args:
-        log: Where to.
+        log: The log to write to.
         trajectory: The recording.
         robot: The robot's model.
         base: Sensed poses of a floating base, (T, 7); None for a fixed one.

@@ -16,10 +16,10 @@ def live_viewer() -> Iterator[tuple[str, str]]:
     """Run a viewer until the block ends: a window if there is a desktop, else a server for a browser.
 
     Yields:
-        Where to send data, and the address to open in a browser ("" for a window).
+        The address that receives data, and the address to open in a browser ("" for a window).
 
     Raises:
-        ConfigurationError: It does not start.
+        ConfigurationError: The viewer does not start.
     """
     port = free_port()
     data = f"rerun+http://{LOOPBACK}:{port}/proxy"

@@ -6,10 +6,10 @@ Entities, over the timeline ``generation`` (refinement and latency scan count on
     /spread/<name>                             standard deviation over that of the whole range: 1 at the start
     /trace/<stage>/<key>                       misfit, chi2 and what else the method notes
     /log10/<stage>/<key>                       decimal logarithm of those that are positive
-    /log                                       its own words
+    /log                                       messages of the method
     /motion/<joint>/{real,population}          a joint's curves in a lane of its own, 2D
 
-The view may skip generations: the search hands over a copy and never waits for the viewer.
+The view may skip generations: it gets copies, and the search never waits for it.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def log_robot(
     """Write one robot that moves.
 
     Args:
-        log: Where to.
+        log: The log to write to.
         scene: Its shapes.
         name: ``"real"`` or the name of a parameter set.
         color: Of all its shapes; only the colour distinguishes two robots in the same place.

@@ -25,9 +25,10 @@ class ScaleSettings:
 
     Attributes:
         margin: Room above and below the values, in shares of their span.
-        least_share: The least span, in shares of the largest value: a signal that hardly moves is drawn as
-            one that hardly moves.
-        least_span: The least span of values near zero, in their unit: rounding is not a signal.
+        least_share: The least span, in shares of the largest value, so that small changes of a large value
+            look small.
+        least_span: The least span of values near zero, in their unit, so that rounding does not look like a
+            signal.
         ticks: Least number of labels.
         label_px: Rerun leaves out labels that are closer together [px].
         window_px: Height that plots share in a window of 1280 x 800 [px].
@@ -61,7 +62,7 @@ def visible_range(
     """Return the lower and upper end of the y axis.
 
     Args:
-        curves: What is drawn; values that are not finite are left out.
+        curves: The drawn curves; values that are not finite are left out.
         within: Values beyond these ends are cut off.
         rows: Number of plots that share the window's height.
         settings: Margins and numbers of labels.
@@ -99,7 +100,7 @@ def time_columns(seconds: float, settings: ScaleSettings = SETTINGS) -> int:
 
 
 def _time_labels(seconds: float, columns: int, settings: ScaleSettings) -> int:
-    # Of time axes, too, rerun labels powers of ten only.
+    # Rerun labels time axes, too, at multiples of a power of ten only.
     most = settings.window_width_px / columns / settings.time_label_px
     step = 10.0 ** np.ceil(np.log10(max(seconds, 1e-9) / most))
     return int(seconds / step + 1e-9) + 1

@@ -138,7 +138,8 @@ def _explain(viewer: Viewer, err: Exception) -> str:
     words = ("adapter", "vulkan", "wgpu", "graphics")
     if viewer.process.poll() is not None and any(word in output.lower() for word in words):
         return (
-            "there is no Vulkan renderer for the picture; a software one will do. On Debian and Ubuntu: "
+            "there is no Vulkan renderer for the picture; a software renderer is enough. On Debian and "
+            "Ubuntu: "
             f"{RENDERER_INSTALL} - or look at the recording with --web"
         )
     return f"no picture: {err}\nrerun said: {output.strip()[-400:] or '(nothing)'}"

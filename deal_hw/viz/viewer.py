@@ -23,9 +23,8 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 LOOPBACK = "127.0.0.1"
 """Rerun's default is every interface: a recording would be readable from the whole network."""
 WINDOW = ("--persist-state",) if platform.system() == "Linux" else ()
-"""Arguments of a window: without it rerun reads no settings, and its theme is the desktop's, else dark.
-
-Elsewhere its settings are in no folder that we can choose, and the user's own stay as they are.
+"""Arguments of a window. Without this one rerun reads no settings, and its theme is the desktop's or dark. On
+other systems we cannot choose the folder of its settings, so the user's own are used unchanged.
 """
 _STOP_S = 5.0
 
@@ -36,7 +35,7 @@ class Viewer:
 
     Attributes:
         process: The child.
-        log: File with what it printed.
+        log: File with its output.
     """
 
     process: subprocess.Popen[bytes]
@@ -170,7 +169,7 @@ def wait_until_listening(viewer: Viewer, port: int, timeout_s: float) -> None:
     """Wait until the program accepts connections on a port.
 
     Raises:
-        ConfigurationError: It ended, or does not in time.
+        ConfigurationError: It ended, or does not listen in time.
     """
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:

@@ -1,1 +1,1 @@
-"""Fakes for tests and tools: robots, wires, policies and recordings that are made as they are wanted."""
+"""Fakes for tests and tools: robots, wires, policies and recordings with chosen behaviour."""

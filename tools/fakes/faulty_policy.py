@@ -122,14 +122,14 @@ def _spec(description: RobotDescription) -> PolicySpec:
         speed_limit=description.speed_limit,
         control_rate_hz=description.control_rate_hz,
         position_units=description.position_units,
-        training={"algorithm": "none: goes wrong on purpose"},
+        training={"algorithm": "none: has a fault on purpose"},
     )
 
 
 def _fault_nodes(onnx: Any, fault: Fault) -> list[Any]:
-    """Return what makes `fault`, a number that is 0 in good times, and the number of `copies` of the action.
+    """Return nodes for `fault`, a number that is 0 without a fault, and the `copies` of the action.
 
-    It is made of `active`, (1, 1), and `alarms`, (1,), which are 0 in good times.
+    It is made of `active`, (1, 1), and `alarms`, (1,), which are 0 without a fault.
     """
     node = onnx.helper.make_node
     copies = [node("Identity", ["one"], ["copies"])]

@@ -169,7 +169,7 @@ def _outcome(kind: Kind, data: bytes, folder: Path, limit_s: float) -> str:
 def _judged(message: str) -> str:
     """Return "refused" for a message that a user can be shown."""
     if not message.strip():
-        return "refused without a word"
+        return "refused without a message"
     if len(message.splitlines()) > 1:
         return f"a message of several lines\n{message[:2000]}"
     if len(message) > 1000:

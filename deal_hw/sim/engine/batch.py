@@ -268,7 +268,7 @@ class ServoBatch:
             raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
         finally:
             if force is not None:
-                # The engine would keep the last forces.
+                # Otherwise the engine would keep the last forces.
                 self._applied[:] = 0.0
         position = self._chart(record["qpos"][:, every - 1 :: every], reference)
         velocity = record["qvel"][:, every - 1 :: every][..., self._dof]

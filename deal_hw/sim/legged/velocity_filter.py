@@ -76,7 +76,7 @@ def filtered_velocity(
     Args:
         time_s: (T,) [s].
         acceleration: Specific force in the world, (T, 3) [m/s²].
-        answers: Velocity of the base by each foot, if it stands, (T, F, 3) [m/s].
+        answers: Velocity of the base by each foot, as if that foot stood, (T, F, 3) [m/s].
         stands: Which feet stand, (T, F).
         settings: Weights.
     """

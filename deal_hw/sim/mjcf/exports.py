@@ -50,8 +50,8 @@ _ISAAC_LAB = (
 )
 _MJLAB = (
     "velocity_limit has no field: no set-point is limited in speed",
-    "delay_min_lag and delay_max_lag are the latency in whole physics steps: a range would be drawn anew in "
-    "each step",
+    "delay_min_lag and delay_max_lag are both the latency in whole physics steps, because mjlab draws from "
+    "a range at each step",
 )
 _URDF = (
     "armature has no field: most importers set 0",

@@ -1,8 +1,8 @@
 """Servo gains from gravity: the deviation of a joint from its command, against the torque it carries.
 
 A proportional servo that holds a load f is f / kp off its command. The mean of that over a recording gives
-the gain within a factor of about two, and its sign. A joint with a wrong sign in the column map, in command
-and measurement alike, shows no wrong correlation, but it seems to hang upwards.
+the gain within a factor of about two, and its sign. If the column map has a wrong sign for a joint, in
+command and measurement alike, their correlation looks right. But the joint then seems to hang upwards.
 """
 
 from __future__ import annotations

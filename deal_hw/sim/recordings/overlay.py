@@ -1,7 +1,7 @@
 """Simulation beside a recording: predictions that restart from the measured state every window.
 
-A replay of a whole recording has little information: an unstable robot's replay leaves the recording within a
-second, whatever the model. Over a window of a fraction of a second the error is the model's. The overlay is
+A replay of a whole recording shows little: with an unstable robot it leaves the recording within a second,
+for any model. Over a window of a fraction of a second the error is the model's. The overlay is
 for viewing, so nothing is fitted: each window starts from measured positions, smoothed over a few samples.
 """
 

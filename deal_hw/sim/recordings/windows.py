@@ -1,7 +1,7 @@
 """Prediction in short windows that restart from given states.
 
-An unstable robot's replay diverges from its own recording within a second, whatever the model; windows of
-some ticks do not. All members of a population predict all windows of an episode.
+The replay of an unstable robot diverges from its own recording within a second, for any model. Predictions
+over windows of some ticks do not. All members of a population predict all windows of an episode.
 """
 
 from __future__ import annotations

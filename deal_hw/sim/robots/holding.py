@@ -1,4 +1,4 @@
-"""Test whether a robot holds its start pose: wrong gains or a long timestep show here first."""
+"""Tests whether a simulated robot holds its start pose, which fails with wrong gains or a long timestep."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""robot.yaml: the facts about a robot that its MJCF does not have, and those that deal-hw reads from here.
+"""robot.yaml: facts about a robot that its MJCF does not contain, and copies of those that it does.
 
 A joint has the names, units and gains of the MJCF. The file may be stricter than the MJCF, never looser:
 :mod:`deal_hw.sim.robots.user_robot` compares both.
@@ -158,13 +158,14 @@ def read_robot_file(path: Path) -> RobotFile:
 
 _HEAD: Final = """\
 # A robot for deal-hw, beside its MJCF; `deal-hw robot check` compares both. null: no limit, or none.
-# The MJCF says names, units, gains and effort limits: change them there, then here.
-# It does not say rates, velocity limits and sensors: write your robot's.
+# Names, units, gains and effort limits are the MJCF's: change them there, then here.
+# Rates, velocity limits and sensors are not in an MJCF: write those of your robot.
 """
 _JOINT_HEAD: Final = """\
 # In the order that every array follows.
 # default_position: start pose, middle of excitations.  position_range: where targets may be.
-# velocity_limit: faster trips, and targets change by no more in a second.  sensor_noise: standard deviation.
+# velocity_limit: trips above it, and limits the targets' change per second.  sensor_noise: standard
+# deviation.
 """
 
 
