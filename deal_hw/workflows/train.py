@@ -63,7 +63,7 @@ class TrainSettings(Checked):
 
     udr: bool = False
     """Train under uniform domain randomisation (UDR) instead: every parameter within a factor 5 of its
-    nominal value (Go2: 1.75)."""
+    nominal value (Go2, humanoid and hand: 1.75)."""
 
     nominal: bool = False
     """Train under the model's nominal values instead; latency as with --udr."""
