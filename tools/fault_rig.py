@@ -252,7 +252,7 @@ class Rig(ABC):
             if self.run.poll() is not None and not ends:
                 return None
             time.sleep(_POLL_S)
-        raise TimeoutError(f"waited {seconds:g} s in vain: {getattr(ready, '__doc__', '')}")
+        raise TimeoutError(f"waited {seconds:g} s without result: {getattr(ready, '__doc__', '')}")
 
     def event_ns(self, what: str) -> int:
         """Return the first time of an event [host ns]; 0: not yet. "start": the start of the run."""

@@ -1,4 +1,4 @@
-"""``deal-hw bench``: how well calibration and the loop do, as JSON rows, a CSV and a figure."""
+"""``deal-hw bench``: measures calibration and the whole loop, as JSON rows, a CSV and a figure."""
 
 from __future__ import annotations
 
@@ -52,10 +52,11 @@ class Bench:
     go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned. fixed-range: calibrate
     off-centre truths in a fixed range. mismatch: the same on robots with effects that no simulator here
     models. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings of a real
-    robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and without
-    deliberate faults: does the verdict accept a right model and reject a wrong one? first-answer: seconds
-    until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. speed: what a search
-    costs beside bare physics and DEAL's Table 3. go2-codec: what the Go2's messages cost to write and read.
+    robot (--model, --data), compared by errors on held-out motion. verdict: robots in plain MuJoCo with and
+    without deliberate faults, to test whether verdicts accept right models and reject wrong ones.
+    first-answer: time until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. speed:
+    time of a search, beside that of the engine alone and DEAL's Table 3. go2-codec: time to write and read
+    the Go2's messages.
     """
 
     recordings: Annotated[tyro.conf.OmitArgPrefixes[Recordings], REAL] = field(default_factory=Recordings)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def derived_robot(model: Path, name: str, tables: Sequence[Table]) -> UserRobot | None:
-    """Return the robot that a model describes; None for a robot of ours, which later verbs know by name.
+    """Return the robot that a model describes; None for a robot of deal-hw, which is known by its name.
 
     Args:
         model: The MJCF.

@@ -101,8 +101,8 @@ class CalibrateSettings(Checked):
     """Range of the latency search, LOW HIGH [s]. Widen it if an alarm reports an estimate at its end."""
 
     spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
-    """Leave out up to three samples in a row that jump away and come back, so many times farther than the
-    joint's fastest motion would take it. A larger number leaves out less."""
+    """Leave out up to three successive samples that jump away and come back, if they jump more than this many
+    times as far as the joint's fastest motion would reach. A larger number leaves out fewer samples."""
 
     residual_std: float | Mapping[str, float] | tuple[str, ...] | None = ()
     """Expected standard deviation of the prediction error [rad, m]: sensor noise and model error. One number,
