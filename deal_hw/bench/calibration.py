@@ -20,7 +20,7 @@ from deal_hw.bench.tasks import DEMONSTRATION_S, TASKS, make_case
 from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["fixed-range", "mismatch", "paper"]
-PAPER_NOTE = "the truth is the middle of the range: a search that ignores the data has an error of 0 here"
+PAPER_NOTE = "the truth is the nominal model: its values, kept without any recording, have an error of 0 here"
 KEY = (
     "task",
     "space",

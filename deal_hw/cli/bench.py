@@ -50,8 +50,8 @@ class Bench:
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned. fixed-range: calibrate
-    off-centre truths in a fixed range. mismatch: the same on robots with effects that no simulator here
-    models. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings of a real
+    drawn truths in a fixed range. mismatch: the same on robots with effects that no simulator here
+    models. paper: DEAL's protocol, whose target is the nominal model. real: recordings of a real
     robot (--model, --data), compared by errors on held-out motion. verdict: robots in plain MuJoCo with and
     without deliberate faults, to test whether verdicts accept right models and reject wrong ones.
     first-answer: time until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. speed:
