@@ -126,11 +126,11 @@ def test_a_lost_link_is_news_for_the_side_that_went_there_until_it_is_back(endpo
         wait_for_arrival(near, payload(STATE, 3))
         far.close()
         assert next_message(pair, near).payload == payload(STATE, 3)
-        with pytest.raises(TransportLostError, match="connection is lost"):
+        with pytest.raises(TransportLostError, match="no connection"):
             near.receive(5.0)
-        with pytest.raises(TransportLostError, match="connection is lost"):
+        with pytest.raises(TransportLostError, match="no connection"):
             near.receive(0.0)
-        with pytest.raises(TransportLostError, match="connection is lost"):
+        with pytest.raises(TransportLostError, match="no connection"):
             near.send(Message(COMMAND, payload(COMMAND, 1), 0))
         far.open()
         send_until_heard(far, near)
@@ -262,7 +262,7 @@ def test_what_is_no_zenoh_gives_no_session(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        with pytest.raises(PortNotFoundError, match="something listens there, but it is no Zenoh"):
+        with pytest.raises(PortNotFoundError, match="something listens there, but it is not Zenoh"):
             ZenohTransport(f"tcp/127.0.0.1:{port}").open()
 
 
