@@ -563,6 +563,5 @@ def refined_from(
         theta,
         latency_s if given is None else given,
         stages_s,
-        fixed_latency=given is not None,
         notify=partial(run.offer, "refinement"),
     )

@@ -100,14 +100,8 @@ def _fitted(problem: Problem, fit: Refined, scale: FloatArray, fine: Mask, secon
     """Return the fit in windows of one length; weights and parameters are fitted in turn."""
     for _ in range(SETTINGS.rounds):
         weighted = problem.with_noise(scale)
-        fit = refine(
-            weighted,
-            fit.theta,
-            fit.latency_s,
-            (seconds,),
-            fixed_latency=problem.fixed_latency_s is not None,
-            states=fit.shooting.states(fit.point),
-        )
+        states = fit.shooting.states(fit.point)
+        fit = refine(weighted, fit.theta, fit.latency_s, (seconds,), states=states)
         found = WeightedFit(weighted, fit, scale)
         scale = np.where(fine, np.maximum(scale * _rms(fit), 1.0), 1.0)
     return found

@@ -102,14 +102,13 @@ def refine(
     latency_s: float,
     stages_s: Sequence[float] | None = None,
     iterations: int = 12,
-    fixed_latency: bool = False,
     notify: Callable[[Refined], None] | None = None,
     states: States | None = None,
     shake: bool = True,
     hopeless: float = np.inf,
     notify_step: Callable[[Refined], None] | None = None,
 ) -> Refined:
-    """Refine parameters from a start.
+    """Refine parameters from a start; a latency that the problem gives stays as it is.
 
     Args:
         problem: The problem.
@@ -117,7 +116,6 @@ def refine(
         latency_s: Start latency [s].
         stages_s: Window lengths, in order [s]; the settings' by default.
         iterations: Most iterations of each run of the solver.
-        fixed_latency: Keep the latency.
         notify: Called with the fit after each window length that is kept.
         states: Start states of the first stage's windows; the smoothed states by default.
         shake: With contacts, draw other start states where the solver stops early. With exact states, reduce
@@ -131,6 +129,7 @@ def refine(
     space, settings = problem.space, SETTINGS
     theta = np.clip(theta, space.low, space.high)
     stages_s = stages_s or window_stages(problem)
+    fixed_latency = problem.fixed_latency_s is not None
     if problem.noise_free:
         if shake and not fixed_latency:
             theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
@@ -372,7 +371,6 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     hopeless = np.inf if problem.noise_free else SETTINGS.local_hopeless
     fit = partial(
         refine,
-        fixed_latency=problem.fixed_latency_s is not None,
         notify=notify,
         shake=problem.noise_free,
         hopeless=hopeless,

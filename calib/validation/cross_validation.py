@@ -94,17 +94,16 @@ def choose(
         note = f"left out: {SETTINGS.folds} searches would take {cost:.1g} physics steps"
         return Choice("refinement", {}, window_s, note=note)
     before = problem.steps
-    fixed = problem.fixed_latency_s is not None
 
     def fits(train: Problem, fold: int) -> dict[str, Member]:
         searched = search.run(train, budget, np.random.default_rng([seed, fold]))
-        refined = refine(train, searched.estimate, searched.latency_s, fixed_latency=fixed)
+        refined = refine(train, searched.estimate, searched.latency_s)
         found = {
             "search": (searched.estimate, searched.latency_s),
             "refinement": (refined.theta, refined.latency_s),
         }
         if robust:
-            weighed = refine_robust(refined, fixed)
+            weighed = refine_robust(refined, problem.fixed_latency_s is not None)
             found["robust refinement"] = weighed.theta, weighed.latency_s
         return found
 

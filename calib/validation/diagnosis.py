@@ -237,15 +237,13 @@ def find_play(problem: Problem, refined: Refined) -> Play | None:
         if most > 0
     ]
     wide = problem.with_more(plays)
-    fixed = problem.fixed_latency_s is not None
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
     part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
     seen = [e.usable for e in part.episodes]
     rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
     length = samples_in(problem, SETTINGS.play_s)
     try:
-        first = problem.first_latency_s
-        fit = refine(part, wide.space.nominal, first, (SETTINGS.play_s,), fixed_latency=fixed)
+        fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.play_s,))
         with_play = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
         # The wider fit may have left another minimum; then its parameters predict as well without their play.
         own, found = np.split(fit.theta, [len(problem.space)])

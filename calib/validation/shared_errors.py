@@ -308,7 +308,6 @@ def _fitted(
             problem.first_latency_s,
             (window_s,),
             iterations=SETTINGS.iterations,
-            fixed_latency=problem.fixed_latency_s is not None,
             notify_step=check,
         )
         held_out = change.on(problem, unseen)

@@ -58,7 +58,7 @@ def noisy_problem(noisy: Case) -> Problem:
 @pytest.fixture(scope="session")
 def noisy_refined(noisy: Case, noisy_problem: Problem) -> Refined:
     """Where the refinement of the noisy problem ends, in windows of 0.2 s."""
-    found = refine(noisy_problem, noisy.theta * 1.02, noisy.latency_s, (0.2,), fixed_latency=True)
+    found = refine(noisy_problem, noisy.theta * 1.02, noisy.latency_s, (0.2,))
     return with_rows(found)
 
 

@@ -49,7 +49,7 @@ def problem(space: ParameterSpace, latency_s: float | None, *, sensor: bool = Fa
 
 def test_refinement_recovers_the_delay() -> None:
     """Truth recovery: the robot is late by 7 ms, 3 ms of which are the given latency."""
-    found = refine(problem(space_with(DELAY), 0.003), np.array([60.0, 0.002]), 0.003, fixed_latency=True)
+    found = refine(problem(space_with(DELAY), 0.003), np.array([60.0, 0.002]), 0.003)
     assert found.theta[1] == pytest.approx(0.004, abs=1e-5)
 
 

@@ -52,10 +52,9 @@ def test_smoothed_start_states_settle_to_the_noise(
 def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three_unknown: Known) -> None:
     """From eight percent off the residual becomes noise, and the parameters come back."""
     space, truth = three_unknown(sensed.space, sensed.theta)
-    problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1)
-    found = refine(
-        problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=8, fixed_latency=True
-    )
+    latency_s = sensed.latency_s
+    problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1, fixed_latency_s=latency_s)
+    found = refine(problem, truth * [1.08, 0.92, 1.08], latency_s, (0.4,), iterations=8)
     assert found.chi2 < MISMATCH.chi2
     assert not unexplained(found)
     np.testing.assert_allclose(found.theta, truth, rtol=0.05)

@@ -68,7 +68,7 @@ def test_refinement_recovers_an_exactly_seen_go2(
     """From ten percent off, three unknown drive parameters come out to a ten-thousandth."""
     space, truth = three_unknown(exact.space, exact.theta)
     problem = Problem(exact.robot, space, [beginning(exact.fit, 1.5)], fixed_latency_s=0.0)
-    found = refine(problem, truth * [1.1, 0.9, 1.1], 0.0, (0.1,), fixed_latency=True)
+    found = refine(problem, truth * [1.1, 0.9, 1.1], 0.0, (0.1,))
     np.testing.assert_allclose(found.theta, truth, rtol=1e-4)
 
 

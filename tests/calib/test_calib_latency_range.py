@@ -60,10 +60,10 @@ def test_given_latency_of_85_ms_is_the_one_that_is_fitted_with(
 ) -> None:
     """From 10 % off the truth is found to 1 %; with 40 ms given the residual stays far above the noise."""
     truth = recorded(1.2, LATE)[1]
-    fit = refine(small_problem(1.2, LATE, 0.085), truth * 1.1, 0.085, fixed_latency=True)
+    fit = refine(small_problem(1.2, LATE, 0.085), truth * 1.1, 0.085)
     assert fit.latency_s == 0.085
     np.testing.assert_allclose(fit.theta, truth, rtol=0.01)
-    wrong = refine(small_problem(1.2, LATE, 0.04), truth * 1.1, 0.04, fixed_latency=True)
+    wrong = refine(small_problem(1.2, LATE, 0.04), truth * 1.1, 0.04)
     assert wrong.chi2 > 100 * max(fit.chi2, 1e-3)
 
 

@@ -60,7 +60,7 @@ def test_a_window_that_nothing_explains_bends_no_parameter_and_is_not_silenced(s
     position[20:23, -1] += 1e-3
     wrong = dataclasses.replace(seen.episode, position=position)
     problem = Problem(seen.robot, seen.space, [wrong], threads=1, fixed_latency_s=0.0)
-    found = refine(problem, seen.truth * [1.1, 0.9, 1.1], 0.0, fixed_latency=True)
+    found = refine(problem, seen.truth * [1.1, 0.9, 1.1], 0.0)
     np.testing.assert_allclose(found.theta, seen.truth, rtol=1e-4)
     assert found.chi2 > MISMATCH.chi2
 

@@ -46,7 +46,7 @@ from deal_hw.types import FloatArray
 def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[..., Problem]) -> None:
     """Residuals of the noise's size end the calibration only where they are white as noise is."""
     problem = small_problem()
-    found = refine(problem, problem.space.nominal, 0.0, fixed_latency=True)
+    found = refine(problem, problem.space.nominal, 0.0)
     white = np.random.default_rng(0).normal(size=(8, 400, 2))
     # The same power with a memory, x[t] = 0.2 x[t - 1] + sqrt(1 - 0.2 ** 2) w[t]: autocorrelation time 1.5.
     pattern = lfilter([np.sqrt(1 - 0.2**2)], [1, -0.2], white, axis=1)

@@ -95,7 +95,7 @@ def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noi
     """Three windows: a note instead of rows."""
     few = dataclasses.replace(noisy.fit, usable=np.arange(len(noisy.fit.sample)) < 130)
     short = Problem(noisy.robot, noisy.space, [few], threads=1, fixed_latency_s=noisy.latency_s)
-    found = refine(short, noisy.theta, noisy.latency_s, (0.2,), iterations=1, fixed_latency=True)
+    found = refine(short, noisy.theta, noisy.latency_s, (0.2,), iterations=1)
     split = check_split_half(short, found, uncertainty_at(short, found, fixed_latency=True))
     assert split.rows == () and "too few" in split.note
 
@@ -111,7 +111,7 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     assert case.truth is not None
     theta = np.array([case.truth.parameters[name] for name in space.names])
     problem = Problem(case.robot, space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
-    found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4), iterations=4, fixed_latency=True))
+    found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4), iterations=4))
     known, _ = judge(problem, found, uncertainty_at(problem, found, fixed_latency=True), Validation())
     assert len(known.null_directions) == 2
     # The same is said before a search begins.
