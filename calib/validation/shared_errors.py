@@ -9,6 +9,8 @@ documentation lists them.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +19,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from deal_hw.calib.data.channel_change import ChannelChange
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.uncertainty.intervals import MISMATCH
@@ -68,6 +69,61 @@ class SharedErrorSettings:
 
 
 SETTINGS = SharedErrorSettings()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelChange:
+    """A change of all joint channels of a fixed-base robot: x of joint j becomes ``scale[j] * x[source[j]]``.
+
+    Command and measurement change alike, so comparing them does not show it.
+
+    Attributes:
+        source: Source joint of each joint, a permutation, (J,).
+        scale: Factors, (J,); efforts take the sign only.
+        clock: Factor of all times [-].
+    """
+
+    source: tuple[int, ...]
+    scale: tuple[float, ...]
+    clock: float = 1.0
+
+    @classmethod
+    def none(cls, joints: int) -> ChannelChange:
+        """Return the identity."""
+        return cls(source=tuple(range(joints)), scale=(1.0,) * joints)
+
+    def of(self, episode: SampledEpisode, actuated: Sequence[int], *, efforts: bool) -> SampledEpisode:
+        """Return the changed recording of a fixed-base robot; gains and limits stay.
+
+        Only the actuated joints, (A,), exchange commands. ``efforts``: commands are efforts, not positions.
+        """
+        joints, scale = list(self.source), np.array(self.scale)
+        actuators = [list(actuated).index(self.source[joint]) for joint in actuated]
+        sent = np.sign(scale) if efforts else scale
+        return dataclasses.replace(
+            episode,
+            step_s=self.clock * episode.step_s,
+            position=scale * episode.position[:, joints],
+            velocity=scale / self.clock * episode.velocity[:, joints],
+            target=sent[list(actuated)] * episode.target[:, actuators],
+            start_setpoint=sent[list(actuated)] * episode.start_setpoint[actuators],
+        )
+
+    def on(self, problem: Problem, episodes: Sequence[SampledEpisode]) -> Problem:
+        """Return the problem of changed recordings of a fixed-base robot, with the noise scaled alike."""
+        facts, robot = problem.robot.description, problem.robot
+        motor = facts.actuation == "motor"
+        changed = [self.of(e, facts.actuated_index, efforts=motor) for e in episodes]
+        joints, scale = list(self.source), np.abs(self.scale)
+        position, velocity = np.split(problem.noise_std, 2)
+        std = np.concatenate([scale * position[joints], scale / self.clock * velocity[joints]])
+        # A device period is a whole number of physics steps.
+        steps = changed[0].step_s / robot.step_s
+        if abs(steps - round(steps)) < 1e-6 and round(steps) >= 1:
+            return problem.on(changed, std)
+        robot = dataclasses.replace(robot, model=copy.copy(robot.model))
+        robot.model.opt.timestep = changed[0].step_s / math.ceil(steps)
+        return dataclasses.replace(problem, robot=robot, episodes=changed, known_std=std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +199,7 @@ def shared_errors(problem: Problem) -> Iterator[SharedError]:
     same = ChannelChange.none(J)
 
     def scaled(factor: float, joints: Sequence[int]) -> ChannelChange:
-        scale = tuple(factor if j in joints else 1.0 for j in range(J))
-        return ChannelChange(source=same.source, scale=scale)
+        return dataclasses.replace(same, scale=tuple(factor if j in joints else 1.0 for j in range(J)))
 
     for j, name in enumerate(names):
         yield SharedError(
@@ -161,7 +216,7 @@ def shared_errors(problem: Problem) -> Iterator[SharedError]:
             yield SharedError(
                 "order",
                 (names[i], names[j]),
-                ChannelChange(source=tuple(source), scale=same.scale),
+                dataclasses.replace(same, source=tuple(source)),
                 f"{names[i]} and {names[j]} were swapped",
                 f"Change the columns of {names[i]} and {names[j]} in the column map.",
             )
@@ -170,7 +225,7 @@ def shared_errors(problem: Problem) -> Iterator[SharedError]:
         (1 / f, f"the clock were {f:g} times too fast"),
         (f, f"the clock were {f:g} times too slow"),
     ):
-        undo = ChannelChange(source=same.source, scale=same.scale, clock=clock)
+        undo = dataclasses.replace(same, clock=clock)
         yield SharedError("clock", (), undo, words, f"Multiply all times by {clock:g}.")
     single = [(j,) for j in range(J)]
     alike = [tuple(j for j in range(J) if units[j] == unit) for unit in units]
