@@ -227,10 +227,7 @@ class OutputErrorFits(Fits):
     def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
         """Return the search's problem: part of the recordings, and the first fit's residuals as scale."""
         parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
-        std = problem.known_std
-        if std is None:
-            std = problem.noise_std.copy()
-            std[problem.channels] = np.maximum(std[problem.channels], first.scale)
+        std = first.expected_std if problem.known_std is None else problem.known_std
         return problem.on(spread([p for p in parts if p.usable.any()], self.settings.search_s), std)
 
     def _choose(self, run: CalibrationRun, problem: Problem, seed: int, *, search: bool) -> Choice:

@@ -97,6 +97,17 @@ class OutputErrorFit:
         problem = self.plain.problem
         return float(np.mean((self.scale / problem.noise_std[problem.channels]) ** 2))
 
+    @property
+    def expected_std(self) -> FloatArray:
+        """Expected prediction error, positions then velocities, (2 C,): the residual, and at least the noise.
+
+        A search needs it as scale where nobody knows how good the model is.
+        """
+        problem = self.plain.problem
+        std = problem.noise_std.copy()
+        std[problem.channels] = np.maximum(std[problem.channels], self.scale)
+        return std
+
     @cached_property
     def normal(self) -> Normal:
         """Normal equations of weighted residuals and of the parameters' own priors, with their rows.
@@ -181,18 +192,6 @@ def prediction_rmse(
         squares += np.sum(np.where(seen, error, 0.0) ** 2, axis=(1, 2))
         count += np.sum(seen, axis=(0, 1))
     return np.asarray(np.sqrt(np.where(np.isfinite(squares), squares, np.inf) / np.maximum(count, 1)))
-
-
-def expected_residual(problem: Problem) -> FloatArray:
-    """Return the expected prediction error of real recordings, positions then velocities, (2 C,).
-
-    It is the residual of a fit over short windows from the nominal values, and at least the sensor noise. A
-    search needs it as scale where nobody knows how good the model is.
-    """
-    fit = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
-    std = problem.noise_std.copy()
-    std[problem.channels] = np.maximum(std[problem.channels], fit.scale)
-    return std
 
 
 def _errors(data: WindowData, residual: FloatArray) -> FloatArray:

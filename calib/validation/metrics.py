@@ -1,4 +1,4 @@
-"""Quality of a calibration: on unseen motion, and against a truth that only a bench knows."""
+"""Quality of a calibration on unseen motion."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData, samples_in
-from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calibration import Z90
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
@@ -190,67 +188,3 @@ def signal_range(
             if rotation.start <= c < rotation.stop:
                 span[i] = turned[c - rotation.start]
     return np.asarray(span)
-
-
-def error_percent(theta: FloatArray, truth: FloatArray) -> float:
-    """Return the mean over parameters of |p - p*| / p* in percent (DEAL, eq. 11)."""
-    return float(100.0 * np.mean(np.abs(theta - truth) / truth))
-
-
-def log_error_x100(theta: FloatArray, truth: FloatArray) -> float:
-    """Return 100 times the mean |ln(p / p*)|, which is symmetric around the truth."""
-    return float(100.0 * np.mean(np.abs(np.log(theta / truth))))
-
-
-@dataclass(frozen=True, slots=True)
-class IntervalScore:
-    """Quality of 90 % intervals.
-
-    Attributes:
-        coverage90: Share of parameters whose interval holds the truth.
-        width90: Median interval width over that of the Fisher bound.
-    """
-
-    coverage90: float
-    width90: float
-
-
-def interval_score(
-    space: ParameterSpace, interval: FloatArray, truth: FloatArray, fisher_std: FloatArray
-) -> IntervalScore:
-    """Score intervals, (K, 2), against a truth, (K,), and the Fisher bound's standard deviations, (K,)."""
-    inside = (interval[:, 0] <= truth) & (truth <= interval[:, 1])
-    width = space.to_scale(interval[:, 1]) - space.to_scale(interval[:, 0])
-    return IntervalScore(float(np.mean(inside)), float(np.median(width / (2 * Z90 * fisher_std))))
-
-
-def fisher_std(
-    problem: Problem,
-    theta: FloatArray,
-    latency_s: float,
-    states: Sequence[tuple[FloatArray, FloatArray]],
-    noise_std: FloatArray,
-    length: int,
-) -> FloatArray:
-    """Return the standard deviations of the Fisher bound at the truth, in each parameter's own scale, (K,).
-
-    The bound has the same windows, unknowns (start states and latency) and range prior as the intervals, but
-    the true noise.
-
-    Args:
-        problem: The recordings and the simulator.
-        theta: True parameters, (K,).
-        latency_s: True latency [s].
-        states: True positions and velocities at the samples of each episode, (T, J) each.
-        noise_std: True standard deviation of the measured channels, (M,).
-        length: Samples of a window.
-    """
-    shooting = Shooting(problem, length)
-    hessian = shooting.normal(shooting.start(theta, latency_s, list(states))).hessian
-    # The problem whitens by estimated noise, the bound uses the true noise.
-    estimated = problem.noise_std[problem.channels]
-    ratio = float(np.mean((estimated / np.maximum(noise_std, estimated * 1e-3)) ** 2))
-    low, high = problem.latency_range_s
-    prior = np.append(problem.space.width**2, (high - low) ** 2) / 12.0
-    covariance = np.linalg.inv(hessian * ratio + np.diag(1.0 / prior))
-    return np.asarray(np.sqrt(np.diag(covariance))[:-1])

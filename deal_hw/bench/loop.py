@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import Cells, Row, per_parameter
+from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
@@ -46,7 +47,7 @@ def calibration_row(
     Returns:
         The calibration's part of the row, and the result.
     """
-    from deal_hw.calib.validation.metrics import HeldOut, error_percent, log_error_x100
+    from deal_hw.calib.validation.metrics import HeldOut
 
     d = case
     result = calibrate_episodes(
@@ -98,7 +99,6 @@ def calibration_row(
 def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tuple[float, float | None]:
     """Return coverage90 and width90; without noise there is no bound for a width."""
     from deal_hw.calib.data.problem import Problem, samples_in
-    from deal_hw.calib.validation.metrics import fisher_std, interval_score
 
     if case.channel_std is None:
         inside = (result.interval[:, 0] <= case.theta) & (case.theta <= result.interval[:, 1])
@@ -107,8 +107,7 @@ def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tu
     std = np.maximum(case.channel_std, problem.noise_std[problem.channels] * 1e-2)
     length = samples_in(problem, 0.8)
     bound = fisher_std(problem, case.theta, case.latency_s, [case.fit_truth], std, length)
-    score = interval_score(case.space, result.interval, case.theta, bound)
-    return score.coverage90, score.width90
+    return interval_score(case.space, result.interval, case.theta, bound)
 
 
 def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISODES) -> tuple[float, float]:

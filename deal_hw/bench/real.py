@@ -73,12 +73,13 @@ def expected_std(
 ) -> Callable[[str], FloatArray | None]:
     """Return a method's expected prediction error, (2 C,): the given one, or a first fit's."""
     from deal_hw.calib.data.problem import Problem
-    from deal_hw.calib.fit.output_error import expected_residual
+    from deal_hw.calib.fit.output_error import SHORT, fit_output_error
 
-    # Fitted once, before the first cell that needs it.
-    fitted = functools.cache(
-        lambda: expected_residual(Problem(work.robot, work.space, work.episodes, threads=threads))
-    )
+    @functools.cache
+    def fitted() -> FloatArray:
+        """Fit short windows from the nominal values once, before the first cell that needs it."""
+        problem = Problem(work.robot, work.space, work.episodes, threads=threads)
+        return fit_output_error(problem, work.space.nominal, problem.first_latency_s, SHORT).expected_std
 
     def std(method: str) -> FloatArray | None:
         return given if given is not None or method in UNTOLD else fitted()

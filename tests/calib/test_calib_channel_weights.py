@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from deal_hw.bench.scores import log_error_x100
 from deal_hw.bench.tasks import Case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.channel_weights import weight_channels
 from deal_hw.calib.fit.refinement import at_parameters, refine
-from deal_hw.calib.validation.metrics import log_error_x100
 
 COUNT_M = 25e-6
 

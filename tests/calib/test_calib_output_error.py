@@ -13,7 +13,7 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_output_error, prediction_rmse
+from deal_hw.calib.fit.output_error import SHORT, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.output_error_fits import OutputErrorFits, OutputErrorSettings, output_error_method
 from deal_hw.calib.pipeline import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
@@ -121,7 +121,7 @@ def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem
 
 def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
     """What a search is told is the residual of a first fit; of what was not measured nothing is said."""
-    std = expected_residual(problem)
+    std = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT).expected_std
     assert problem.noise_std[0] <= std[0] < 5e-3
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
+from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case
 from deal_hw.calib import pipeline
 from deal_hw.calib.data.checks import check_excitation
@@ -32,7 +33,7 @@ from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
 from deal_hw.calib.uncertainty.time_steps import LatencyScan
-from deal_hw.calib.validation.metrics import HeldOut, error_percent, interval_score, log_error_x100
+from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
@@ -333,10 +334,12 @@ def test_scores_by_hand() -> None:
     theta, truth = np.array([1.1, 0.5]), np.ones(2)
     assert error_percent(theta, truth) == pytest.approx(30.0)
     assert log_error_x100(theta, truth) == pytest.approx(39.423, abs=1e-3)
-    score = interval_score(_two(), np.array([[0.9, 1.2], [0.4, 0.6]]), truth, np.array([0.1, 0.1]))
-    assert score.coverage90 == 0.5
+    coverage90, width90 = interval_score(
+        _two(), np.array([[0.9, 1.2], [0.4, 0.6]]), truth, np.array([0.1, 0.1])
+    )
+    assert coverage90 == 0.5
     widths = np.log(1.2 / 0.9), np.log(0.6 / 0.4)
-    assert score.width90 == pytest.approx(np.median(widths) / (2 * 1.6448536 * 0.1))
+    assert width90 == pytest.approx(np.median(widths) / (2 * 1.6448536 * 0.1))
 
 
 def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) -> None:
