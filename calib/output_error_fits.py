@@ -34,8 +34,8 @@ from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
     Uncertainty,
-    ended_at_bound,
     mismatch,
+    names_at_bound,
     uncertainty,
     with_rows,
 )
@@ -52,6 +52,7 @@ from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by
 from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Z90, Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
@@ -113,31 +114,16 @@ class OutputErrorSettings:
 
 
 @dataclass(frozen=True)
-class FirstFits:
-    """The fits from the nominal values.
-
-    Attributes:
-        problem: The recordings as they are fitted.
-        short: The fit of short windows.
-        windows: The fits of growing windows that continue from it.
-    """
-
-    problem: Problem
-    short: OutputErrorFit
-    windows: Sequence[OutputErrorFit]
-
-
-@dataclass(frozen=True)
 class OutputErrorFits(Fits):
     """A search, candidate fits, and the choice of the best predictor by cross-validation.
 
     Attributes:
         settings: The settings.
-        first: The fits from the nominal values, once they are made.
+        first: The fits from the nominal values, once they are made: of short windows, then of growing ones.
     """
 
     settings: OutputErrorSettings = field(default_factory=OutputErrorSettings)
-    first: FirstFits | None = None
+    first: tuple[OutputErrorFit, ...] = ()
 
     def started(self, run: CalibrationRun) -> OutputErrorFits:
         """Fit short and long windows from the nominal values. See :meth:`Fits.started`."""
@@ -145,21 +131,19 @@ class OutputErrorFits(Fits):
         if run.settings.cross_validation:
             problem = _joined_stretches(problem)
         if np.isfinite(settings.fitted_s):
-            parts = [p for e in problem.episodes for p in stretches(e, settings.stretch_s) if p.usable.any()]
-            problem = problem.on(spread(parts, settings.fitted_s), problem.known_std)
+            problem = problem.on(self._spread(problem, settings.fitted_s), problem.known_std)
         run.say("residual", "fits short windows from the model's own values")
         short = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
         run.offer("fit of short windows", short)
         windows = self._windows(run, problem, _member(short))
         run.offer("fit of long windows", windows[-1])
-        return dataclasses.replace(self, first=FirstFits(problem, short, windows))
+        return dataclasses.replace(self, first=(short, *windows))
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
-        made = self.first or self.started(run).first
-        if made is None:
-            raise RuntimeError("unreachable: a started strategy has its first fits")
-        settings, problem, first, windows = self.settings, made.problem, made.short, made.windows
+        settings, (first, *windows) = self.settings, self.first or self.started(run).first
+        # The recordings as they are fitted, which may be joined or a part.
+        problem = first.plain.problem
         # The fits continue from the search's estimate, so it only has to find the neighbourhood.
         run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
@@ -209,9 +193,7 @@ class OutputErrorFits(Fits):
             "window_s": recipe.seconds,
             "noise_std": problem.noise_std[problem.channels].tolist(),
             "inflation": known.inflation,
-            "at_bound": [
-                problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
-            ],
+            "at_bound": names_at_bound(problem.space, theta),
             "split_half": split.to_json(),
             "confounded": [dataclasses.asdict(pair) for pair in found],
         }
@@ -226,9 +208,13 @@ class OutputErrorFits(Fits):
 
     def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
         """Return the search's problem: part of the recordings, and the first fit's residuals as scale."""
-        parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
         std = first.expected_std if problem.known_std is None else problem.known_std
-        return problem.on(spread([p for p in parts if p.usable.any()], self.settings.search_s), std)
+        return problem.on(self._spread(problem, self.settings.search_s), std)
+
+    def _spread(self, problem: Problem, seconds: float) -> list[SampledEpisode]:
+        """Return stretches of the recordings, spread evenly over them, of this total length [s]."""
+        parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
+        return spread([p for p in parts if p.usable.any()], seconds)
 
     def _choose(self, run: CalibrationRun, problem: Problem, seed: int, *, search: bool) -> Choice:
         """Fit every candidate without each fold and compare the predictions of that fold.

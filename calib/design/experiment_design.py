@@ -16,7 +16,6 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, longest_windows
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.fit.residual import Shooting, States
-from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationPlan
 from deal_hw.description import RobotDescription
@@ -257,13 +256,6 @@ class Experiment:
         dark = np.einsum("nkk,kk->n", covariances, self.prior.information[:K, :K])
         self._order = np.argsort(-dark).tolist()
         return found
-
-
-def default_knowledge(
-    space: ParameterSpace, latency_s: tuple[float, float] = LATENCY_RANGE_S
-) -> ParameterDistribution:
-    """Return the distribution before any calibration: the ranges."""
-    return ParameterDistribution.uniform(space, latency_s)
 
 
 def _draw(

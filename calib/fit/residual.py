@@ -65,13 +65,11 @@ class WindowRows:
     """Linearised residuals of one episode's windows; the last S rows are the prior of the start states.
 
     Attributes:
-        episode: Index of the episode.
         residual: Whitened residuals, (W, R) with R = H M + S.
         parameter: Their derivatives by parameters and latency, (W, R, K + 1).
         start: By the start states, (W, R, S).
     """
 
-    episode: int
     residual: FloatArray
     parameter: FloatArray
     start: FloatArray
@@ -258,12 +256,12 @@ class Shooting:
             if self.given:
                 back.append((np.zeros((W, 2 * C, K + 1)), np.zeros((W, 2 * C))))
                 if keep:
-                    rows.append(WindowRows(data.episode, r_flat, jp, js))
+                    rows.append(WindowRows(r_flat, jp, js))
                 continue
             start = np.concatenate([point.position[e], point.velocity[e]], axis=1) - data.prior_mean
             information = self.start_information[e]
             if keep:
-                rows.append(_rows(data.episode, r_flat, jp, js, np.sqrt(information), start))
+                rows.append(_rows(r_flat, jp, js, np.sqrt(information), start))
             mss = np.einsum("wri,wrj->wij", js, js) + information[:, :, None] * np.eye(2 * C)
             gs = np.einsum("wri,wr->wi", js, r_flat) + information * start
             msp = np.einsum("wri,wrj->wij", js, jp)
@@ -404,12 +402,11 @@ def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _rows(
-    episode: int, residual: FloatArray, jp: FloatArray, js: FloatArray, root: FloatArray, start: FloatArray
+    residual: FloatArray, jp: FloatArray, js: FloatArray, root: FloatArray, start: FloatArray
 ) -> WindowRows:
     """Append to each window the rows of its start state's prior."""
     W, _, S = js.shape
     return WindowRows(
-        episode,
         np.concatenate([residual, root * start], axis=1),
         np.concatenate([jp, np.zeros((W, S, jp.shape[2]))], axis=1),
         np.concatenate([js, root[:, :, None] * np.eye(S)], axis=1),

@@ -138,6 +138,9 @@ def gather(
     drawing = None
     # A recording that was cut into stretches is shown as one.
     fitted, held = joined(episodes), joined(holdout)
+    theta = np.stack([result.space.nominal, result.estimate])
+    # The user's own model has no latency: the same candidates as in the held-out error.
+    latency_s = np.array([0.0, result.latency_s])
     parts = Counter(e.name for e in (*fitted, *held))
     for group, heldout in ((held, True), (fitted, False)):
         word = "held-out" if heldout else "fitted"
@@ -148,7 +151,8 @@ def gather(
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
         problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
         titles = [_title(e, f"{word} recording {i} of {len(group)}", parts) for i, e in enumerate(shown, 1)]
-        for data, predicted in _predictions(problem, result, window_s):
+        for data in _windows(problem, window_s):
+            predicted = problem.predict(theta, latency_s, data)
             overlays.append(_overlay(problem, data, predicted, titles[data.episode], heldout))
             if heldout and drawing is None:
                 drawing = _worst_moment(problem, data, predicted, titles[data.episode])
@@ -174,17 +178,6 @@ def _title(episode: SampledEpisode, other: str, parts: Counter[str]) -> str:
         return other
     between = f", {episode.time_s[0]:.4g} to {episode.time_s[-1]:.4g} s"
     return episode.name + (between if parts[episode.name] > 1 else "")
-
-
-def _predictions(
-    problem: Problem, result: CalibrationResult, window_s: float
-) -> Iterator[tuple[WindowData, MemberPrediction]]:
-    """Yield the windows of each recording and their predictions by the nominal and the calibrated model."""
-    theta = np.stack([result.space.nominal, result.estimate])
-    # The user's own model has no latency: the same candidates as in the held-out error.
-    latency = np.array([0.0, result.latency_s])
-    for data in _windows(problem, window_s):
-        yield data, problem.predict(theta, latency, data)
 
 
 def _overlay(
@@ -252,7 +245,9 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
     except InsufficientDataError:
         return []
     for data in windows:
-        whitened = _whitened(problem, centre, data)
+        whitened = whitened_residual(problem, centre, centre, [data]).reshape(data.measured.shape)
+        # A missing sample has weight zero: its zero is no residual.
+        whitened = np.where(np.isfinite(data.std) & np.isfinite(whitened), whitened, np.nan)
         episode = problem.episodes[data.episode]
         found.append(
             Residuals(
@@ -263,10 +258,3 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
             )
         )
     return found
-
-
-def _whitened(problem: Problem, centre: Members, data: WindowData) -> FloatArray:
-    """Return the whitened residual of each window, (W, H, M); NaN for missing samples."""
-    whitened = whitened_residual(problem, centre, centre, [data]).reshape(data.measured.shape)
-    # A missing sample has weight zero: its zero is no residual.
-    return np.where(np.isfinite(data.std) & np.isfinite(whitened), whitened, np.nan)

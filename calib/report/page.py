@@ -155,7 +155,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         100 * np.clip(space.normalize(values), 0, 1)
         for values in (result.interval[:, 0], result.interval[:, 1], space.nominal, result.estimate)
     ]
-    rows = []
+    rows, valued = [], with_value(result)
     for k, p in enumerate(space):
         # Rounded to the share of the range that the alarm uses.
         bound = {0.0: "lower", 100.0: "upper"}.get(round(float(at[3][k]), 4), "")
@@ -164,7 +164,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
             prior = f"expected {p.prior_mean:.4g} {p.unit} within {spread}"
         low, high = map(float, result.interval[k])
-        has_value = bool(with_value(result)[k])
+        has_value = bool(valued[k])
         rows.append(
             Row(
                 parameter=p,

@@ -146,8 +146,6 @@ def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
         normal matrices, (W, S, S).
     """
     js = rows.start
-    if js.shape[2] == 0:
-        return rows.parameter, np.zeros((len(js), 0, 0))
     normal = np.einsum("wri,wrj->wij", js, js)
     gain = np.linalg.solve(normal, np.einsum("wri,wrj->wij", js, rows.parameter))
     return rows.parameter - np.einsum("wrs,wsp->wrp", js, gain), normal
@@ -158,8 +156,6 @@ def without_starts(start: FloatArray, normal: FloatArray, x: FloatArray) -> Floa
 
     ``start`` are derivatives by the start states, (W, R, S), ``normal`` their normal matrices, (W, S, S).
     """
-    if start.shape[2] == 0:
-        return x
     moved = np.linalg.solve(normal, np.einsum("wrs,wri->wsi", start, x))
     return np.asarray(x - np.einsum("wrs,wsi->wri", start, moved))
 

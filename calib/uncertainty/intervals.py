@@ -379,6 +379,11 @@ def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.b
     return np.asarray((unit < SETTINGS.at_bound) | (unit > 1 - SETTINGS.at_bound))
 
 
+def names_at_bound(space: ParameterSpace, theta: FloatArray) -> list[str]:
+    """Return the names of the parameters that :func:`ended_at_bound` finds."""
+    return [space.names[k] for k in np.flatnonzero(ended_at_bound(space, theta))]
+
+
 def with_rows(refined: Refined) -> Refined:
     """Return the fit with linearised residuals, from which variances are clustered.
 

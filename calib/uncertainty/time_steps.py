@@ -100,7 +100,8 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
         reach, iterations = SCAN.contact_ticks, SCAN.contact_iterations
     if not contacts:
         # In a smooth problem the curvature shows up to which distance a tick is worth a fit.
-        worth_s = np.sqrt(SCAN.hopeless * max(1.0, refined.chi2) * _latency_variance(refined))
+        variance = np.linalg.inv(_information(refined))[-1, -1]
+        worth_s = np.sqrt(SCAN.hopeless * max(1.0, refined.chi2) * variance)
         low = max(low, min(math.ceil((refined.latency_s - worth_s) / tick), centre))
         high = min(high, max(math.floor((refined.latency_s + worth_s) / tick), centre))
     found: dict[int, Refined] = {}
@@ -130,11 +131,6 @@ def _information(refined: Refined) -> FloatArray:
     """Return the information on parameters and latency, (K + 1, K + 1); the range tells what data do not."""
     prior = np.append(1.0 / refined.shooting.problem.space.width**2, 0.0)
     return np.asarray(refined.normal.hessian + np.diag(prior))
-
-
-def _latency_variance(refined: Refined) -> float:
-    """Return the latency's variance under the sensors' noise, all parameters free [s^2]."""
-    return float(np.linalg.inv(_information(refined))[-1, -1])
 
 
 def _at_latency(refined: Refined, latency_s: float) -> Point:

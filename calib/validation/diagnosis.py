@@ -19,6 +19,7 @@ from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.fit.solver import kurtosis
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
@@ -454,14 +455,12 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
         r = rows[:, : H * M].reshape(W, H, M)
         power.append(np.sum(r**2, axis=2).ravel())
         values.append(r.ravel())
-    every = np.concatenate(values)
-    kurtosis = float(np.mean(every**4)) / max(float(np.mean(every**2)) ** 2, 1e-300)
     each, time = np.concatenate(power), np.concatenate([t.ravel() for t in known.time_s])
     source = np.repeat(known.names, [t.size for t in known.time_s])
     most = np.argsort(-each)[: max(round(SETTINGS.burst_part * len(each)), 1)]
     most = most[each[most] > SETTINGS.burst_size * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))
-    if kurtosis < SETTINGS.burst_kurtosis or share < SETTINGS.burst_share:
+    if kurtosis(values) < SETTINGS.burst_kurtosis or share < SETTINGS.burst_share:
         return None
     unit_s = 10 * known.period_s
     stretches = [

@@ -7,11 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, ended_at_bound
+from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
 from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import diagnose
 from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
@@ -102,9 +100,10 @@ def judge(
 
     ``refined`` has linearised residuals, and ``known`` is its uncertainty.
     """
-    facts: dict[str, Any] = {"inflation": known.inflation}
-    ended = np.flatnonzero(ended_at_bound(problem.space, refined.theta))
-    facts["at_bound"] = [problem.space.names[k] for k in ended]
+    facts: dict[str, Any] = {
+        "inflation": known.inflation,
+        "at_bound": names_at_bound(problem.space, refined.theta),
+    }
     if known.clustered is not None:
         cluster = known.clustered
         facts["clustered"] = {

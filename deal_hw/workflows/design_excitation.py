@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
+from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import (
@@ -319,8 +320,6 @@ def _plain_designs(config: ExcitationSettings, balances: bool) -> dict[str, Exci
 
 
 def _knowledge(config: ExcitationSettings) -> ParameterDistribution:
-    from deal_hw.calib.design.experiment_design import default_knowledge
-
     if config.calibration is not None:
         from deal_hw.workflows.train import read_distribution
 
@@ -330,4 +329,4 @@ def _knowledge(config: ExcitationSettings) -> ParameterDistribution:
     name = config.space or next(iter(table))
     if name not in table:
         raise UnknownNameError("parameter set", name, table)
-    return default_knowledge(table[name]().with_ratio(config.range_ratio))
+    return ParameterDistribution.uniform(table[name]().with_ratio(config.range_ratio), LATENCY_RANGE_S)

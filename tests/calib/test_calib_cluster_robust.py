@@ -15,10 +15,9 @@ from deal_hw.types import FloatArray
 def _rows(residual: FloatArray, design: FloatArray, start: FloatArray | None = None) -> WindowRows:
     """Windows (W, H) of one channel, a design (W, H, P), start states (W, H, S) of which nothing is known."""
     if start is None:
-        return WindowRows(0, residual, design, np.zeros((*residual.shape, 0)))
+        return WindowRows(residual, design, np.zeros((*residual.shape, 0)))
     W, _, S = start.shape
     return WindowRows(
-        0,
         np.concatenate([residual, np.zeros((W, S))], axis=1),
         np.concatenate([design, np.zeros((W, S, design.shape[2]))], axis=1),
         np.concatenate([start, np.broadcast_to(1e-6 * np.eye(S), (W, S, S))], axis=1),

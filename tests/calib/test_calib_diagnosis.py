@@ -77,7 +77,6 @@ def _evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Eviden
     residual = rng.normal(size=(WINDOWS, SAMPLES)) + wrong / STD
     parameter = np.stack([c / STD for c in (*columns, rng.normal(size=(WINDOWS, SAMPLES)))], axis=-1)
     rows = WindowRows(
-        0,
         np.concatenate([residual, rng.normal(size=(WINDOWS, 2))], axis=1),
         np.concatenate([parameter, np.zeros((WINDOWS, 2, parameter.shape[2]))], axis=1),
         np.concatenate([start, known], axis=1),
@@ -185,7 +184,6 @@ def _pushed(
     moved = np.stack([np.convolve(one, answer)[:SAMPLES] for one in impulse])
     residual = rng.normal(size=(WINDOWS, SAMPLES)) + moved
     rows = WindowRows(
-        0,
         np.concatenate([residual, np.zeros((WINDOWS, 1))], axis=1),
         np.zeros((WINDOWS, SAMPLES + 1, 1)),
         np.concatenate([np.ones((WINDOWS, SAMPLES, 1)), np.full((WINDOWS, 1, 1), 1e-3)], axis=1),

@@ -20,11 +20,10 @@ from deal_hw.calib.design.experiment_design import (
     Experiment,
     MakeBehaviour,
     Prior,
-    default_knowledge,
     information,
 )
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calibration import CalibrationResult, Identifiability
+from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, Identifiability
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
@@ -50,6 +49,11 @@ MJCF = f"""
 </mujoco>
 """
 POSITION = f'<position name="slide" joint="slide" kp="{STIFFNESS}" kv="{GAIN}" forcerange="-60 60"/>'
+
+
+def ranges(parameters: ParameterSpace) -> ParameterDistribution:
+    """Return what is known before any calibration."""
+    return ParameterDistribution.uniform(parameters, LATENCY_RANGE_S)
 
 
 def describe(folder: Path, actuation: str) -> RobotDescription:
@@ -172,7 +176,7 @@ def test_information_of_a_mass_on_a_damper(motor: RobotModel) -> None:
 def test_posterior_and_gain_by_hand() -> None:
     """Range ln 25 wide: prior variance (ln 25)^2 / 12 = 0.8634. Information 100: 1 / (1.1582 + 100)."""
     parameters = space("mass")
-    prior = Prior.of(default_knowledge(parameters))
+    prior = Prior.of(ranges(parameters))
     hessian = np.diag([100.0, 0.0])
     covariance = prior.posterior(hessian)
     assert covariance[0, 0] == pytest.approx(1 / (1 / 0.86344 + 100.0), rel=1e-4)
@@ -184,7 +188,7 @@ def test_null_direction_adds_no_gain(servo: RobotModel) -> None:
     """Mass and armature of a slide are one: freeing both tells nothing about their ratio, and no infinity."""
     plan = make_plan(servo.description, ExcitationDesign(seconds=1.0, low_hz=1.0))
     one, both = (
-        Experiment(servo, default_knowledge(space(*names)), 1.0, 1, np.random.default_rng(0), threads=1)
+        Experiment(servo, ranges(space(*names)), 1.0, 1, np.random.default_rng(0), threads=1)
         for names in (("mass",), ("mass", "armature"))
     )
     play = lambda: ExcitationBehaviour(plan, servo.description)  # noqa: E731
@@ -230,9 +234,7 @@ def test_optimum_is_at_least_as_good_as_all_candidates(
 ) -> None:
     """Of everything that was tried on all members; and its plan carries the figures."""
     rng = np.random.default_rng(5)
-    experiment = Experiment(
-        servo, default_knowledge(space("mass", "damping", "effort_limit")), 1.0, 2, rng, threads=1
-    )
+    experiment = Experiment(servo, ranges(space("mass", "damping", "effort_limit")), 1.0, 2, rng, threads=1)
     seen = recording(experiment, monkeypatch)
     settings = SearchSettings(candidates=6, finalists=3, rounds=8, criterion=criterion)  # type: ignore[arg-type]
     plain = make_plan(servo.description, ExcitationDesign(seconds=1.0, low_hz=1.0))
@@ -254,9 +256,7 @@ def test_candidates_that_trip_are_discarded_and_counted(servo: RobotModel) -> No
     """A robot that trips at 10 mm: the error says how many, and why."""
     limits = dataclasses.replace(servo.description.limits, trip_position=((-0.01, 0.01),))
     tight = dataclasses.replace(servo, description=dataclasses.replace(servo.description, limits=limits))
-    experiment = Experiment(
-        tight, default_knowledge(space("mass")), 1.0, 1, np.random.default_rng(0), threads=1
-    )
+    experiment = Experiment(tight, ranges(space("mass")), 1.0, 1, np.random.default_rng(0), threads=1)
     with pytest.raises(
         CalibrationError, match=r"none of 6 excitations keeps 'slide'.*slide came near the end"
     ):
@@ -303,7 +303,7 @@ def test_robots_that_cannot_be_designed_for_are_refused(servo: RobotModel) -> No
     with pytest.raises(CalibrationError, match="only 0 of 16 draws"):
         Experiment(
             still,
-            default_knowledge(space("mass")),
+            ranges(space("mass")),
             1.0,
             2,
             np.random.default_rng(0),
