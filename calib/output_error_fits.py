@@ -50,7 +50,7 @@ from deal_hw.calib.validation.cross_validation import (
 )
 from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_split_half
 from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
-from deal_hw.calibration import Z90, Alarm, CalibrationMethod, CalibrationResult
+from deal_hw.calibration import Z90, Alarm, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
@@ -317,12 +317,9 @@ class OutputErrorFits(Fits):
         return (mismatch(chi2, f" over {seconds:g} s from {kind} start states"),)
 
 
-def output_error_method(search: CalibrationMethod[Problem] | None = None) -> CalibrationPipeline:
-    """Return `output-error`: output-error fits by cross-validation, after the local fit and a search.
-
-    The default search is `eki`.
-    """
-    return CalibrationPipeline(search or Eki(), "output-error", fits=OutputErrorFits())
+def output_error_method() -> CalibrationPipeline:
+    """Return `output-error`: fits by cross-validation, after the local fit and the search `eki`."""
+    return CalibrationPipeline(Eki(), "output-error", fits=OutputErrorFits())
 
 
 def local() -> CalibrationPipeline:

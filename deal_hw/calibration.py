@@ -11,7 +11,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
-from deal_hw.parameters import LONGEST_LATENCY_S, ParameterDistribution, ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.reading import number, numbers, object_of, read_json, reading, texts
 from deal_hw.schema import from_values
 from deal_hw.types import FloatArray
@@ -107,6 +107,11 @@ def percent(share: float) -> str:
     """Return a share as text, in percent with two digits, or as a whole number from 100 on."""
     value = 100 * share
     return f"{value:.2g} %" if value < 99.5 else f"{value:.0f} %"
+
+
+def std_words(parameter: Parameter, std: float) -> str:
+    """Return a standard deviation in a parameter's own scale as text: in percent on a log scale."""
+    return percent(std) if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:

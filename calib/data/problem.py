@@ -295,12 +295,11 @@ class Problem:
         moved = self.starts[index].velocity
         return np.concatenate([moved, np.zeros_like(moved)], axis=1)[:, self.channels]
 
-    def windows(self, length: int, hop: int | None = None, offset: int = 0) -> list[WindowData]:
+    def windows(self, length: int, offset: int = 0) -> list[WindowData]:
         """Cut all episodes into windows of ``length`` samples.
 
         Args:
             length: Samples predicted in each window, H.
-            hop: Samples from start to start; H by default.
             offset: First sample that may start a window.
 
         Raises:
@@ -310,7 +309,7 @@ class Problem:
         problem = ""
         for index, episode in enumerate(self.episodes):
             try:
-                windows = cut_windows(episode, length, hop, offset, self.latency_range_s[1])
+                windows = cut_windows(episode, length, offset, self.latency_range_s[1])
             except InsufficientDataError as err:
                 problem = str(err)
                 continue

@@ -18,7 +18,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior, information
 from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
-from deal_hw.calibration import CalibrationResult, percent
+from deal_hw.calibration import CalibrationResult, std_words
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
     OF_FAMILY,
@@ -227,10 +227,11 @@ def _advice(
     worth: float,
 ) -> Advice:
     name, prior = space.names[k], float(space.width[k] / np.sqrt(12.0))
+    now = std_words(space.free[k], before)
     usable = {name: found for name, found in predictions.items() if found.usable}
     if not usable:
         sentence = (
-            f"{name} is open at {_amount(space, k, before)}: with the values found, none of "
+            f"{name} is open at {now}: with the values found, none of "
             f"{len(predictions)} excitations stays inside the limits in simulation, so there is no advice"
         )
         return Advice(name, before, before, "", sentence)
@@ -243,22 +244,13 @@ def _advice(
             else "record for longer, or measure it by other means"
         )
         sentence = (
-            f"{name} is open at {_amount(space, k, before)}, and the best of {len(usable)} excitations "
-            f"leaves {_amount(space, k, after)}: {how}"
+            f"{name} is open at {now}, and the best of {len(usable)} excitations "
+            f"leaves {std_words(space.free[k], after)}: {how}"
         )
         return Advice(name, before, after, "", sentence)
     rest = "" if _has_value(space, k, after) else ", which is still weak"
-    sentence = (
-        f"record {best}: {name} goes from {_amount(space, k, before)} to {_amount(space, k, after)}{rest}"
-    )
+    sentence = f"record {best}: {name} goes from {now} to {std_words(space.free[k], after)}{rest}"
     return Advice(name, before, after, best, sentence)
-
-
-def _amount(space: ParameterSpace, k: int, std: float) -> str:
-    """Format a standard deviation: in percent on a log scale, with the unit on a linear one."""
-    if space.log_scale[k]:
-        return percent(std)
-    return f"{std:.2g} {space.free[k].unit}"
 
 
 def next_recordings(
@@ -267,7 +259,6 @@ def next_recordings(
     episodes: Sequence[SampledEpisode],
     *,
     balance: Callable[[], Behaviour] | None = None,
-    settings: AdviceSettings = SETTINGS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
     """Return advice as :func:`advise` does, for the parameters that the result calls weak or unidentified.
@@ -281,10 +272,10 @@ def next_recordings(
     if robot.base is not None:
         return _without(open_, "motions are planned for a fixed base only; record it held by its trunk")
     try:
-        described = _described(robot, result, episodes, settings, threads)
+        described = _described(robot, result, episodes, threads)
         known = dataclasses.replace(robot, description=described)
         seen = information(known, result.space, episodes, result.estimate, result.latency_s, threads=threads)
-        found = advise(known, result, seen, balance=balance, settings=settings, threads=threads)
+        found = advise(known, result, seen, balance=balance, threads=threads)
     except DealHwError as err:
         return _without(open_, str(err))
     # A parameter with the verdict identifiable needs no recording, however wide its interval is.
@@ -302,7 +293,6 @@ def _described(
     robot: RobotModel,
     result: CalibrationResult,
     episodes: Sequence[SampledEpisode],
-    settings: AdviceSettings,
     threads: int | None,
 ) -> RobotDescription:
     """Return the description with the residual as noise, and with the recordings' limits if it has none."""
@@ -319,7 +309,7 @@ def _described(
     positions = np.concatenate([e.position[e.usable] for e in episodes])
     low, high = np.nanmin(targets, axis=0), np.nanmax(targets, axis=0)
     least, most = np.nanmin(positions, axis=0), np.nanmax(positions, axis=0)
-    spare = settings.beyond * (most - least)
+    spare = SETTINGS.beyond * (most - least)
     fastest = np.max([np.abs(s.velocity).max(axis=0) for s in problem.starts], axis=0)
     home = 0.5 * (least + most)
     if description.actuation == "position":
@@ -328,7 +318,7 @@ def _described(
         description.limits,
         target=_pairs(low, high),
         trip_position=_pairs(least - spare, most + spare),
-        trip_velocity=tuple(map(float, settings.faster * fastest)),
+        trip_velocity=tuple(map(float, SETTINGS.faster * fastest)),
     )
     return dataclasses.replace(description, limits=limits, default_position=tuple(map(float, home)))
 

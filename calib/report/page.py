@@ -19,7 +19,7 @@ from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.story import make_story
 from deal_hw.calib.validation.verdict import trust
-from deal_hw.calibration import RESULT_FILE, CalibrationResult, percent
+from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import Parameter
@@ -155,7 +155,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         100 * np.clip(space.normalize(values), 0, 1)
         for values in (result.interval[:, 0], result.interval[:, 1], space.nominal, result.estimate)
     ]
-    rows, valued = [], with_value(result)
+    rows = []
     for k, p in enumerate(space):
         # Rounded to the share of the range that the alarm uses.
         bound = {0.0: "lower", 100.0: "upper"}.get(round(float(at[3][k]), 4), "")
@@ -164,14 +164,15 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
             prior = f"expected {p.prior_mean:.4g} {p.unit} within {spread}"
         low, high = map(float, result.interval[k])
-        has_value = bool(valued[k])
+        verdict = result.verdicts[k] if result.verdicts else ""
+        has_value = verdict != "not identifiable"
         rows.append(
             Row(
                 parameter=p,
                 estimate=float(result.estimate[k]),
                 low=low,
                 high=high,
-                verdict=result.verdicts[k] if result.verdicts else "",
+                verdict=verdict,
                 has_value=has_value,
                 outside=has_value and not low <= result.estimate[k] <= high,
                 at_bound=bound,
@@ -206,29 +207,19 @@ def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, st
 
 def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
     """Return the table of advised recordings, in words."""
+
+    def spread(row: Mapping[str, Any], key: str) -> str:
+        return "–" if row[key] is None else std_words(result.space[row["parameter"]], row[key])
+
     return [
         {
             "parameter": str(row["parameter"]),
-            "before": _spread(result, str(row["parameter"]), row["std"]),
-            "after": _spread(result, str(row["parameter"]), row["std_after"]) if row["excitation"] else "–",
+            "before": spread(row, "std"),
+            "after": spread(row, "std_after") if row["excitation"] else "–",
             "sentence": str(row["sentence"]),
         }
         for row in result.advice
     ]
-
-
-def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
-    """Format a standard deviation in the parameter's own scale."""
-    if std is None:
-        return "–"
-    parameter = result.space[name]
-    return percent(std) if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
-
-
-def with_value(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return which parameters have a value on the page, (K,): unidentified ones have none."""
-    K = len(result.space)
-    return np.array([v != "not identifiable" for v in result.verdicts] or [True] * K, dtype=bool)
 
 
 def short(value: float, digits: int = 4) -> str:

@@ -42,20 +42,17 @@ class Windows:
         return np.asarray(self.start[:, None] + 1 + np.arange(self.length))
 
 
-def cut_windows(
-    episode: SampledEpisode, length: int, hop: int | None = None, first: int = 0, latest_s: float = 0.0
-) -> Windows:
+def cut_windows(episode: SampledEpisode, length: int, first: int = 0, latest_s: float = 0.0) -> Windows:
     """Cut an episode into windows with usable samples and constant gains and limits.
 
     Args:
         episode: The episode.
         length: Samples a window predicts, H.
-        hop: Samples from one window's start to the next's; H by default, so that no sample is used twice.
         first: First sample that may start a window.
         latest_s: The longest simulated latency [s], for which a change of gains or limits may still act.
 
     Returns:
-        The windows, without gaps, lost frames or changes of gains or effort limit.
+        The windows, without gaps, lost frames or changes of gains or effort limit; no sample is used twice.
 
     Raises:
         InsufficientDataError: There is none.
@@ -74,7 +71,7 @@ def cut_windows(
         constant = changed[late] == changed[min(int(step[-1]), last_step)]
         if whole and constant:
             starts.append(at)
-            at += hop or length
+            at += length
         else:
             at += 1
     if not starts:
