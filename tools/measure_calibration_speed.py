@@ -23,7 +23,7 @@ import numpy as np
 from deal_hw.bench.rows import describe_call
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.methods import CLOSED_LOOP_METHODS, make_method, usual_population
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, make_method, usual_population
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.sim.engine.batch import bare_steps_per_second

@@ -32,7 +32,7 @@ from fakes.simulated_episode import simulated_episode
 
 from deal_hw.bench.rows import describe_call
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.methods import make_method
+from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model

@@ -93,7 +93,7 @@ def make_cells(
     Raises:
         UnknownNameError: There is no such task or method.
     """
-    from deal_hw.calib.methods import check_method
+    from deal_hw.calib.pipeline.methods import check_method
 
     for task in tasks:
         if task not in TASKS:
@@ -135,7 +135,7 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
 
     Without a population each method has its default.
     """
-    from deal_hw.calib.methods import usual_budget
+    from deal_hw.calib.pipeline.methods import usual_budget
 
     row: dict[str, Any] = {"bench": cell.protocol}
     row |= {name: getattr(cell, name) for name in KEY} | {"error": ""}

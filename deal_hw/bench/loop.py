@@ -17,7 +17,7 @@ import numpy as np
 from deal_hw.bench.rows import Cells, Row, per_parameter
 from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
-from deal_hw.calib.methods import check_method
+from deal_hw.calib.pipeline.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION

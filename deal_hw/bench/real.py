@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import Cells, Row
-from deal_hw.calib.methods import check_method
+from deal_hw.calib.pipeline.methods import check_method
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray

@@ -53,7 +53,7 @@ def cells(
     Raises:
         UnknownNameError: There is no such task or method.
     """
-    from deal_hw.calib.methods import usual_population
+    from deal_hw.calib.pipeline.methods import usual_population
 
     chosen = make_cells(
         "fixed-range", tasks, profile, methods, [range_ratio], seeds, space=space, demonstration="policy"
@@ -88,7 +88,7 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
         many steps, and the ratio.
     """
     from deal_hw.calib.data.problem import Problem
-    from deal_hw.calib.methods import usual_budget
+    from deal_hw.calib.pipeline.methods import usual_budget
     from deal_hw.sim.engine.batch import default_threads
 
     cpu_s = time.process_time()

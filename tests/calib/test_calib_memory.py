@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.methods import make_method
+from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calibration import Budget, Progress
 
 FROM, TO = 5, 11

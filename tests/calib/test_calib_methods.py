@@ -14,14 +14,14 @@ from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings, _Box
 from deal_hw.calib.fit.refinement import refine
-from deal_hw.calib.methods import (
+from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
     METHODS,
     NO_DATA_METHODS,
     check_method,
     make_method,
 )
-from deal_hw.calib.pipeline import CalibrationPipeline
+from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint

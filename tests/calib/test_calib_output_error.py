@@ -14,8 +14,8 @@ import pytest
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import SHORT, Recipe, fit_output_error, prediction_rmse
-from deal_hw.calib.output_error_fits import OutputErrorFits, OutputErrorSettings, output_error_method
-from deal_hw.calib.pipeline import CalibrationPipeline
+from deal_hw.calib.pipeline.output_error_fits import OutputErrorFits, OutputErrorSettings, output_error_method
+from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calib.uncertainty.null_space import confounded

@@ -16,13 +16,13 @@ from scipy.signal import lfilter
 
 from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case
-from deal_hw.calib import pipeline
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
-from deal_hw.calib.pipeline import (
+from deal_hw.calib.pipeline import stages
+from deal_hw.calib.pipeline.stages import (
     CalibrationPipeline,
     CalibrationRun,
     Refinement,
@@ -117,7 +117,7 @@ def test_only_the_first_search_is_brief(
     """What a brief search leaves unexplained is searched for to the end, unless drawn points end no lower."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     refined = dataclasses.replace(refine(problem, noisy.theta, noisy.latency_s), chi2=9.0)
-    monkeypatch.setattr(pipeline, "refined_from", lambda *_: refined)
+    monkeypatch.setattr(stages, "refined_from", lambda *_: refined)
     search = FixedSearch(noisy.theta, noisy.latency_s, 0.05)
     run = CalibrationRun(
         problem=problem,

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.calib import pipeline
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import local_fit, refine
-from deal_hw.calib.pipeline import CalibrationRun, Refinement, with_shared_error
+from deal_hw.calib.pipeline import stages
+from deal_hw.calib.pipeline.stages import CalibrationRun, Refinement, with_shared_error
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.shared_errors import (
@@ -187,7 +187,7 @@ def test_a_search_that_predicts_as_well_refutes_it(tmp_path: Path, monkeypatch: 
     """Right recordings that were suspected: the calibration goes on as without the suspicion."""
     right = problem("pendulum", None, tmp_path)
     suspicion = FoundError(tuple(shared_errors(right))[:1], 1.0, 100.0, 500.0, right, 10)
-    monkeypatch.setattr(pipeline, "find_shared_error", lambda problem, local, tell: suspicion)
+    monkeypatch.setattr(stages, "find_shared_error", lambda problem, local, tell: suspicion)
     said: list[Progress] = []
     rng = np.random.default_rng(0)
     run = CalibrationRun(

@@ -47,9 +47,7 @@ ROOMS = {
         {"search", "fit"},
         {"deal_paper", "uncertainty"},
         {"validation", "design", "baselines"},
-        {"pipeline"},
-        {"output_error_fits"},
-        {"methods", "report"},
+        {"pipeline", "report"},
     ),
     "drivers.go2": (
         {"descriptions"},
@@ -266,7 +264,7 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
         ),
         (
             "deal_hw/bench/x.py",
-            "from deal_hw.workflows.calibrate import calibrate\nimport deal_hw.calib.methods",
+            "from deal_hw.workflows.calibrate import calibrate\nimport deal_hw.calib.pipeline.methods",
         ),
         ("deal_hw/cli/bench.py", "from deal_hw.bench import rows"),
         ("deal_hw/policy.py", "import numpy\nfrom deal_hw.description import RobotDescription"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calib.methods import CLOSED_LOOP_METHODS
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS
 from deal_hw.calibration import listed
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.methods import CLOSED_LOOP_METHODS
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS
 from deal_hw.control.velocity import FixedVelocity, make_source
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription

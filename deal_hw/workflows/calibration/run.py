@@ -191,7 +191,7 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays
         from deal_hw.calib.data.noise import SETTINGS as DATA
         from deal_hw.calib.data.problem import Problem
-        from deal_hw.calib.methods import make_method
+        from deal_hw.calib.pipeline.methods import make_method
         from deal_hw.calib.validation.metrics import HeldOut
         from deal_hw.calib.validation.verdict import latency_alarms
     except ModuleNotFoundError as err:

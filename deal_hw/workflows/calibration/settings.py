@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from deal_hw.calib.methods import check_method, usual_budget
+from deal_hw.calib.pipeline.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, Budget, CalibrationResult, ProgressCallback
 from deal_hw.data.files import dataset_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings

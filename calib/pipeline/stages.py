@@ -2,8 +2,9 @@
 
 :class:`CalibrationPipeline` is the same for simulated and real robots, with a fixed or a floating base. A
 :class:`Fits` strategy continues where the local fit does not explain the recordings. :class:`Refinement`
-searches and refines down to the sensors' noise. :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits
-predictions of a robot that no model explains.
+searches and refines down to the sensors' noise.
+:class:`deal_hw.calib.pipeline.output_error_fits.OutputErrorFits` fits predictions of a robot that no model
+explains.
 """
 
 from __future__ import annotations

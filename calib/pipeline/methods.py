@@ -21,9 +21,9 @@ METHODS: dict[str, str] = {
     "deal-paper-pn": "deal_hw.calib.deal_paper.algorithm1:without_normalisation",
     "deal-paper-flat": "deal_hw.calib.deal_paper.algorithm1:flat",
     "deal-paper-replay": "deal_hw.calib.deal_paper.algorithm1:replayed",
-    "output-error": "deal_hw.calib.output_error_fits:output_error_method",
-    "local": "deal_hw.calib.output_error_fits:local",
-    "gait": "deal_hw.calib.output_error_fits:gait",
+    "output-error": "deal_hw.calib.pipeline.output_error_fits:output_error_method",
+    "local": "deal_hw.calib.pipeline.output_error_fits:local",
+    "gait": "deal_hw.calib.pipeline.output_error_fits:gait",
     "easi": "deal_hw.calib.baselines.easi:Easi",
     "easi-log": "deal_hw.calib.baselines.easi:logarithmic",
     "bo": "deal_hw.calib.baselines.bayesian:BayesianOptimisation",
@@ -85,7 +85,7 @@ def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem
     search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
     if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
         return search
-    from deal_hw.calib.pipeline import CalibrationPipeline
+    from deal_hw.calib.pipeline.stages import CalibrationPipeline
     from deal_hw.calib.validation.verdict import Validation
 
     # A user who names a search wants it to run, even where refining the nominal values would be enough.

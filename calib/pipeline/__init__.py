@@ -1,0 +1,1 @@
+"""The whole calibration: its stages, its strategies, and the table of methods."""
