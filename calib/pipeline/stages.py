@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -57,6 +57,9 @@ from deal_hw.calibration import (
     listed,
 )
 from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.fit.output_error import OutputErrorFit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,22 +114,6 @@ class FitOutcome:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Fit(Protocol):
-    """The result of a fit of any kind."""
-
-    @property
-    def theta(self) -> FloatArray:
-        """Physical parameters, (K,)."""
-
-    @property
-    def latency_s(self) -> float:
-        """Total latency [s]."""
-
-    @property
-    def chi2(self) -> float:
-        """Mean squared residual over the noise variance."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationRun:
     """State shared by the stages of one calibration.
@@ -165,7 +152,7 @@ class CalibrationRun:
 
         return report
 
-    def offer(self, stage: str, found: Fit | CalibrationResult) -> None:
+    def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""
         theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
         if self.progress is not None:
@@ -258,7 +245,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             local = lower_minimum(run, local, RESTARTS) or local
             white = conclusive(problem, local)
         if local is not None and white:
-            found = conclude_fit(run, without_search(problem, budget, local), local)
+            found = conclude_fit(run, None, local)
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
             found = conclude_weighted(run, weighted)
         else:
@@ -395,32 +382,34 @@ def lower_minimum(run: CalibrationRun, found: Refined, settings: RestartSettings
 
 def conclude_fit(
     run: CalibrationRun,
-    searched: CalibrationResult,
+    searched: CalibrationResult | None,
     refined: Refined,
     choice: Choice | None = None,
     restarts: int = 0,
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
-    ``searched`` is the search's result or its substitute, ``choice`` that of cross-validation, if it ran.
+    ``searched`` is the search's result; None where the fit needed no search. ``choice`` is that of
+    cross-validation, if it ran.
     """
-    problem = run.problem
-    scan = None
+    problem, scan, whole = run.problem, None, None
+    searched = searched or without_search(problem, run.budget, refined)
     if choice is not None and choice.chosen == "search":
         length, states = refined.shooting.length, refined.shooting.states(refined.point)
         refined = at_parameters(problem, searched.estimate, searched.latency_s, length, states)
     elif problem.fixed_latency_s is None:
         scan = scan_latency(problem, refined, run.progress)
-    whole = scan is not None and scan.decides(refined)
-    if scan is not None and whole:
-        refined = scan.refined[scan.best]
-    decided = whole or problem.fixed_latency_s is not None
+        # Whole ticks that have not converged decide nothing: the free latency is kept.
+        whole = scan if scan.decides(refined) else None
+    if whole is not None:
+        refined = whole.refined[whole.best]
+    decided = whole is not None or problem.fixed_latency_s is not None
     if choice is not None and choice.chosen == "robust refinement":
         refined = refine_robust(refined, decided)
     refined = with_rows(refined)
     known = uncertainty_at(problem, refined, fixed_latency=decided)
-    if scan is not None and whole:
-        known = averaged(problem, scan, known)
+    if whole is not None:
+        known = averaged(problem, whole, known)
     known, checked = judge(problem, refined, known, run.settings)
     facts: dict[str, Any] = {
         "restarts": restarts,
@@ -458,11 +447,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         "these sensors are finer than the model; the fit weights them by the model's residual "
         f"(multiples of their noise): {words}",
     )
-    found = conclude_fit(
-        dataclasses.replace(run, problem=weighted.problem),
-        without_search(weighted.problem, run.budget, weighted.fit),
-        weighted.fit,
-    )
+    found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit)
     known = dataclasses.replace(found.known, alarms=(*found.known.alarms, mismatch(weighted.chi2)))
     facts = {**found.facts, "channel_weights": scale}
     return dataclasses.replace(found, chi2=weighted.chi2, known=known, facts=facts)
@@ -486,7 +471,7 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
     alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    found = conclude_fit(wide, without_search(play.problem, run.budget, fit), fit)
+    found = conclude_fit(wide, None, fit)
     known = dataclasses.replace(found.known, alarms=(alarm, *found.known.alarms))
     facts = {**found.facts, "diagnosis": [dataclasses.asdict(play.diagnosis)]}
     return dataclasses.replace(found, known=known, facts=facts)
