@@ -129,8 +129,7 @@ class _MultiStart(Stepper):
         settings = self.settings
         self._bounds = value_bounds(self.problem)
         self._ticks = settings.noisy_ticks if is_noisy(self.problem) else settings.clean_ticks
-        middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
-        self._midpoint = self._values_of(middle)[0]
+        self._midpoint = self._values_of(self.coordinates.midpoint)[0]
         self._restarts, self._explained = 0, False
         self._best = (math.inf, self._midpoint)
         self._begin_draws()

@@ -116,7 +116,7 @@ class _Random(Stepper):
         super().__init__(log, rng, search)
         self._windows = cut(log.problem, self.settings.ticks)
         # One metric for all draws, that of the range's midpoint: otherwise scores are not comparable.
-        self._middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
+        self._middle = self.coordinates.midpoint
         self._unit = np.empty((0, self.coordinates.count))
         self._score = np.empty(0)
 

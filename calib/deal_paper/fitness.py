@@ -154,8 +154,7 @@ class TrajectoryFitness(Fitness):
 
     def _prepare(self, rng: np.random.Generator) -> None:
         self._windows = cut(self._problem, self._settings.window_ticks)
-        coordinates = Coordinates(self._problem)
-        self._midpoint = coordinates.members(np.full((1, coordinates.count), 0.5))
+        self._midpoint = Coordinates(self._problem).midpoint
         # Made on first use: a small population's call costs less than its metric.
         self._whitenings: list[Whitening] | None = None
 

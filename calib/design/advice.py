@@ -175,7 +175,8 @@ def advise(
     before = np.full(K, np.inf) if known.covariance is None else np.sqrt(np.diag(known.covariance))
     # A truncated interval has more information than its width shows.
     before = np.minimum(before, space.width / np.sqrt(12.0))
-    open_ = [k for k in range(K) if not _has_value(space, k, float(before[k])) or _said_weak(result, k)]
+    # A parameter with the verdict identifiable needs no recording, however wide its interval is.
+    open_ = [k for k, verdict in enumerate(result.verdicts) if verdict != "identifiable"]
     if not open_:
         return ()
     designs = menu_designs(robot.description, balance is not None, settings)
@@ -210,14 +211,6 @@ def predict_menu(
     return {name: experiment.predict(experiment.playing(plan, balance)) for name, plan in menu.items()}
 
 
-def _said_weak(result: CalibrationResult, k: int) -> bool:
-    return bool(result.verdicts) and result.verdicts[k] != "identifiable"
-
-
-def _has_value(space: ParameterSpace, k: int, std: float) -> bool:
-    return std <= INTERVALS.identifiable_std * (1.0 if space.log_scale[k] else float(space.width[k]))
-
-
 def _advice(
     space: ParameterSpace,
     k: int,
@@ -248,7 +241,8 @@ def _advice(
             f"leaves {std_words(space.free[k], after)}: {how}"
         )
         return Advice(name, before, after, "", sentence)
-    rest = "" if _has_value(space, k, after) else ", which is still weak"
+    unit = 1.0 if space.log_scale[k] else float(space.width[k])
+    rest = "" if after <= INTERVALS.identifiable_std * unit else ", which is still weak"
     sentence = f"record {best}: {name} goes from {now} to {std_words(space.free[k], after)}{rest}"
     return Advice(name, before, after, best, sentence)
 
@@ -275,11 +269,9 @@ def next_recordings(
         described = _described(robot, result, episodes, threads)
         known = dataclasses.replace(robot, description=described)
         seen = information(known, result.space, episodes, result.estimate, result.latency_s, threads=threads)
-        found = advise(known, result, seen, balance=balance, threads=threads)
+        return advise(known, result, seen, balance=balance, threads=threads)
     except DealHwError as err:
         return _without(open_, str(err))
-    # A parameter with the verdict identifiable needs no recording, however wide its interval is.
-    return tuple(one for one in found if one.parameter in open_)
 
 
 def _without(names: Sequence[str], why: str) -> tuple[Advice, ...]:

@@ -76,6 +76,11 @@ class Coordinates:
         latency = self._low + self._width * np.clip(unit[:, K], 0.0, 1.0)
         return Members(theta, latency)
 
+    @property
+    def midpoint(self) -> Members:
+        """The one member in the middle of every range."""
+        return self.members(np.full((1, self.count), 0.5))
+
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Draw unit coordinates, (count, C), over all ranges; the latency without its margin."""
         unit = rng.random((count, self.count))
