@@ -316,14 +316,3 @@ class BatchPool:
         if len(self._kept) > self._most:
             self._steps += self._kept.pop(next(iter(self._kept))).steps
         return batch
-
-
-def bare_steps_per_second(robot: RobotModel, count: int, steps: int, threads: int | None = None) -> float:
-    """Measure the engine alone: physics steps per second of ``count`` members, open loop."""
-    import time
-
-    batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())
-    batch.bind("qpos")[:, list(robot.qpos)] = 0.05
-    start = time.perf_counter()
-    batch.step(nstep=steps)
-    return count * steps / (time.perf_counter() - start)
