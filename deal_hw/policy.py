@@ -12,7 +12,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, Protocol, get_args
@@ -55,6 +55,18 @@ MAX_DELAY: Final = 100
 MAX_TERMS: Final = 4096
 MAX_JOINTS: Final = 256
 MAX_SPEC_CHARACTERS: Final = 1_000_000
+_OF_ROBOT: Final = (
+    "joint_names",
+    "actuated",
+    "default_position",
+    "stiffness",
+    "damping",
+    "effort_limit",
+    "speed_limit",
+    "control_rate_hz",
+    "position_units",
+)
+"""Fields of a spec that a robot's description has, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +203,30 @@ class PolicySpec:
             json.dumps(dict(self.training), allow_nan=False)
         except (TypeError, ValueError, RecursionError) as err:
             raise refusal("training", self.training, f"plain JSON values ({err})") from err
+
+    @classmethod
+    def of_robot(
+        cls,
+        description: RobotDescription,
+        observation: Iterable[ObservationTerm],
+        action_scale: Iterable[float],
+        **more: Any,
+    ) -> PolicySpec:
+        """Return a spec with a robot's joints, default pose, gains, limits and control rate.
+
+        Args:
+            description: The robot.
+            observation: The terms of the observation.
+            action_scale: As the attribute, (A,).
+            **more: Further fields, and values other than the robot's.
+        """
+        own = {name: getattr(description, name) for name in _OF_ROBOT}
+        return cls(
+            robot=description.name,
+            observation=tuple(observation),
+            action_scale=tuple(action_scale),
+            **{**own, **more},
+        )
 
     def _check_clock(self) -> None:
         observed = any(term.quantity == "clock" for term in self.observation)

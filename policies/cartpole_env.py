@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -65,12 +63,7 @@ class BalanceTask:
             )
 
 
-def balance_spec(
-    description: RobotDescription,
-    task: BalanceTask,
-    trained_under: str = "",
-    training: Mapping[str, Any] | None = None,
-) -> PolicySpec:
+def balance_spec(description: RobotDescription, task: BalanceTask, trained_under: str = "") -> PolicySpec:
     """Return the layout of observation and action.
 
     Positions now, velocities over 160 ms, actions over 280 ms. Velocities are differences of noisy reports
@@ -86,22 +79,7 @@ def balance_spec(
             ObservationTerm("velocity", pole, 0.3, delay),
         ]
     terms += [ObservationTerm("action", cart, 1.0, delay) for delay in range(1, ACTIONS + 1)]
-    return PolicySpec(
-        robot=description.name,
-        joint_names=description.joint_names,
-        actuated=description.actuated,
-        observation=tuple(terms),
-        action_scale=(task.action_scale_m,),
-        default_position=description.default_position,
-        stiffness=description.stiffness,
-        damping=description.damping,
-        effort_limit=description.effort_limit,
-        speed_limit=description.speed_limit,
-        control_rate_hz=description.control_rate_hz,
-        position_units=description.position_units,
-        trained_under=trained_under,
-        training=dict(training or {}),
-    )
+    return PolicySpec.of_robot(description, terms, (task.action_scale_m,), trained_under=trained_under)
 
 
 class CartPoleEnv(ServoVectorEnv):

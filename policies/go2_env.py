@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -154,10 +154,7 @@ class WalkTask:
 
 
 def walk_spec(
-    description: RobotDescription,
-    trained_under: str = "",
-    training: Mapping[str, Any] | None = None,
-    task: WalkTask | None = None,
+    description: RobotDescription, trained_under: str = "", task: WalkTask | None = None
 ) -> PolicySpec:
     """Return the layout of observation and action: joints, gyro, gravity, command, clock, the last action.
 
@@ -168,15 +165,8 @@ def walk_spec(
     terms += [*vector_terms("command", 1.0), *(ObservationTerm("clock", axis, 1.0) for axis in CLOCK_AXES)]
     terms += joint_terms(description, 0.05)
     scale = [ACTION_SCALE_RAD[name.split("_")[1]] for name in description.actuated]
-    return locomotion_spec(
-        description,
-        terms,
-        scale,
-        trained_under,
-        training,
-        clock_hz=task.clock_hz,
-        command_range=task.command_range,
-    )
+    more = {"clock_hz": task.clock_hz, "command_range": task.command_range}
+    return locomotion_spec(description, terms, scale, trained_under, **more)
 
 
 class Go2Env(LocomotionEnv):

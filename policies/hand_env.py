@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -49,17 +47,14 @@ class TurnTask:
 
 
 def turn_spec(
-    description: RobotDescription,
-    trained_under: str = "",
-    training: Mapping[str, Any] | None = None,
-    task: TurnTask | None = None,
+    description: RobotDescription, trained_under: str = "", task: TurnTask | None = None
 ) -> PolicySpec:
     """Return the layout of observation and action: joints, last action, and the cube without its place."""
     terms = [ObservationTerm("height", "z", 10.0), *vector_terms("gravity", 1.0)]
     terms += [*vector_terms("heading", 1.0), *vector_terms("angular_velocity", 0.2)]
     terms += joint_terms(description, 0.1)
     scale = ((task or TurnTask()).action_rad,) * len(description.actuated)
-    return locomotion_spec(description, terms, scale, trained_under, training)
+    return locomotion_spec(description, terms, scale, trained_under)
 
 
 class HandEnv(LocomotionEnv):

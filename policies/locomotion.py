@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -147,30 +147,15 @@ def locomotion_spec(
     terms: Sequence[ObservationTerm],
     action_scale: Sequence[float],
     trained_under: str,
-    training: Mapping[str, Any] | None,
     **more: Any,
 ) -> PolicySpec:
     """Return a spec with the description's gains and with its limits inside the safety limits.
 
     ``more`` are further fields of the spec.
     """
-    limits = description.limits
-    return PolicySpec(
-        robot=description.name,
-        joint_names=description.joint_names,
-        actuated=description.actuated,
-        observation=tuple(terms),
-        action_scale=tuple(action_scale),
-        default_position=description.default_position,
-        stiffness=description.stiffness,
-        damping=description.damping,
-        effort_limit=tuple(map(min, description.effort_limit, limits.effort)),
-        speed_limit=description.speed_limit,
-        control_rate_hz=description.control_rate_hz,
-        position_units=description.position_units,
-        trained_under=trained_under,
-        training=dict(training or {}),
-        **more,
+    effort = tuple(map(min, description.effort_limit, description.limits.effort))
+    return PolicySpec.of_robot(
+        description, terms, action_scale, effort_limit=effort, trained_under=trained_under, **more
     )
 
 

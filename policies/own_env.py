@@ -208,25 +208,12 @@ def _plain_layout(description: RobotDescription, distribution: ParameterDistribu
             f"robot {description.name!r}: a policy's actions need a position_range around default_position "
             "and an effort_limit of every actuator; write them into robot.yaml"
         )
-    return PolicySpec(
-        robot=description.name,
-        joint_names=description.joint_names,
-        actuated=description.actuated,
-        observation=tuple(
-            ObservationTerm(quantity=quantity, joint=joint, scale=1.0)
-            for quantity in ("position", "velocity")
-            for joint in description.joint_names
-        ),
-        action_scale=tuple(map(float, scale)),
-        default_position=description.default_position,
-        stiffness=description.stiffness,
-        damping=description.damping,
-        effort_limit=description.effort_limit,
-        speed_limit=description.speed_limit,
-        control_rate_hz=description.control_rate_hz,
-        trained_under=distribution.digest(),
-        position_units=description.position_units,
-    )
+    terms = [
+        ObservationTerm(quantity=quantity, joint=joint, scale=1.0)
+        for quantity in ("position", "velocity")
+        for joint in description.joint_names
+    ]
+    return PolicySpec.of_robot(description, terms, map(float, scale), trained_under=distribution.digest())
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -52,11 +51,7 @@ class RunTask:
         check_task(self.ticks, top_height_m=self.top_height_m)
 
 
-def run_spec(
-    description: RobotDescription,
-    trained_under: str = "",
-    training: Mapping[str, Any] | None = None,
-) -> PolicySpec:
+def run_spec(description: RobotDescription, trained_under: str) -> PolicySpec:
     """Return the layout of observation and action: the full state without the place, and the last action.
 
     Directions are in the torso's frame. Gymnasium's quaternion has two values, q and -q, for one orientation.
@@ -65,7 +60,7 @@ def run_spec(
     terms += [*vector_terms("heading", 1.0), *vector_terms("linear_velocity", 0.5)]
     terms += [*vector_terms("angular_velocity", 0.2), *joint_terms(description, 0.1)]
     scale = (1.0,) * len(description.actuated)
-    return locomotion_spec(description, terms, scale, trained_under, training)
+    return locomotion_spec(description, terms, scale, trained_under)
 
 
 class RunEnv(LocomotionEnv):

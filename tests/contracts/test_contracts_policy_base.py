@@ -25,19 +25,7 @@ J = len(DESCRIPTION.joint_names)
 
 
 def spec(*terms: ObservationTerm) -> PolicySpec:
-    return PolicySpec(
-        robot="go2",
-        joint_names=DESCRIPTION.joint_names,
-        actuated=DESCRIPTION.actuated,
-        observation=terms,
-        action_scale=(0.5,) * J,
-        default_position=DESCRIPTION.default_position,
-        stiffness=DESCRIPTION.stiffness,
-        damping=DESCRIPTION.damping,
-        effort_limit=DESCRIPTION.effort_limit,
-        speed_limit=DESCRIPTION.speed_limit,
-        control_rate_hz=50.0,
-    )
+    return PolicySpec.of_robot(DESCRIPTION, terms, (0.5,) * J)
 
 
 coordinate = st.floats(-4.0, 4.0)

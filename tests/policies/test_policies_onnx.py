@@ -21,7 +21,9 @@ from deal_hw.policies.onnx_export import export_network, write_policy
 from deal_hw.policies.onnx_runtime import SPEC_KEY, OnnxPolicy
 from deal_hw.policy import ObservationTerm, PolicySpec
 
-SPEC = balance_spec(DESCRIPTION, BalanceTask(), "0123456789abcdef", {"algorithm": "none"})
+SPEC = dataclasses.replace(
+    balance_spec(DESCRIPTION, BalanceTask(), "0123456789abcdef"), training={"algorithm": "none"}
+)
 
 
 def network(inputs: int = len(SPEC.observation), outputs: int = 1, seed: int = 0) -> torch.nn.Sequential:

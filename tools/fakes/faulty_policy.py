@@ -108,20 +108,11 @@ def faulty_policy(
 
 
 def _spec(description: RobotDescription) -> PolicySpec:
-    limits = description.limits
-    return PolicySpec(
-        robot=description.name,
-        joint_names=description.joint_names,
-        actuated=description.actuated,
-        observation=tuple(ObservationTerm("command", axis, 1.0) for axis in AXES),
-        action_scale=(0.1,) * len(description.actuated),
-        default_position=description.default_position,
-        stiffness=description.stiffness,
-        damping=description.damping,
-        effort_limit=tuple(np.minimum(description.effort_limit, limits.effort)),
-        speed_limit=description.speed_limit,
-        control_rate_hz=description.control_rate_hz,
-        position_units=description.position_units,
+    return PolicySpec.of_robot(
+        description,
+        [ObservationTerm("command", axis, 1.0) for axis in AXES],
+        (0.1,) * len(description.actuated),
+        effort_limit=tuple(map(min, description.effort_limit, description.limits.effort)),
         training={"algorithm": "none: has a fault on purpose"},
     )
 

@@ -14,25 +14,11 @@ CARTPOLE_GAINS = (1.65, 1.04, 0.475, 0.171)
 """Balances the nominal cart-pole: target per cart position, pole angle and their rates."""
 
 
-def feedback_spec(description: RobotDescription, action_scale: float = 0.25) -> PolicySpec:
+def feedback_spec(description: RobotDescription) -> PolicySpec:
     """Return the spec of a policy that observes all positions, then all velocities, unscaled."""
     quantities: tuple[Quantity, ...] = ("position", "velocity")
-    return PolicySpec(
-        robot=description.name,
-        joint_names=description.joint_names,
-        actuated=description.actuated,
-        observation=tuple(
-            ObservationTerm(q, name, 1.0) for q in quantities for name in description.joint_names
-        ),
-        action_scale=(action_scale,) * len(description.actuated),
-        default_position=description.default_position,
-        stiffness=description.stiffness,
-        damping=description.damping,
-        effort_limit=description.effort_limit,
-        speed_limit=description.speed_limit,
-        control_rate_hz=description.control_rate_hz,
-        position_units=description.position_units,
-    )
+    terms = [ObservationTerm(q, name, 1.0) for q in quantities for name in description.joint_names]
+    return PolicySpec.of_robot(description, terms, (0.25,) * len(description.actuated))
 
 
 class LinearPolicy:
