@@ -41,14 +41,6 @@ def robot(config: New | Check) -> int | RobotCheck:
         found = check_robot(config.robot)
         print(found.table())
         return found
-    path = new_robot(
-        config.model,
-        out=config.out,
-        name=config.name,
-        control_rate=config.control_rate,
-        state_rate=config.state_rate,
-        feet=config.feet,
-        several_trees=config.several_trees,
-    )
+    path = new_robot(**vars(config))
     print(f"written: {path}; check its rates and limits, then: deal-hw robot check {path}")
     return 0

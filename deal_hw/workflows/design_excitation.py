@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -185,17 +186,29 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
             f"per second, so a motion may have up to {most_hz:g} Hz; lower --high-hz"
         )
     balance = balancer(description, None if config.policy is None else Path(config.policy))
+    balance_s = 0.0 if balance is None else min(BALANCE_S, 0.25 * config.seconds)
     path = Path(config.out)
     if config.family == "optimal":
-        report = _search(config, description, balance, notify)
-        report.plan.write(path)
-        return report
-    if config.family == "sway":
-        plan = _sway(config, description)
+        report = _search(config, description, balance, balance_s, notify)
+    elif config.family == "sway":
+        report = ExcitationReport(plan=_sway(config, description), path=path)
     else:
-        plan = make_plan(description, _given_design(config, balance is not None))
-    plan.write(path)
-    return ExcitationReport(plan=plan, path=path)
+        whole = config.split <= 0
+        design = ExcitationDesign(
+            family=config.family,
+            seconds=config.seconds,
+            amplitude=config.amplitude,
+            low_hz=config.low_hz,
+            high_hz=config.high_hz,
+            split=1.0 if whole else config.split,
+            effort=(config.effort, 1.0) if whole else (1.0, config.effort),
+            speed=(config.speed, 1.0) if whole else (1.0, config.speed),
+            seed=config.seed,
+            balance_s=balance_s,
+        )
+        report = ExcitationReport(plan=make_plan(description, design), path=path)
+    report.plan.write(path)
+    return report
 
 
 def _sway(config: ExcitationSettings, description: RobotDescription) -> ExcitationPlan:
@@ -218,32 +231,11 @@ def _sway(config: ExcitationSettings, description: RobotDescription) -> Excitati
     )
 
 
-def _given_design(config: ExcitationSettings, balances: bool) -> ExcitationDesign:
-    if config.family == "optimal" or config.family == "sway":
-        raise RuntimeError(f"unreachable: {config.family} has no design")
-    whole = config.split <= 0
-    return ExcitationDesign(
-        family=config.family,
-        seconds=config.seconds,
-        amplitude=config.amplitude,
-        low_hz=config.low_hz,
-        high_hz=config.high_hz,
-        split=1.0 if whole else config.split,
-        effort=(config.effort, 1.0) if whole else (1.0, config.effort),
-        speed=(config.speed, 1.0) if whole else (1.0, config.speed),
-        seed=config.seed,
-        balance_s=_balance_s(config.seconds) if balances else 0.0,
-    )
-
-
-def _balance_s(seconds: float) -> float:
-    return min(BALANCE_S, 0.25 * seconds)
-
-
 def _search(
     config: ExcitationSettings,
     description: RobotDescription,
     balance: Callable[[], Behaviour] | None,
+    balance_s: float,
     notify: Notify | None,
 ) -> ExcitationReport:
     try:
@@ -252,37 +244,27 @@ def _search(
         from deal_hw.sim.engine.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
-    settings = SearchSettings(
-        candidates=config.candidates,
-        rounds=config.rounds,
-        criterion=config.criterion,
-    )
+    settings = SearchSettings(candidates=config.candidates, rounds=config.rounds, criterion=config.criterion)
     rng = np.random.default_rng(config.seed)
-    quiet_plan = make_plan(
-        description,
-        ExcitationDesign(
-            family="steps",
-            seconds=config.seconds,
-            amplitude=0.01,
-            balance_s=_balance_s(config.seconds) if balance is not None else 0.0,
-        ),
-    )
+    design = partial(ExcitationDesign, seconds=config.seconds, balance_s=balance_s)
 
-    def play(plan: ExcitationPlan) -> Behaviour:
-        return ExcitationBehaviour(plan, description, balance() if balance is not None else None)
+    def player(design: ExcitationDesign) -> Callable[[], Behaviour]:
+        plan = make_plan(description, design)
+        return lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None)
 
+    rest = player(design(family="steps", amplitude=0.01))
     experiment = Experiment(
         load_model(description),
         _knowledge(config),
         config.seconds,
         config.draws,
         rng,
-        rest=lambda: play(quiet_plan),
+        rest=rest,
         threads=config.threads,
     )
-    references: dict[str, Callable[[], Behaviour]] = {
-        family: _player(play, make_plan(description, design))
-        for family, design in _plain_designs(config, balance is not None).items()
+    references = {
+        "multisine": player(design(family="multisine", seed=config.seed)),
+        "chirp": player(design(family="chirp")),
     }
     if balance is not None:
         rich = RichConfig(duration_s=config.seconds)
@@ -303,20 +285,6 @@ def _search(
         space=experiment.space,
         refused=experiment.refused,
     )
-
-
-def _player(play: Callable[[ExcitationPlan], Behaviour], plan: ExcitationPlan) -> Callable[[], Behaviour]:
-    return lambda: play(plan)
-
-
-def _plain_designs(config: ExcitationSettings, balances: bool) -> dict[str, ExcitationDesign]:
-    balance_s = _balance_s(config.seconds) if balances else 0.0
-    return {
-        "multisine": ExcitationDesign(
-            family="multisine", seconds=config.seconds, balance_s=balance_s, seed=config.seed
-        ),
-        "chirp": ExcitationDesign(family="chirp", seconds=config.seconds, balance_s=balance_s),
-    }
 
 
 def _knowledge(config: ExcitationSettings) -> ParameterDistribution:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -116,7 +117,7 @@ def new_robot(settings: NewRobotSettings) -> Path:
         state_rate_hz=settings.state_rate,
         feet=settings.feet,
         several_trees=settings.several_trees,
-        mjcf_entry=_relative(model, out.parent),
+        mjcf_entry=os.path.relpath(model, out.parent),
     )
     _check_name(robot.file.name, "--name")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -262,12 +263,6 @@ def _sim() -> Any:
 def _check_name(name: str, where: str) -> None:
     if is_ours(name):
         raise ConfigurationError(f"{where} {name!r} is the name of a robot of deal-hw; choose another name")
-
-
-def _relative(model: Path, folder: Path) -> str:
-    import os
-
-    return os.path.relpath(os.path.abspath(model), os.path.abspath(folder))
 
 
 def _agreement(robot: UserRobot) -> list[Finding]:

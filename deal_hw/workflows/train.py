@@ -350,7 +350,7 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
     if isinstance(source, ParameterDistribution):
         return source, ""
     if isinstance(source, str | Path):
-        return read_distribution(Path(source)), _verdict(Path(source))
+        return _with_verdict(Path(source))
     return source.distribution, source.colour
 
 
@@ -387,17 +387,15 @@ def read_distribution(path: Path) -> ParameterDistribution:
     Raises:
         ConfigurationError: There is no such file, or it holds no distribution.
     """
+    return _with_verdict(path)[0]
+
+
+def _with_verdict(path: Path) -> tuple[ParameterDistribution, str]:
+    """Return the distribution in a file and the colour of its verdict; "" if there is none."""
     what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
     with reading(path, what, advice, error=ConfigurationError):
-        return ParameterDistribution.from_json(values)
-
-
-def _verdict(path: Path) -> str:
-    """Return the colour of the verdict in the distribution's file; "" if there is none."""
-    what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
-    values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
-    return str(values.get("verdict", ""))
+        return ParameterDistribution.from_json(values), str(values.get("verdict", ""))
 
 
 def _space(robot: str) -> ParameterSpace:

@@ -100,11 +100,6 @@ def test_a_walk_with_a_clock_jump_is_walked_again(tmp_path: Path, monkeypatch: p
             outcome=Outcome.FINISHED,
             reason="the run is over",
             passive_confirmed=True,
-            loop_timing=None,
-            clipped={},
-            cycles_sent=1,
-            states_recorded=1,
-            warnings=(),
         )
         return RunReport(dataset=tmp_path, episodes=(episode,))
 

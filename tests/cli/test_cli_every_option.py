@@ -122,15 +122,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         others.pop("view")
         did.append((plan.to_json(), port, others))
         ended = EpisodeReport(
-            path=None,
-            outcome=Outcome.STOPPED,
-            reason="the run was stopped",
-            passive_confirmed=True,
-            loop_timing=None,
-            clipped={},
-            cycles_sent=0,
-            states_recorded=0,
-            warnings=(),
+            path=None, outcome=Outcome.STOPPED, reason="the run was stopped", passive_confirmed=True
         )
         return RunReport(dataset=None, episodes=(ended,))
 

@@ -72,10 +72,6 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
         outcome=Outcome.TRIPPED,
         reason="the connection is lost",
         passive_confirmed=False,
-        loop_timing=None,
-        clipped={},
-        cycles_sent=0,
-        states_recorded=0,
         warnings=("switch it off by hand",),
     )
     said: list[str] = []
@@ -101,11 +97,6 @@ def test_a_lost_connection_asks_for_no_gentler_motion(confirmed: bool) -> None:
         outcome=Outcome.TRIPPED,
         reason="joint 'cart' is at 0.39 m",
         passive_confirmed=confirmed,
-        loop_timing=None,
-        clipped={},
-        cycles_sent=9,
-        states_recorded=9,
-        warnings=(),
         motion=moved,
     )
     assert not supervised._to_repeat(search, plan, ended, DESCRIPTION)

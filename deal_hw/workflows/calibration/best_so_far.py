@@ -7,14 +7,12 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deal_hw.calibration import (
     Alarm,
-    Budget,
-    CalibrationMethod,
     CalibrationResult,
     Progress,
     ProgressCallback,
@@ -27,8 +25,6 @@ from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:
-    from deal_hw.calib.data.problem import Problem
-    from deal_hw.calib.search.resume import SearchCheckpoint
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.overlay import Overlay
 
@@ -37,29 +33,6 @@ CHECKPOINT = "checkpoint.npz"
 
 SO_FAR = "so_far"
 """Folder beside the results for the best fit of a stopped calibration."""
-
-
-def open_checkpoint(
-    path: Path,
-    resume: bool,
-    problem: Problem,
-    method: CalibrationMethod[Any],
-    budget: Budget,
-    rng: np.random.Generator,
-) -> SearchCheckpoint:
-    """Return the checkpoint of a run that begins or continues.
-
-    Args:
-        path: The file.
-        resume: Continue from the file; otherwise it is replaced after the first generation.
-        problem: Data and simulator.
-        method: The method.
-        budget: How much it may use.
-        rng: The run's generator, before its first draw.
-    """
-    from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
-
-    return SearchCheckpoint(path, run_identity(problem, method, budget, rng), fresh=not resume)
 
 
 def check_resume(path: Path, resume: bool) -> None:

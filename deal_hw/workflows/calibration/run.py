@@ -31,7 +31,6 @@ from deal_hw.workflows.calibration.best_so_far import (
     SO_FAR,
     BestSoFar,
     keeping_best,
-    open_checkpoint,
     saying_how_to_resume,
 )
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
@@ -192,6 +191,7 @@ def calibrate_episodes(
         from deal_hw.calib.data.noise import SETTINGS as DATA
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.pipeline.methods import make_method
+        from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.validation.metrics import HeldOut
         from deal_hw.calib.validation.verdict import latency_alarms
     except ModuleNotFoundError as err:
@@ -234,11 +234,11 @@ def calibrate_episodes(
             if progress is not None:
                 progress(p)
 
-        if checkpoint is None:
-            result = searcher.run(problem, budget, rng, note)
-        else:
-            store = open_checkpoint(checkpoint, resume, problem, searcher, budget, rng)
-            result = searcher.run(problem, budget, rng, note, store)
+        store = None
+        if checkpoint is not None:
+            identity = run_identity(problem, searcher, budget, rng)
+            store = SearchCheckpoint(checkpoint, identity, fresh=not resume)
+        result = searcher.run(problem, budget, rng, note, store)
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
     result = dataclasses.replace(result, alarms=alarms)
     if held_out is None:

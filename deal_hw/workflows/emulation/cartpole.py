@@ -90,13 +90,7 @@ def _truth(config: EmulateSettings) -> CartpoleTruth:
     from deal_hw.drivers.cartpole.oracle import draw_truth
     from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 
-    return choose_truth(
-        config,
-        nominal_truth,
-        lambda profile, seed, ratio: draw_truth(profile, seed, range_ratio=ratio),
-        CartpoleTruth.from_json,
-        CARTPOLE_RANGE_RATIO,
-    )
+    return choose_truth(config, nominal_truth, draw_truth, CartpoleTruth.from_json, CARTPOLE_RANGE_RATIO)
 
 
 def _hazards(config: EmulateSettings) -> Hazards:

@@ -93,7 +93,7 @@ def run_until(
 def choose_truth(
     config: EmulateSettings,
     nominal: Callable[[str, int], T],
-    draw: Callable[[str, int, float], T],
+    draw: Callable[..., T],
     parse: Callable[[Mapping[str, Any]], T],
     range_ratio: float,
 ) -> T:
@@ -102,7 +102,7 @@ def choose_truth(
     Args:
         config: Chooses among them.
         nominal: Returns the nominal truth of a profile and a seed.
-        draw: Returns a truth of a profile, a seed and a range ratio.
+        draw: Returns a truth of a profile, a seed and a ``range_ratio``.
         parse: Makes a truth of a file's values.
         range_ratio: The ratio if the settings have none.
 
@@ -113,9 +113,8 @@ def choose_truth(
         return nominal(config.profile, config.seed)
     if config.truth_from is not None:
         return read_truth(Path(config.truth_from), parse)
-    return draw(
-        config.profile, config.seed, range_ratio if config.range_ratio is None else config.range_ratio
-    )
+    ratio = range_ratio if config.range_ratio is None else config.range_ratio
+    return draw(config.profile, config.seed, range_ratio=ratio)
 
 
 def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:

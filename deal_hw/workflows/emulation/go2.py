@@ -175,13 +175,7 @@ def free_port(port: str) -> str:
 def _truth(config: EmulateSettings) -> Go2Truth:
     from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Go2Truth, draw_truth, nominal_truth
 
-    return choose_truth(
-        config,
-        nominal_truth,
-        lambda profile, seed, ratio: draw_truth(profile, seed, range_ratio=ratio),
-        Go2Truth.from_json,
-        DEFAULT_RANGE_RATIO,
-    )
+    return choose_truth(config, nominal_truth, draw_truth, Go2Truth.from_json, DEFAULT_RANGE_RATIO)
 
 
 def _device(config: EmulateSettings, truth: Go2Truth) -> Go2Device:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,11 @@ class EpisodeReport:
     outcome: Outcome
     reason: str
     passive_confirmed: bool
-    loop_timing: LoopTimingReport | None
-    clipped: dict[str, int]
-    cycles_sent: int
-    states_recorded: int
-    warnings: tuple[str, ...]
+    loop_timing: LoopTimingReport | None = None
+    clipped: dict[str, int] = field(default_factory=dict)
+    cycles_sent: int = 0
+    states_recorded: int = 0
+    warnings: tuple[str, ...] = ()
     error: str = ""
     motion: Excitation | None = None
     walk: VelocityError | None = None

@@ -196,11 +196,9 @@ def _record(
         outcome=end.outcome,
         reason=end.reason,
         passive_confirmed=end.passive_confirmed,
-        loop_timing=None,
         clipped=end.clipped,
         cycles_sent=end.cycles_sent,
         states_recorded=states,
-        warnings=(),
         error=end.error,
     )
     moved = store.note_episode(path, {**kept, **report.to_json()})[0].excitation
