@@ -9,13 +9,14 @@ model. - mismatch: the same on robots with effects that no simulator here has (p
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.rows import Cells
 from deal_hw.bench.tasks import DEMONSTRATION_S, TASKS, make_case
 from deal_hw.errors import DealHwError, UnknownNameError
 
@@ -123,11 +124,8 @@ def make_cells(
 
 def cells(chosen: Sequence[Cell], *, population: int | None, generations: int, threads: int | None) -> Cells:
     """Return the cells with the function that runs each; see :func:`run_cell`."""
-
-    def make(cell: Cell) -> Callable[[], Row]:
-        return lambda: run_cell(cell, population=population, generations=generations, threads=threads)
-
-    return Cells(names=KEY, runs=[(cell.key, make(cell)) for cell in chosen])
+    run = partial(run_cell, population=population, generations=generations, threads=threads)
+    return Cells(names=KEY, runs=[(cell.key, partial(run, cell)) for cell in chosen])
 
 
 def run_cell(cell: Cell, *, population: int | None, generations: int, threads: int | None) -> dict[str, Any]:

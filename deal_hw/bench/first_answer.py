@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +111,8 @@ def _written(robot: PlainRobot, ask: _Ask) -> CalibrateSettings:
     return CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
 
 
-def _double_pendulum(ask: _Ask) -> CalibrateSettings:
-    return _written(make_robot("double-pendulum", ask.seed), ask)
-
-
-def _cart_pole(ask: _Ask) -> CalibrateSettings:
-    return _written(make_robot("cart-pole", ask.seed), ask)
+def _plain(ask: _Ask, kind: str) -> CalibrateSettings:
+    return _written(make_robot(kind, ask.seed), ask)
 
 
 def _torque_arm(ask: _Ask) -> CalibrateSettings:
@@ -181,8 +178,8 @@ def _go2(ask: _Ask) -> CalibrateSettings:
 
 
 PROBLEMS: Mapping[str, Callable[[_Ask], CalibrateSettings]] = {
-    "double-pendulum": _double_pendulum,
-    "cart-pole": _cart_pole,
+    "double-pendulum": partial(_plain, kind="double-pendulum"),
+    "cart-pole": partial(_plain, kind="cart-pole"),
     "torque-arm": _torque_arm,
     "so101": _so101,
     "go2-suspended": _go2,
@@ -210,11 +207,9 @@ def cells(
     """
     check_problems(problems)
 
-    def make(name: str, seed: int) -> Callable[[], Row]:
-        return lambda: run_cell(name, seed, real=real, budget=budget, threads=threads)
-
+    run = partial(run_cell, real=real, budget=budget, threads=threads)
     chosen = [(name, seed) for seed in seeds for name in problems if name not in REAL or seed == seeds[0]]
-    return Cells(names=KEY, runs=[(cell, make(*cell)) for cell in chosen])
+    return Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
 
 
 def run_cell(

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,11 +46,8 @@ def cells(
     profile: str, seeds: Sequence[int], steps: int, *, train: bool, folder: Path, threads: int | None
 ) -> Cells:
     """Return the cells of the bench, one per seed; see :func:`loop_row`."""
-
-    def make(seed: int) -> Callable[[], Row]:
-        return lambda: loop_row(profile, seed, steps, train=train, folder=folder, threads=threads)
-
-    runs = [((profile, seed, steps if train else 0), make(seed)) for seed in seeds]
+    run = partial(loop_row, profile, steps=steps, train=train, folder=folder, threads=threads)
+    runs = [((profile, seed, steps if train else 0), partial(run, seed)) for seed in seeds]
     return Cells(names=("profile", "seed", "steps"), runs=runs)
 
 

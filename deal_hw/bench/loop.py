@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, per_parameter
+from deal_hw.bench.rows import Cells, per_parameter
 from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.pipeline.methods import check_method
@@ -32,11 +33,6 @@ from deal_hw.workflows.shipped import required_policy
 TASK_EPISODES = 5
 SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")
 """Methods that run without the refinement, beside the default with everything."""
-
-
-def demonstrate(profile: str, seed: int, range_ratio: float) -> Case:
-    """Draw a truth and record one ``rich`` demonstration and one ``chirp`` from its robot."""
-    return make_case("cartpole", profile, seed, range_ratio)
 
 
 def calibration_row(
@@ -110,7 +106,7 @@ def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tu
     return interval_score(case.space, result.interval, case.theta, bound)
 
 
-def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISODES) -> tuple[float, float]:
+def task_score(truth: CartpoleTruth, policy: Policy) -> tuple[float, float]:
     """Run the fixed task on the emulated robot; return mean |pole angle| [rad] and mean |cart speed| [m/s].
 
     After an early end by the safety filter, the rest counts as fallen: pi rad, and a cart at rest.
@@ -119,7 +115,7 @@ def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISOD
 
     virtual = VirtualCartpole(truth)
     angles, speeds = [], []
-    for _ in range(episodes):
+    for _ in range(TASK_EPISODES):
         run = virtual.run(PolicyBehaviour(policy, DESCRIPTION), TASK_SECONDS)
         recorded, period_s = run.trajectory, 1 / DESCRIPTION.state_rate_hz
         result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
@@ -177,13 +173,9 @@ def cells(
     for method in methods:
         check_method(method)
 
-    def make(seed: int, method: str) -> Callable[[], Row]:
-        return lambda: loop_row(
-            profile, seed, method, range_ratio, train=train, folder=folder, threads=threads
-        )
-
+    run = partial(loop_row, range_ratio=range_ratio, train=train, folder=folder, threads=threads)
     runs = [
-        ((profile, seed, method, range_ratio), make(seed, method))
+        ((profile, seed, method, range_ratio), partial(run, profile, seed, method))
         for seed, method in itertools.product(seeds, methods)
     ]
     return Cells(names=("profile", "seed", "method", "range_ratio"), runs=runs)
@@ -223,11 +215,11 @@ def loop_row(
         "error": "",
     }
     try:
-        demonstration = demonstrate(profile, seed, range_ratio)
-        part, result = calibration_row(demonstration, method, Budget(refine=refine), threads)
+        case = make_case("cartpole", profile, seed, range_ratio)
+        part, result = calibration_row(case, method, Budget(refine=refine), threads)
         row |= part
         if refine and train:
-            row |= transfer_row(demonstration, result, folder)
+            row |= transfer_row(case, result, folder)
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"
     return row

@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -59,24 +60,21 @@ def cells(
         "fixed-range", tasks, profile, methods, [range_ratio], seeds, space=space, demonstration="policy"
     )
 
-    def make(task: str, method: str, seed: int, members: int) -> Callable[[], Row]:
-        def run() -> Row:
-            row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
-            row |= {"population": members, "generations": generations, "seed": seed, "error": ""}
-            try:
-                case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
-                row |= measure(case, method, members, generations, threads)
-            except DealHwError as err:
-                row["error"] = f"{type(err).__name__}: {err}"
-            return row
-
-        return run
+    def run(task: str, method: str, seed: int, members: int) -> Row:
+        row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
+        row |= {"population": members, "generations": generations, "seed": seed, "error": ""}
+        try:
+            case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
+            row |= measure(case, method, members, generations, threads)
+        except DealHwError as err:
+            row["error"] = f"{type(err).__name__}: {err}"
+        return row
 
     runs = []
     for cell in chosen:
         members = population or usual_population(cell.method)
         key = (cell.task, space, cell.method, members, generations, cell.seed)
-        runs.append((key, make(cell.task, cell.method, cell.seed, members)))
+        runs.append((key, partial(run, cell.task, cell.method, cell.seed, members)))
     return Cells(names=KEY, runs=runs)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -199,19 +200,6 @@ def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
     return _target(task, load_model(description), space, ask, motions, None, settle_s)
 
 
-def _allegro(ask: _Ask) -> Case:
-    return _simulated(ask, "allegro")
-
-
-def _ant(ask: _Ask) -> Case:
-    return _simulated(ask, "ant")
-
-
-def _humanoid(ask: _Ask) -> Case:
-    # Without torque it falls within a second, so a demonstration begins upright.
-    return _simulated(ask, "humanoid", 0.0)
-
-
 def _go2(ask: _Ask) -> Case:
     from deal_hw.drivers.go2.descriptions import floor
     from deal_hw.drivers.go2.motions import FEET, sway
@@ -336,8 +324,9 @@ def _channel_std(robot: RobotModel, sensing: TargetSensing) -> FloatArray:
 
 TASKS: Mapping[str, Callable[[_Ask], Case]] = {
     "cartpole": _cartpole,
-    "allegro": _allegro,
-    "ant": _ant,
+    "allegro": partial(_simulated, task="allegro"),
+    "ant": partial(_simulated, task="ant"),
     "go2": _go2,
-    "humanoid": _humanoid,
+    # Without torque it falls within a second, so a demonstration begins upright.
+    "humanoid": partial(_simulated, task="humanoid", settle_s=0.0),
 }

@@ -9,13 +9,14 @@ calibration ends once the fault is named.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.rows import Cells
 from deal_hw.calib.validation.verdict import SETTINGS, trust
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.errors import DealHwError, UnknownNameError
@@ -74,11 +75,8 @@ def cells(
 
 def table(cells: Sequence[tuple[str, str, int]], *, budget: Budget, threads: int | None) -> Cells:
     """Return the cells with the function that runs each; see :func:`run_cell`."""
-
-    def make(kind: str, fault: str, seed: int) -> Callable[[], Row]:
-        return lambda: run_cell(kind, fault, seed, budget=budget, threads=threads)
-
-    return Cells(names=KEY, runs=[(cell, make(*cell)) for cell in cells])
+    run = partial(run_cell, budget=budget, threads=threads)
+    return Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in cells])
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:

@@ -242,6 +242,11 @@ class _Table:
     draw: Callable[[Path, Sequence[Row]], None] = lambda out, rows: None
 
 
+def _in_words(bench: Any, cells: Cells) -> _Table:
+    """Return a bench whose module has the line and the summary, and no figure."""
+    return _Table(cells=cells, line=bench.line, summary=lambda rows: print("\n".join(bench.summary(rows))))
+
+
 def _methods(config: Bench, default: Sequence[str]) -> tuple[str, ...]:
     return _names(config.methods) or tuple(default)
 
@@ -260,9 +265,7 @@ def _first_answer(config: Bench, out: Path) -> _Table:
         budget=_budget(config),
         threads=config.threads,
     )
-    return _Table(
-        cells=cells, line=first_answer.line, summary=lambda rows: print("\n".join(first_answer.summary(rows)))
-    )
+    return _in_words(first_answer, cells)
 
 
 def _budget(config: Bench) -> Budget:
@@ -307,7 +310,7 @@ def _speed(config: Bench, out: Path) -> _Table:
         space=config.space,
         threads=config.threads,
     )
-    return _Table(cells=cells, line=speed.line, summary=lambda rows: print("\n".join(speed.summary(rows))))
+    return _in_words(speed, cells)
 
 
 def _go2_loop(config: Bench, out: Path) -> _Table:
@@ -321,9 +324,7 @@ def _go2_loop(config: Bench, out: Path) -> _Table:
         folder=out.parent / f"{out.stem}_runs",
         threads=config.threads,
     )
-    return _Table(
-        cells=cells, line=go2_loop.line, summary=lambda rows: print("\n".join(go2_loop.summary(rows)))
-    )
+    return _in_words(go2_loop, cells)
 
 
 def _calibration(config: Bench, out: Path) -> _Table:
@@ -382,9 +383,7 @@ def _verdict(config: Bench, out: Path) -> _Table:
         budget=_budget(config),
         threads=config.threads,
     )
-    return _Table(
-        cells=cells, line=verdict.line, summary=lambda rows: print("\n".join(verdict.summary(rows)))
-    )
+    return _in_words(verdict, cells)
 
 
 _TABLES: dict[str, Callable[[Bench, Path], _Table]] = {

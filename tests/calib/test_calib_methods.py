@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from fakes.recorded_commands import RecordedCommands
 
-from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
+from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings, _Box
 from deal_hw.calib.fit.refinement import refine
@@ -37,7 +37,7 @@ SECONDS = 1.2
 @functools.cache
 def recorded(profile: str, seed: int) -> Demonstration:
     """Return a demonstration of a tuning seed; made once for all tests of this file."""
-    return demonstrate(profile, seed, 5.0)
+    return make_case("cartpole", profile, seed, 5.0)
 
 
 def two_parameters() -> tuple[ParameterSpace, np.ndarray[tuple[int], np.dtype[np.float64]]]:
