@@ -114,15 +114,10 @@ def std_words(parameter: Parameter, std: float) -> str:
     return percent(std) if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
 
 
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Return names as text, of many only the first.
-
-    Args:
-        names: The names.
-        most: Largest number of names.
-    """
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def listed(names: Sequence[str]) -> str:
+    """Return names as text, of more than six only the first."""
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(names[:6]) + more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

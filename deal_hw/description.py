@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -215,26 +215,14 @@ class RobotDescription:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values, with the MJCF's digest instead of its text."""
-        import dataclasses
-
-        values = dataclasses.asdict(self)
+        values = asdict(self)
         values["mjcf"] = hashlib.sha256(self.mjcf.read_bytes()).hexdigest()
         values["sources"] = dict(self.sources)
         # Default values are omitted, so that a description from before the field existed keeps its digest.
-        for name, default in (
-            ("actuation", "position"),
-            ("floating_base", None),
-            ("repeat_rate_hz", 0.0),
-            ("passive_damping", ()),
-            ("rest_position", ()),
-            ("feet", ()),
-            ("excitation_range", ()),
-        ):
-            if values[name] == default:
-                del values[name]
-        for name, default in (("silence_s", 0.3), ("legs", None)):
-            if values["limits"][name] == default:
-                del values["limits"][name]
+        for facts, known in ((values, fields(self)), (values["limits"], fields(self.limits))):
+            for entry in known:
+                if facts[entry.name] == entry.default:
+                    del facts[entry.name]
         return values
 
     def digest(self) -> str:

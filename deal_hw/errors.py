@@ -52,9 +52,9 @@ def short(value: object, most: int = QUOTED) -> str:
     return (text if len(text) <= most else f"{text[: most - 4]} ...") + size
 
 
-def shown(value: object, most: int = SHORT) -> str:
+def shown(value: object) -> str:
     """Return a file's value for a message: as :func:`short`, with text in quotes."""
-    return short(repr(value[: 4 * most]) if isinstance(value, str) else value, most)
+    return short(repr(value[: 4 * SHORT]) if isinstance(value, str) else value, SHORT)
 
 
 _CONTAINERS = (Mapping, list, tuple, set, frozenset)

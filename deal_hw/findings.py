@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 
@@ -42,9 +42,4 @@ class Finding:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "area": self.area,
-            "level": self.level.value,
-            "message": self.message,
-            "remedy": self.remedy,
-        }
+        return {**asdict(self), "level": self.level.value}
