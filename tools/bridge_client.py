@@ -26,6 +26,8 @@ from deal_hw.transport import Message, WireOptions
 PERIOD_NS: Final = 2_000_000
 PATIENCE_S: Final = 15.0
 ZERO: Final = np.zeros(12)
+STIFFNESS: Final = 20.0
+"""Stiffness of the held pose [N·m/rad]."""
 
 
 class BridgeClient:
@@ -39,15 +41,14 @@ class BridgeClient:
     Args:
         port: End point of the bridge.
         options: Certificates.
-        stiffness: Stiffness of the held pose [N·m/rad].
     """
 
-    def __init__(self, port: str, options: WireOptions, stiffness: float = 20.0) -> None:
+    def __init__(self, port: str, options: WireOptions) -> None:
         self._clock = MonotonicClock()
         self._link = ZenohTransport(port, self._clock, options)
         self._link.declare(publish=[topics.LOW_COMMAND], subscribe=[topics.LOW_STATE, topics.BRIDGE])
         self._encoder = LowCommandEncoder()
-        self._gains = np.full(12, stiffness), np.full(12, 1.0)
+        self._gains = np.full(12, STIFFNESS), np.full(12, 1.0)
         self.frame: LowStateFrame | None = None
         self.states = 0
         self.status: dict[str, Any] = {}
@@ -92,7 +93,7 @@ class BridgeClient:
                     self.frame = decode_low_state(message.payload)
                     self.states += 1
                 else:
-                    self.status = decode_status(message.payload)
+                    self.status = json.loads(decode_request(message.payload).parameter)
 
     def send(self, payload: bytes, attachment: bytes = b"") -> bool:
         """Put a command on the wire; return whether there was a link."""
@@ -114,16 +115,16 @@ class BridgeClient:
         target = np.clip(self.frame.position, low, high)
         return self._encoder.encode(LowCommand(target, ZERO, *self._gains, ZERO))
 
-    def hear(self, until: Callable[[], bool], patience_s: float = PATIENCE_S) -> None:
+    def hear(self, until: Callable[[], bool]) -> None:
         """Listen without sending until a condition holds.
 
         Raises:
             TransportTimeoutError: It is not so in time.
         """
-        end_ns = self._clock.now_ns() + round(patience_s * 1e9)
+        end_ns = self._clock.now_ns() + round(PATIENCE_S * 1e9)
         while not until():
             if self._clock.now_ns() > end_ns:
-                raise TransportTimeoutError(f"not heard within {patience_s:g} s; the bridge: {self.status}")
+                raise TransportTimeoutError(f"not heard within {PATIENCE_S:g} s; the bridge: {self.status}")
             self.listen(0.02)
 
     def take_over(self) -> None:
@@ -156,9 +157,3 @@ class BridgeClient:
                     self.send(self._payload)
                 due_ns = max(due_ns + PERIOD_NS, self._clock.now_ns())
                 self._clock.sleep_until_ns(due_ns)
-
-
-def decode_status(payload: bytes) -> dict[str, Any]:
-    """Return the bridge's status messages."""
-    found: dict[str, Any] = json.loads(decode_request(payload).parameter)
-    return found

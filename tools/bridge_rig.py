@@ -36,6 +36,16 @@ def wire(folder: Path, name: str) -> WireOptions:
     return WireOptions(ca=folder / "ca.pem", **own)
 
 
+def bridge_process(
+    keys: Path, domain: int, listen: str, *options: str, prefix: Sequence[str] = ()
+) -> VerbProcess:
+    """Return a bridge between DDS on loopback and an end point, not started."""
+    own = wire(keys, "robot")
+    files = ("--ca", str(own.ca), "--certificate", str(own.certificate), "--key", str(own.key))
+    where = ("--port", "lo", "--domain", str(domain), "--listen", listen)
+    return VerbProcess("bridge", "go2", *where, *files, *options, prefix=prefix)
+
+
 class BridgeRig:
     """The two processes; a context manager.
 
@@ -66,20 +76,10 @@ class BridgeRig:
         self.keys = folder / "keys"
         make_keys(self.keys, address)
         self._options = tuple(bridge)
-        self._events, self._domain, self._prefix = folder / "events.jsonl", str(domain), prefix
+        self._events, self._domain, self._prefix = folder / "events.jsonl", domain, prefix
         self._events.touch()
-        self._robot = VerbProcess(
-            "emulate",
-            "go2",
-            "--port",
-            "lo",
-            "--domain",
-            self._domain,
-            "--events-to",
-            str(self._events),
-            *emulator,
-            prefix=prefix,
-        )
+        where = ("--port", "lo", "--domain", str(domain), "--events-to", str(self._events))
+        self._robot = VerbProcess("emulate", "go2", *where, *emulator, prefix=prefix)
         self.port = f"tls/{address}:0"
         self.bridge = self._make_bridge()
 
@@ -135,22 +135,4 @@ class BridgeRig:
             clock.sleep_until_ns(clock.now_ns() + 10_000_000)
 
     def _make_bridge(self) -> VerbProcess:
-        options = wire(self.keys, "robot")
-        return VerbProcess(
-            "bridge",
-            "go2",
-            "--port",
-            "lo",
-            "--domain",
-            self._domain,
-            "--listen",
-            self.port,
-            "--ca",
-            str(options.ca),
-            "--certificate",
-            str(options.certificate),
-            "--key",
-            str(options.key),
-            *self._options,
-            prefix=self._prefix,
-        )
+        return bridge_process(self.keys, self._domain, self.port, *self._options, prefix=self._prefix)

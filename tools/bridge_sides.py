@@ -87,7 +87,7 @@ def _command_number(payload: bytes) -> int:
 
 
 def main() -> int:
-    orders = json.loads(sys.argv[2])
+    orders = json.load(sys.stdin)
     die_with_parent(orders["parent_pid"])
     print(json.dumps(run(sys.argv[1], orders)), flush=True)
     return 0

@@ -15,7 +15,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -139,18 +139,20 @@ def _record(path: Path, robot: str, made: list[CycleRecord]) -> None:
         for number, cycle in enumerate(made):
             clock.sleep_until_ns(cycle.start_ns + CYCLE_NS)
             events = (Event(cycle.start_ns, "clipped", "too far", {}),) if number == 3 else ()
-            recorder.write(
-                CycleRecord(**{**{n: getattr(cycle, n) for n in cycle.__slots__}, "events": events})
-            )
+            recorder.write(replace(cycle, events=events))
 
 
 def _cart_alone(trajectory: Trajectory) -> Trajectory:
     """Return the recording of the driven joint alone."""
     description = {**trajectory.metadata["description"], "joint_names": ["cart"], "position_units": ["m"]}
-    fields = {name: getattr(trajectory, name) for name in trajectory.__slots__}
-    fields |= {name: fields[name][:, :1] for name in ("position", "velocity", "effort")}
-    metadata = {**trajectory.metadata, "description": description}
-    return Trajectory(**{**fields, "joint_names": ("cart",), "metadata": metadata})
+    return replace(
+        trajectory,
+        joint_names=("cart",),
+        position=trajectory.position[:, :1],
+        velocity=trajectory.velocity[:, :1],
+        effort=trajectory.effort[:, :1],
+        metadata={**trajectory.metadata, "description": description},
+    )
 
 
 def python_of(reader: Reader, folder: Path, pip_args: list[str]) -> Path:

@@ -169,7 +169,7 @@ def state_bytes() -> Callable[[int], bytes]:
 
 def main(config: DdsPeerSoak) -> int:
     """Run both roles; return the exit status."""
-    subprocess.run([ROOT / "tools/build_dds_peer.sh"], check=True)
+    build_peer()
     hashes = subprocess.run([PEER, "hashes"], capture_output=True, text=True, check=True).stdout
     ours = [[name, MINIMAL[name], COMPLETE[name]] for name in MINIMAL]
     became = become_realtime()
@@ -187,12 +187,22 @@ def main(config: DdsPeerSoak) -> int:
     passed = result["idlc_0102_gives_our_hashes"] and all(
         result[run]["passed"] for run in ("peer_is_robot", "peer_is_user")
     )
-    text = json.dumps({"passed": bool(passed), **result}, indent=1) + "\n"
-    if config.out is None:
+    return finish({"passed": bool(passed), **result}, config.out)
+
+
+def build_peer() -> None:
+    """Build the C program, if it is not there."""
+    subprocess.run([ROOT / "tools/build_dds_peer.sh"], check=True)
+
+
+def finish(result: dict[str, Any], out: Path | None) -> int:
+    """Write a result to a file or print it; return the exit status."""
+    text = json.dumps(result, indent=1) + "\n"
+    if out is None:
         print(text, end="")
     else:
-        config.out.write_text(text)
-    return 0 if passed else 1
+        out.write_text(text)
+    return 0 if result["passed"] else 1
 
 
 if __name__ == "__main__":

@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from dds_peer_soak import PEER, build_peer, finish
 
 from deal_hw.bench.rows import describe_call
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
-ROOT = Path(__file__).resolve().parents[1]
-PEER = ROOT / "build/dds_peer/go2_peer"
 STAND, LIE = 3, 4
 STANDING_M, LYING_M = 0.28, 0.12
 """Base height above which the robot stands, below which it lies."""
@@ -52,23 +51,9 @@ def run(phases: int, domain: int, config: DdsPeerStand) -> dict[str, Any]:
     """Run an emulator and the program's first phases; return the reports of both."""
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder, "truth.json")
-        options = (
-            "--transport",
-            "dds",
-            "--port",
-            "lo",
-            "--domain",
-            str(domain),
-            "--profile",
-            config.profile,
-            "--seed",
-            str(config.seed),
-            "--duration-s",
-            "120",
-            "--reveal-to",
-            str(truth),
-        )
-        with EmulatorProcess("go2", *options) as emulator:
+        wire = ("--transport", "dds", "--port", "lo", "--domain", str(domain), "--duration-s", "120")
+        robot = ("--profile", config.profile, "--seed", str(config.seed), "--reveal-to", str(truth))
+        with EmulatorProcess("go2", *wire, *robot) as emulator:
             peer = subprocess.run(
                 [PEER, "stand", str(domain), str(phases)],
                 capture_output=True,
@@ -93,7 +78,7 @@ def clean(result: dict[str, Any]) -> bool:
 
 def main(config: DdsPeerStand) -> int:
     """Run twice; return the exit status."""
-    subprocess.run([ROOT / "tools/build_dds_peer.sh"], check=True)
+    build_peer()
     stood = run(STAND, config.domain, config)
     lay = run(LIE, config.domain + 1, config)
     passed = (
@@ -103,12 +88,7 @@ def main(config: DdsPeerStand) -> int:
     )
     call = describe_call(f"tools/{Path(__file__).name}")
     settings = {**call, "passed": passed, "profile": config.profile, "seed": config.seed}
-    text = json.dumps({**settings, "stood": stood, "lay_down": lay}, indent=1) + "\n"
-    if config.out is None:
-        print(text, end="")
-    else:
-        config.out.write_text(text)
-    return 0 if passed else 1
+    return finish({**settings, "stood": stood, "lay_down": lay}, config.out)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 
 from fakes.faulty_proxy import FaultyProxy, State
 from fault_rig import (
@@ -24,6 +23,7 @@ from fault_rig import (
     Case,
     Rig,
     headline,
+    process_state,
 )
 
 
@@ -56,14 +56,14 @@ def stop_supervisor(rig: Rig) -> None:
     control = rig.control_pid()
     rig.signal(rig.run.pid, signal.SIGSTOP)
     with contextlib.suppress(TimeoutError):
-        rig.until(lambda: not _runs(control), 10.0)
+        rig.until(lambda: process_state(control) in "ZX", 10.0)
     rig.run.send_signal(signal.SIGCONT)
 
 
 def suspend(rig: Rig) -> None:
     """Ctrl-Z: the robot must be passive before the process stops; then `fg`."""
     rig.signal(rig.run.pid, signal.SIGTSTP)
-    stopped = rig.until(lambda: rig.process_state() == "T", 20.0)
+    stopped = rig.until(lambda: process_state(rig.run.pid) == "T", 20.0)
     if not stopped:
         rig.notes.append("it ended instead of stopping")
         return
@@ -140,11 +140,9 @@ def second_run(elsewhere: bool = False) -> Callable[[Rig], None]:
     return act
 
 
-def _runs(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
+def after(option: str) -> tuple[str, ...]:
+    """Return an option of the emulator with a random moment."""
+    return (option, "{t}")
 
 
 LINK_S = (0.1, 0.5, 1.5, 3.0, 8.0)

@@ -238,7 +238,7 @@ class Rig(ABC):
                 self.events.append((host_ns, what))
                 self._events_at = file.tell()
 
-    def until(self, ready: Callable[[], Any], seconds: float = 40.0, *, ends: bool = False) -> Any:
+    def until(self, ready: Callable[[], Any], seconds: float = 40.0) -> Any:
         """Return the result of ``ready`` as soon as it is true; None if the run ended before.
 
         Raises:
@@ -249,7 +249,7 @@ class Rig(ABC):
             self.pump()
             if found := ready():
                 return found
-            if self.run.poll() is not None and not ends:
+            if self.run.poll() is not None:
                 return None
             time.sleep(_POLL_S)
         raise TimeoutError(f"waited {seconds:g} s without result: {getattr(ready, '__doc__', '')}")
@@ -310,13 +310,6 @@ class Rig(ABC):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
 
-    def process_state(self) -> str:
-        """Return the state of the run's process as the kernel has it, such as T for stopped."""
-        try:
-            return Path(f"/proc/{self.run.pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return "X"
-
     def finish(self) -> None:
         """Wait until the run and its children have ended; kill what hangs."""
         self._child("")
@@ -335,6 +328,14 @@ class Rig(ABC):
                         os.kill(pid, signal.SIGKILL)
                 break
             time.sleep(0.01)
+
+
+def process_state(pid: int) -> str:
+    """Return the state of a process as the kernel has it, such as T for stopped; X: there is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return "X"
 
 
 def headline(said: str) -> str:

@@ -23,17 +23,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 from fakes.go2 import FakeGo2
 from fuzz.cartpole_wires import blocks, read_answer
+from fuzz.wire import low_commands
 from rich.console import Console
 from rich.progress import track
 
 from deal_hw.bench.rows import write_rows
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.dynamixel import packets
-from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_command import decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.wire import without_padding
 from deal_hw.errors import FrameError, TransportTimeoutError
@@ -124,11 +124,6 @@ def _answer(*, fast: bool) -> Callable[[bytes], list[bytes]]:
     return contents
 
 
-def _low_command() -> bytes:
-    values = np.linspace(-1.0, 1.0, 12)
-    return LowCommandEncoder().encode(LowCommand(values, values, np.abs(values), np.abs(values), values))
-
-
 CODECS = {
     "cart-pole, serial": Codec(
         frames=[
@@ -150,7 +145,7 @@ CODECS = {
     ),
     "Dynamixel, fast answers": Codec(frames=[blocks(fast=True)], contents=_answer(fast=True), bits=16),
     "Dynamixel, plain answers": Codec(frames=[blocks(fast=False)], contents=_answer(fast=False), bits=16),
-    "Go2, LowCmd": Codec(frames=[_low_command()], contents=_checked(decode_low_command, "LowCmd"), bits=32),
+    "Go2, LowCmd": Codec(frames=low_commands(), contents=_checked(decode_low_command, "LowCmd"), bits=32),
     "Go2, LowState": Codec(
         frames=[encode_low_state(FakeGo2().state())],
         contents=_checked(decode_low_state, "LowState"),

@@ -91,19 +91,7 @@ ODD: tuple[Any, ...] = (
     ["cart", "pole"],
     [0.0] * 100_000,
 )
-OPERATORS = (
-    b"Relu",
-    b"Tanh",
-    b"Sqrt",
-    b"Ceil",
-    b"Sign",
-    b"Asin",
-    b"Acos",
-    b"Gemm",
-    b"Loop",
-    b"Size",
-    b"Cast",
-)
+OPERATORS = tuple(b"Relu Tanh Sqrt Ceil Sign Asin Acos Gemm Loop Size Cast".split())
 
 
 class Still:

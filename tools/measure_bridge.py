@@ -31,7 +31,8 @@ from typing import Annotated, Any, Final
 import numpy as np
 import tyro
 from bridge_client import BridgeClient
-from bridge_rig import BridgeRig, make_keys, wire
+from bridge_rig import BridgeRig, bridge_process, make_keys, wire
+from side_process import SideProcess
 from stall_monitor import watch_stalls
 
 from deal_hw.bench.rows import describe_call
@@ -42,13 +43,13 @@ from deal_hw.errors import DealHwError, TransportError
 from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.go2 import free_port
-from deal_hw.workflows.emulation.process import VerbProcess
 
 SIDES: Final = Path(__file__).with_name("bridge_sides.py")
 HOSTS: Final = "10.97.43.1", "10.97.43.2"
 """Addresses of the pair of interfaces: this side, and that in the namespace."""
 _CLONE_NEWNET, _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x40000000, 0x8913, 0x8914, 0x1
 _PAUSE_NS: Final = 500_000
+_START_S: Final = 30.0
 ACTS: Final = ("latency", "cut", "restart", "refuse")
 
 
@@ -110,36 +111,17 @@ def latency(config: MeasureBridge, folder: Path) -> dict[str, Any]:
 
 
 def _latency(path: str, config: MeasureBridge, keys: Path) -> dict[str, Any]:
-    end_point, domain = free_port("tls/127.0.0.1:0"), str(config.domain)
+    end_point = free_port("tls/127.0.0.1:0")
     with contextlib.ExitStack() as running:
         robot_wire = "dds" if path in ("bridge", "dds") else "zenoh"
         robot = running.enter_context(_side("robot", robot_wire, end_point, config, keys))
         if path == "bridge":
-            own = wire(keys, "robot")
-            running.enter_context(
-                VerbProcess(
-                    "bridge",
-                    "go2",
-                    "--port",
-                    "lo",
-                    "--domain",
-                    domain,
-                    "--listen",
-                    end_point,
-                    "--ca",
-                    str(own.ca),
-                    "--certificate",
-                    str(own.certificate),
-                    "--key",
-                    str(own.key),
-                )
-            )
+            running.enter_context(bridge_process(keys, config.domain, end_point))
         client_wire = "dds" if path == "dds" else "zenoh"
         controller = running.enter_context(_side("controller", client_wire, end_point, config, keys))
-        there, _ = controller.communicate(timeout=config.seconds + 60.0)
-        robot.terminate()
-        here, _ = robot.communicate(timeout=20.0)
-    near, far = json.loads(there), json.loads(here)
+        near = controller.result(config.seconds + 60.0)
+        robot.stop()
+        far = robot.result(20.0)
     return {
         "commands": _one_way(near["sent"], far["heard"]),
         "states": _one_way(far["sent"], near["heard"]),
@@ -148,9 +130,7 @@ def _latency(path: str, config: MeasureBridge, keys: Path) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _side(
-    name: str, link: str, end_point: str, config: MeasureBridge, keys: Path
-) -> Iterator[subprocess.Popen[str]]:
+def _side(name: str, link: str, end_point: str, config: MeasureBridge, keys: Path) -> Iterator[SideProcess]:
     options = WireOptions(domain=config.domain)
     if link == "zenoh":
         own = wire(keys, name)
@@ -162,17 +142,9 @@ def _side(
         "seconds": config.seconds,
         "parent_pid": os.getpid(),
     }
-    with subprocess.Popen(
-        [sys.executable, str(SIDES), name, json.dumps(orders)], stdout=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            assert process.stdout is not None
-            if process.stdout.readline() != "ready\n":
-                raise TransportError(f"the {name}'s process did not come up")
-            yield process
-        finally:
-            if process.poll() is None:
-                process.kill()
+    with SideProcess(SIDES, name, orders) as process:
+        process.expect("ready", _START_S)
+        yield process
 
 
 def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any]:

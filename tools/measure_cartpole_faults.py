@@ -12,7 +12,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from fault_acts import LINK_S, freeze_link, kill_both, link_cases, process_cases
+from fault_acts import LINK_S, after, freeze_link, kill_both, link_cases, process_cases
 from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, UNDER_TEST, Case, Rig
 from fault_table import main
 
@@ -120,11 +120,6 @@ class CartpoleRig(Rig):
     def by_itself(self, report: Mapping[str, Any]) -> int:
         """The port vanished, the wire was cut, the firmware stopped, or the bus had a fault."""
         return next((ns for ns, what in self.changes(report) if what in BY_ITSELF), -1)
-
-
-def after(option: str) -> tuple[str, ...]:
-    """Return an option of the emulator with a random moment."""
-    return (option, "{t}")
 
 
 CASES = (

@@ -88,12 +88,8 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
 
 def spread(values: list[float]) -> dict[str, float]:
     """Return p50, p99 and max."""
-    array = np.array(values or [np.nan])
-    return {
-        "p50": round(float(np.percentile(array, 50)), 3),
-        "p99": round(float(np.percentile(array, 99)), 3),
-        "max": round(float(array.max()), 3),
-    }
+    found = np.percentile(values or [np.nan], (50, 99, 100))
+    return dict(zip(("p50", "p99", "max"), (round(float(v), 3) for v in found), strict=True))
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ class MeasureBus:
     absent: bool = False
     """Address an absent servo."""
 
-    out: Path | None = field(default=None)
+    out: Path | None = None
     """Write the rows to this JSON file."""
 
 

@@ -67,17 +67,8 @@ def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
             run, row["collect"], row["failed_recordings"] = recorded(options, seed, Path(folder))
             row["collect_s"] = round(time.monotonic() - began, 1)
             # The first episode is fitted, the second only judges.
-            verb(
-                "calibrate",
-                str(run / "dataset"),
-                "--holdout",
-                "1",
-                "--no-report",
-                "--no-advise",
-                "--out",
-                str(run),
-                *options.calibrate.split(),
-            )
+            words = f"--holdout 1 --no-report --no-advise {options.calibrate}".split()
+            verb("calibrate", str(run / "dataset"), "--out", str(run), *words)
             result = json.loads((run / "calibration" / "result.json").read_text(encoding="utf-8"))
             truth = Go2Truth.from_json(json.loads((run / "truth.json").read_text(encoding="utf-8")))
             row |= judge(result, truth)
@@ -114,35 +105,14 @@ def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
         *(("--domain", str(options.domain)) * (options.transport == "dds")),
     )
     said = []
-    with EmulatorProcess(
-        "go2",
-        *wire,
-        "--port",
-        PORTS[options.transport],
-        "--on-stand",
-        "--profile",
-        options.profile,
-        "--seed",
-        str(seed),
-        "--reveal-to",
-        str(run / "truth.json"),
-    ) as emulator:
+    robot = f"--port {PORTS[options.transport]} --on-stand --profile {options.profile} --seed {seed}".split()
+    with EmulatorProcess("go2", *wire, *robot, "--reveal-to", str(run / "truth.json")) as emulator:
         for excite, seconds in (("multisine", options.seconds), (options.heldout, options.heldout_seconds)):
             plan = excite
             if excite not in ("multisine", "chirp"):
                 plan = str(run / "heldout.json")
-                verb(
-                    "design-excitation",
-                    DESCRIPTION.name,
-                    "--family",
-                    excite,
-                    "--seconds",
-                    str(seconds),
-                    "--seed",
-                    str(seed),
-                    "--out",
-                    plan,
-                )
+                design = f"design-excitation {DESCRIPTION.name} --family {excite} --seconds {seconds}"
+                verb(*design.split(), "--seed", str(seed), "--out", plan)
             words = ("--excite", plan, "--seconds", str(seconds), "--seed", str(seed), "--out", str(run))
             report = verb("collect", DESCRIPTION.name, *wire, "--port", emulator.port, *words)
             said.append(report.replace(str(run), "RUN"))

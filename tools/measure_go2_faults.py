@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fault_acts import (
+    after,
     freeze_link,
     kill_both,
     link_cases,
@@ -141,11 +142,6 @@ def second_controller(rig: Rig) -> None:
         for _ in range(25):
             transport.send(Message(LOW_COMMAND, payload, MonotonicClock().now_ns()))
             time.sleep(0.01)
-
-
-def after(option: str) -> tuple[str, ...]:
-    """Return an option of the emulator with a random moment."""
-    return (option, "{t}")
 
 
 WIRE = after("--wire-after-s")

@@ -29,6 +29,7 @@ from deal_hw.ranges import Range, check_ranges
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.go2 import free_port
 
+SIDES: Final = Path(__file__).with_name("go2_transport_sides.py")
 _START_S: Final = 30.0
 _END_S: Final = 20.0
 _SETTLE_S: Final = 2.0
@@ -119,11 +120,11 @@ def measure(settings: TransportBench) -> tuple[dict[str, Any], dict[str, Any]]:
     robot_wire = {**wire, "listen": True, "mode": "peer"} if settings.transport == "zenoh" else wire
     with (
         _monitored() as seen,
-        SideProcess("robot", {**orders, "wire": robot_wire}) as robot,
+        SideProcess(SIDES, "robot", {**orders, "wire": robot_wire}) as robot,
     ):
         robot.expect("ready", _START_S)
         freeze = {"pid": robot.pid, **_freeze_cycles(settings)}
-        with SideProcess("controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
+        with SideProcess(SIDES, "controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
             controller.expect("ready", _START_S)
             controller.expect("running", _START_S)
             with seconds_bar(f"go2-transport {settings.transport}", settings.seconds, settings.quiet) as bar:

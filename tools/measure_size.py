@@ -164,22 +164,8 @@ def write_arm(folder: Path, joints: int, seed: int, seconds: float) -> tuple[Pla
     for number, (name, length_s) in enumerate(lengths.items()):
         text = record(robot, number, round(length_s * RATE_HZ) / RATE_HZ)
         (folder / f"{name}.csv").write_text(text, encoding="utf-8")
-    return robot, [
-        "calibrate",
-        "--model",
-        "robot.xml",
-        "--parameters",
-        "params.yaml",
-        "--data",
-        "fit1.csv",
-        "fit2.csv",
-        "--holdout",
-        "held-out.csv",
-        "--heldout-window",
-        "2",
-        "--out",
-        "out",
-    ]
+    told = "--model robot.xml --parameters params.yaml --data fit1.csv fit2.csv --holdout held-out.csv"
+    return robot, ["calibrate", *told.split(), "--heldout-window", "2", "--out", "out"]
 
 
 def measure(

@@ -1,4 +1,4 @@
-"""Run the two processes of ``tools/measure_go2_transport.py``: they read orders and print lines."""
+"""Run the two processes of a measurement of a wire: they read orders and print lines."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ from typing import IO, Any
 
 from deal_hw.errors import TransportError
 
-_SIDES = Path(__file__).with_name("go2_transport_sides.py")
-
 
 class SideProcess:
     """One of the two processes; it is ended with the block.
 
     Args:
+        script: The program of both.
         name: "controller" or "robot".
         orders: Its orders on standard input.
     """
 
-    def __init__(self, name: str, orders: Mapping[str, Any]) -> None:
+    def __init__(self, script: Path, name: str, orders: Mapping[str, Any]) -> None:
         self._name = name
         # A session of its own, so that only this process handles Ctrl-C in the terminal.
         self._process = subprocess.Popen(
-            [sys.executable, str(_SIDES), name],
+            [sys.executable, str(script), name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

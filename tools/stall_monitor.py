@@ -15,7 +15,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from deal_hw.control.realtime import become_realtime
@@ -72,14 +72,11 @@ class Account:
 
 
 @contextlib.contextmanager
-def watch_stalls(
-    least_ns: int, processors: Sequence[int] | None = None, priority: int = TOP_PRIORITY
-) -> Iterator[Account]:
-    """Watch processors while the block runs.
+def watch_stalls(least_ns: int, priority: int = TOP_PRIORITY) -> Iterator[Account]:
+    """Watch all processors that this process may use, while the block runs.
 
     Args:
         least_ns: Shorter pauses are not noted [ns].
-        processors: Their numbers; by default all that this process may use.
         priority: Priority of the monitor. With that of the watched program, the time of other real-time
             programs counts as a pause, too.
 
@@ -87,10 +84,9 @@ def watch_stalls(
         ConfigurationError: SCHED_FIFO was refused.
     """
     found = Account()
-    numbers = sorted(os.sched_getaffinity(0)) if processors is None else processors
     with contextlib.ExitStack() as stack:
         running = []
-        for number in numbers:
+        for number in sorted(os.sched_getaffinity(0)):
             command = [sys.executable, __file__, f"--watch={number}", f"--least-ms={least_ns * 1e-6}"]
             command.append(f"--priority={priority}")
             process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))

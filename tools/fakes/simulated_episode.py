@@ -5,13 +5,15 @@ For tests of code that reads recordings. It has no wire; tests of drivers and co
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from deal_hw.description import RobotDescription
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
-from deal_hw.types import Event, FloatArray, Status, Trajectory
+from deal_hw.types import Event, FloatArray, IntArray, Status, Trajectory
 
 BALANCE_GAINS = (1.65, 1.04, 0.475, 0.171)
 """Linear-quadratic regulator of the nominal cart-pole at 50 Hz: per cart position, angle and their rates."""
@@ -94,43 +96,62 @@ def _report(
     targets: FloatArray,
     rng: np.random.Generator | None,
 ) -> Trajectory:
-    count, cycles = len(x), len(targets)
-    device_s = np.arange(count) / description.state_rate_hz
-    sent_s = np.arange(cycles) / description.control_rate_hz + RECEIVED_AFTER_S
     if rng is not None:
         x = x + rng.standard_normal(x.shape) * description.sensor.noise
         x = np.round(x / description.sensor.resolution) * description.sensor.resolution
         lag = round(description.sensor.velocity_window_s * description.state_rate_hz)
         v = np.concatenate([np.zeros((lag, 2)), (x[lag:] - x[:-lag]) / description.sensor.velocity_window_s])
-    in_force = np.ceil(device_s * description.control_rate_hz - 1e-9).astype(np.int64) - 1
-    age = np.where(in_force >= 0, device_s - sent_s[np.maximum(in_force, 0)], np.nan)
     clamped = np.abs(effort[:, 0]) >= description.effort_limit[0]
     status = np.where(
         clamped, int(Status.ARMED | Status.HOMED | Status.EFFORT_CLAMPED), int(Status.ARMED | Status.HOMED)
     )
-    as_column = np.ones((cycles, 1))
+    return recording(
+        description,
+        x,
+        v,
+        effort,
+        targets[:, None],
+        status,
+        events=(
+            Event(300_000, "armed", "The motors follow commands."),
+            Event(int(len(x) * 4e6), "clipped", "One target was clipped."),
+        ),
+    )
+
+
+def recording(
+    description: RobotDescription,
+    position: FloatArray,
+    velocity: FloatArray,
+    effort: FloatArray,
+    targets: FloatArray,
+    status: IntArray,
+    **more: Any,
+) -> Trajectory:
+    """Return the recording of states, (T, J) each, under commands with the description's gains, (C, A)."""
+    device_s = np.arange(len(position)) / description.state_rate_hz
+    sent_s = np.arange(len(targets)) / description.control_rate_hz + RECEIVED_AFTER_S
+    in_force = np.ceil(device_s * description.control_rate_hz - 1e-9).astype(np.int64) - 1
+    rows = np.ones((len(targets), 1))
     return Trajectory(
         joint_names=description.joint_names,
         actuated=description.actuated,
         receive_s=device_s + 0.3e-3,
         device_s=device_s,
-        position=x,
-        velocity=v,
+        position=position,
+        velocity=velocity,
         effort=effort,
         status=status.astype(np.int64),
         command_sequence=in_force,
-        command_age_s=age,
+        command_age_s=np.where(in_force >= 0, device_s - sent_s[np.maximum(in_force, 0)], np.nan),
         sent_s=sent_s,
-        sent_sequence=np.arange(cycles),
-        requested_position=targets[:, None].copy(),
-        position_target=targets[:, None],
-        stiffness=as_column * description.stiffness,
-        damping=as_column * description.damping,
-        effort_limit=as_column * description.effort_limit,
-        speed_limit=as_column * description.speed_limit,
-        events=(
-            Event(300_000, "armed", "The motors follow commands."),
-            Event(int(count * 4e6), "clipped", "One target was clipped."),
-        ),
+        sent_sequence=np.arange(len(targets)),
+        requested_position=targets.copy(),
+        position_target=targets,
+        stiffness=rows * description.stiffness,
+        damping=rows * description.damping,
+        effort_limit=rows * description.effort_limit,
+        speed_limit=rows * description.speed_limit,
         metadata={"robot": description.name, "purpose": "collect", "start_ns": 0},
+        **more,
     )

@@ -13,9 +13,8 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion
 from deal_hw.types import BodyTrajectory, FloatArray, Status, Trajectory
+from fakes.simulated_episode import recording
 
-RECEIVED_AFTER_S = 0.4e-3
-"""A command arrives this long after the robot sent the sample that it answers."""
 _SETTLE_S = 1.5
 
 
@@ -63,11 +62,6 @@ def standing_episode(
 def _report(description: RobotDescription, x: FloatArray, v: FloatArray, targets: FloatArray) -> Trajectory:
     """Return states, (T, 6 + J) each, as the robot reports them: without the base's position."""
     T, J = len(x), len(description.joint_names)
-    device_s = np.arange(T) / description.state_rate_hz
-    sent_s = np.arange(len(targets)) / description.control_rate_hz + RECEIVED_AFTER_S
-    in_force = np.ceil(device_s * description.control_rate_hz - 1e-9).astype(np.int64) - 1
-    age_s = np.where(in_force >= 0, device_s - sent_s[np.maximum(in_force, 0)], np.nan)
-    rows = np.ones((len(targets), 1))
     body = BodyTrajectory(
         orientation=to_quaternion(x[:, 3:6], IDENTITY),
         angular_velocity=v[:, 3:6],
@@ -81,25 +75,5 @@ def _report(description: RobotDescription, x: FloatArray, v: FloatArray, targets
         sticks=np.zeros((T, 4)),
         buttons=np.zeros(T, dtype=np.int64),
     )
-    return Trajectory(
-        joint_names=description.joint_names,
-        actuated=description.actuated,
-        receive_s=device_s + 0.3e-3,
-        device_s=device_s,
-        position=x[:, 6:],
-        velocity=v[:, 6:],
-        effort=np.zeros((T, J)),
-        status=np.full(T, int(Status.ARMED | Status.HOMED)),
-        command_sequence=in_force,
-        command_age_s=age_s,
-        sent_s=sent_s,
-        sent_sequence=np.arange(len(targets)),
-        requested_position=targets.copy(),
-        position_target=targets,
-        stiffness=rows * description.stiffness,
-        damping=rows * description.damping,
-        effort_limit=rows * description.effort_limit,
-        speed_limit=rows * description.speed_limit,
-        metadata={"robot": description.name, "purpose": "collect", "start_ns": 0},
-        body=body,
-    )
+    status = np.full(T, int(Status.ARMED | Status.HOMED))
+    return recording(description, x[:, 6:], v[:, 6:], np.zeros((T, J)), targets, status, body=body)

@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from deal_hw.errors import DealHwError
-
 Mutation = Callable[[random.Random, bytes, Sequence[bytes]], bytes]
 """Returns a damaged copy of some bytes; it may take parts of the other good inputs."""
 
@@ -22,14 +20,12 @@ class FileKind:
         read: Reads the file at a path as the product does.
         name: Name of the file while it is read; may contain folders ("episodes/000000.mcap").
         mutations: Ways to damage it; one is drawn for each input.
-        refusals: Errors that a reader may raise: ours, in one line.
     """
 
     make: Callable[[Path], Sequence[bytes]]
     read: Callable[[Path], object]
     name: str
     mutations: Sequence[Mutation]
-    refusals: tuple[type[Exception], ...] = (DealHwError,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,13 +36,11 @@ class WireKind:
         make: Returns good messages.
         read: Decodes the bytes as the product does.
         mutations: Ways to damage them; one is drawn for each input.
-        refusals: Errors that a decoder may raise.
     """
 
     make: Callable[[], Sequence[bytes]]
     read: Callable[[bytes], object]
     mutations: Sequence[Mutation]
-    refusals: tuple[type[Exception], ...] = (DealHwError,)
 
 
 Kind = FileKind | WireKind

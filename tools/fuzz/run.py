@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from deal_hw.errors import DealHwError
 from fuzz.kind import FileKind, Kind
 
 _STEP = struct.Struct("<QQQ")
@@ -154,7 +155,7 @@ def _outcome(kind: Kind, data: bytes, folder: Path, limit_s: float) -> str:
             signal.setitimer(signal.ITIMER_REAL, 0)
     except _HangError:
         return f"more than {limit_s:g} s\n{traceback.format_exc()}"
-    except kind.refusals as error:
+    except DealHwError as error:
         return _judged(str(error))
     except BaseException as error:
         frames = traceback.extract_tb(error.__traceback__)

@@ -93,7 +93,8 @@ def _low_states() -> list[bytes]:
     return [quiet, encode_low_state(robot.state())]
 
 
-def _low_commands() -> list[bytes]:
+def low_commands() -> list[bytes]:
+    """Return a command whose values differ from joint to joint."""
     values = np.linspace(-1.0, 1.0, 12)
     return [LowCommandEncoder().encode(LowCommand(values, values, np.abs(values), np.abs(values), values))]
 
@@ -183,7 +184,7 @@ KINDS: dict[str, Kind] = {
         mutations=(damage_bytes, mended(damage_bytes, _mend_words(low_state_image))),
     ),
     "wire_low_command": WireKind(
-        make=_low_commands,
+        make=low_commands,
         read=decode_low_command,
         mutations=(damage_bytes, mended(damage_bytes, _mend_words(low_command_image))),
     ),
