@@ -1,20 +1,6 @@
-"""Every error that deal-hw raises on purpose.
+"""Every error that deal-hw raises on purpose: one tree below :class:`DealHwError`.
 
-The tree (built-in parents in parentheses)::
-
-    DealHwError ├── ConfigurationError (ValueError) a setting that cannot be used │ └── UnknownNameError a
-    name that is not in a table; lists the table ├── MissingExtraError (ImportError) an optional dependency is
-    absent ├── TransportError (ConnectionError) the byte path to the robot │ ├── PortNotFoundError no such
-    port │ ├── PortBusyError another program holds the port │ ├── TransportLostError unplugged in flight │ └──
-    TransportTimeoutError (TimeoutError) ├── ProtocolError invalid bytes │ ├── FrameError one corrupt frame;
-    the stream continues │ ├── VersionMismatchError the peer speaks another version │ └── WrongDeviceError the
-    peer is not the requested robot ├── SafetyError a command that must not be sent ├── PolicyError a policy
-    that cannot run │ └── PolicyMismatchError a policy for another robot or another observation ├──
-    DatasetError a recording that cannot be used │ ├── EmptyRecordingError │ └── TornRecordingError no footer:
-    `deal-hw data repair` repairs it ├── TrainingError a training that cannot continue │ ├── CheckpointError a
-    checkpoint that cannot be read, or is of another training │ └── TrainingDivergedError weights that are not
-    finite └── CalibrationError └── InsufficientDataError too short or without excitation; names what to
-    record
+A class has the built-in error that says the same as another base, such as ``ValueError``.
 """
 
 from __future__ import annotations

@@ -12,9 +12,8 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, Protocol, get_args
 
 import numpy as np
@@ -409,54 +408,30 @@ class ObservationBuilder:
         self._position = np.where(fresh, self._position[:1], self._position)
         self._velocity = np.where(fresh, self._velocity[:1], self._velocity)
         self._fresh = np.zeros_like(self._fresh)
-        columns = [self._term(term) for term in self.spec.observation]
+        columns = [np.asarray(term.scale * self._read(term)) for term in self.spec.observation]
         self.clock = (self.clock + self.spec.clock_hz / self.spec.control_rate_hz) % 1.0
         return np.stack(columns, axis=-1).astype(np.float32)
 
-    def _term(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(term.scale * _READERS[term.quantity](self, term))
-
-    def _read_position(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(self._position[term.delay][..., self._joint[term.joint]])
-
-    def _read_sine(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(np.sin(self._read_position(term)))
-
-    def _read_cosine(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(np.cos(self._read_position(term)))
-
-    def _read_velocity(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(self._velocity[term.delay][..., self._joint[term.joint]])
-
-    def _read_action(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(self._action[term.delay][..., self._actuator[term.joint]])
-
-    def _read_command(self, term: ObservationTerm) -> FloatArray:
-        return np.asarray(self.command[..., AXES.index(term.joint)])
-
-    def _read_clock(self, term: ObservationTerm) -> FloatArray:
-        angle = 2.0 * np.pi * self.clock
-        return np.asarray(np.sin(angle) if term.joint == "sin" else np.cos(angle))
-
-    def _read_base(self, term: ObservationTerm) -> FloatArray:
-        first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
-        return np.asarray(self._base[term.delay][..., first + term.axes.index(term.joint)])
-
-
-_READERS: Final[Mapping[str, Callable[[ObservationBuilder, ObservationTerm], FloatArray]]] = MappingProxyType(
-    {
-        "position": ObservationBuilder._read_position,
-        "velocity": ObservationBuilder._read_velocity,
-        "sin_position": ObservationBuilder._read_sine,
-        "cos_position": ObservationBuilder._read_cosine,
-        "action": ObservationBuilder._read_action,
-        "command": ObservationBuilder._read_command,
-        "clock": ObservationBuilder._read_clock,
-        **dict.fromkeys(BASE_QUANTITIES, ObservationBuilder._read_base),
-    }
-)
-"""The method that reads each quantity. There is no default: a quantity without an entry cannot be
-observed."""
+    def _read(self, term: ObservationTerm) -> FloatArray:
+        # There is no default: a quantity without a case cannot be observed.
+        match term.quantity:
+            case "position" | "sin_position" | "cos_position":
+                position = self._position[term.delay][..., self._joint[term.joint]]
+                if term.quantity == "position":
+                    return np.asarray(position)
+                return np.asarray(np.sin(position) if term.quantity == "sin_position" else np.cos(position))
+            case "velocity":
+                return np.asarray(self._velocity[term.delay][..., self._joint[term.joint]])
+            case "action":
+                return np.asarray(self._action[term.delay][..., self._actuator[term.joint]])
+            case "command":
+                return np.asarray(self.command[..., AXES.index(term.joint)])
+            case "clock":
+                angle = 2.0 * np.pi * self.clock
+                return np.asarray(np.sin(angle) if term.joint == "sin" else np.cos(angle))
+            case "gravity" | "heading" | "angular_velocity" | "linear_velocity" | "height":
+                first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
+                return np.asarray(self._base[term.delay][..., first + term.axes.index(term.joint)])
 
 
 def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray:

@@ -46,6 +46,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.bench.rows import FORMER_BENCHES, FORMER_FIELDS
+from deal_hw.ranges import option
 
 FIELDS: Mapping[str, str] = {"polish": "refined", **FORMER_FIELDS}
 """Old name of a row's field -> new name."""
@@ -91,15 +92,27 @@ Cells = dict[Key, dict[int, Row]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of a loss; ratios are new over old."""
+    """Limits of a loss; ratios are new over old. The options have these names."""
 
-    error: float = 1.1
+    error_limit: float = 1.1
     error_floor: float = 1e-3
-    heldout: float = 1.02
+    heldout_limit: float = 1.02
     heldout_floor: float = 1e-5
     coverage_least: float = 0.85
     coverage_enough: float = 1.0
-    seconds: float | None = None
+    seconds_limit: float | None = None
+
+
+HELP = {
+    "error_limit": "most a median parameter error may grow, new over old",
+    "error_floor": "a median parameter error up to this is no loss [percent]",
+    "heldout_limit": "most a median held-out error may grow, new over old",
+    "heldout_floor": "a median held-out error up to this is no loss [nrmse, rad or m]",
+    "coverage_least": "least coverage of 90 %% intervals where the model is right",
+    "coverage_enough": "a coverage from this on is no loss, whatever the old one was",
+    "seconds_limit": "most the median seconds may grow, new over old",
+}
+"""What each limit means."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,15 +137,7 @@ class Comparison:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare two files, print the table and return the exit code."""
     given = _parser().parse_args(arguments)
-    limits = Limits(
-        error=given.error_limit,
-        error_floor=given.error_floor,
-        heldout=given.heldout_limit,
-        heldout_floor=given.heldout_floor,
-        coverage_least=given.coverage_least,
-        coverage_enough=given.coverage_enough,
-        seconds=given.seconds_limit,
-    )
+    limits = Limits(**{name: getattr(given, name) for name in HELP})
     try:
         renamed = METHODS | dict(_pair(text) for text in given.map)
         old, new = read_cells(given.old, renamed), read_cells(given.new, METHODS)
@@ -159,29 +164,10 @@ def _parser() -> argparse.ArgumentParser:
         "--map", action="append", default=[], metavar="OLD=NEW",
         help="compare this method of OLD with that one of NEW; may be given again",
     )  # fmt: skip
-    for name, value, text in (
-        ("error-limit", default.error, "most a median parameter error may grow, new over old"),
-        ("error-floor", default.error_floor, "a median parameter error up to this is no loss [percent]"),
-        ("heldout-limit", default.heldout, "most a median held-out error may grow, new over old"),
-        (
-            "heldout-floor",
-            default.heldout_floor,
-            "a median held-out error up to this is no loss [nrmse, rad or m]",
-        ),
-        (
-            "coverage-least",
-            default.coverage_least,
-            "least coverage of 90 %% intervals where the model is right",
-        ),
-        (
-            "coverage-enough",
-            default.coverage_enough,
-            "a coverage from this on is no loss, whatever the old one was",
-        ),
-        ("seconds-limit", default.seconds, "most the median seconds may grow, new over old"),
-    ):
+    for name, text in HELP.items():
+        value = getattr(default, name)
         shown = "not judged" if value is None else "%(default)s"
-        parser.add_argument(f"--{name}", type=float, default=value, help=f"{text} (default: {shown})")
+        parser.add_argument(option(name), type=float, default=value, help=f"{text} (default: {shown})")
     return parser
 
 
@@ -280,8 +266,8 @@ def compare_cell(
     figures["flagged"] = (_flagged(before), _flagged(after))
 
     for names, limit, floor in (
-        (ERRORS, limits.error, limits.error_floor),
-        (HELDOUT, limits.heldout, limits.heldout_floor),
+        (ERRORS, limits.error_limit, limits.error_floor),
+        (HELDOUT, limits.heldout_limit, limits.heldout_floor),
     ):
         for name in names:
             was, now = figures[name]
@@ -290,8 +276,13 @@ def compare_cell(
         notes += _bad_seeds(names[0], shared, old, new, floor)
     losses += _coverage_losses(key, *figures["coverage90"], limits)
     was, now = figures["seconds"]
-    if limits.seconds is not None and was is not None and now is not None and now > limits.seconds * was:
-        losses.append(f"median seconds {was:.1f} -> {now:.1f}, more than {limits.seconds:g} times")
+    if (
+        limits.seconds_limit is not None
+        and was is not None
+        and now is not None
+        and now > limits.seconds_limit * was
+    ):
+        losses.append(f"median seconds {was:.1f} -> {now:.1f}, more than {limits.seconds_limit:g} times")
     return Comparison(key=key, seeds=len(shared), figures=figures, losses=tuple(losses), notes=tuple(notes))
 
 

@@ -41,20 +41,10 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     udr = required_policy("cartpole")
     out, transport, episodes = config.folder, config.transport or "serial", config.episodes or EPISODES
     truth_file = out / "truth.json"
-    options = (
-        "--transport",
-        transport,
-        "--profile",
-        config.profile,
-        "--seed",
-        str(config.seed),
-        "--firmware",
-        config.firmware,
-        "--reveal-to",
-        str(truth_file),
-    )
+    options = ("--transport", transport, "--firmware", config.firmware, "--reveal-to", str(truth_file))
+    hidden = ("--profile", config.profile, "--seed", str(config.seed))
     link = LinkOptions(transport=transport)
-    with EmulatorProcess("cartpole", *options) as emulator:
+    with EmulatorProcess("cartpole", *options, *hidden) as emulator:
         port = emulator.port
         print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
         with stages.stage("collect", "4 s of informative motion, and 4 s of other motion as held-out data"):

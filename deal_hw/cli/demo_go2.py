@@ -190,22 +190,10 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
     """Yield the robot of the demo's seed. Its truth and its track go to files of this name."""
     out, transport = config.folder, _transport(config)
     track = out / f"truth_track_{name}.csv"
-    with EmulatorProcess(
-        "go2",
-        "--transport",
-        transport,
-        "--port",
-        PORTS[transport],
-        "--profile",
-        config.profile,
-        "--seed",
-        str(config.seed),
-        "--reveal-to",
-        str(out / f"truth_{name}.json"),
-        "--track-to",
-        str(track),
-        *options,
-    ) as emulator:
+    wire = ("--transport", transport, "--port", PORTS[transport])
+    hidden = ("--profile", config.profile, "--seed", str(config.seed))
+    files = ("--reveal-to", str(out / f"truth_{name}.json"), "--track-to", str(track))
+    with EmulatorProcess("go2", *wire, *hidden, *files, *options) as emulator:
         print(f"an emulated Go2 ({config.profile}) with hidden physics is on {emulator.port}")
         # The demo needs no raw bytes, and they are half of the recorder's work.
         link = LinkOptions(transport=transport, record_wire=False)
@@ -305,21 +293,9 @@ def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
     judged = {name: [error for error, _ in found] for name, found in true.items()}
     falls = {name: np.array([float(fell) for _, fell in found]) for name, found in true.items()}
     return [
-        Measure(
-            name="velocity_error_m_s",
-            unit="m_s",
-            values=each(judged, "velocity_m_s"),
-        ),
-        Measure(
-            name="yaw_error_rad_s",
-            unit="rad_s",
-            values=each(judged, "yaw_rad_s"),
-        ),
-        Measure(
-            name="estimated_velocity_error_m_s",
-            unit="m_s",
-            values=each(own, "velocity_m_s"),
-        ),
+        Measure(name="velocity_error_m_s", unit="m_s", values=each(judged, "velocity_m_s")),
+        Measure(name="yaw_error_rad_s", unit="rad_s", values=each(judged, "yaw_rad_s")),
+        Measure(name="estimated_velocity_error_m_s", unit="m_s", values=each(own, "velocity_m_s")),
         Measure(name="falls", values=falls),
     ]
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from deal_hw.drivers.cartpole.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
-from deal_hw.ranges import Range, check_ranges
+from deal_hw.ranges import Checked, Range, check_ranges
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import CARTPOLE, File, Only, Ratio, Seed, Share, given, refuse, refuse_others
 from deal_hw.workflows.robot import is_user_robot
@@ -20,7 +20,7 @@ DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Go2Options:
+class Go2Options(Checked):
     """Options of ``emulate go2`` alone."""
 
     on_stand: bool = False
@@ -69,9 +69,6 @@ class Go2Options:
 
     faults: Go2Faults = field(default_factory=Go2Faults)
     """Faults of the Go2. Their times count from the first stiff command."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def wire(self, transport: str) -> WireOptions:
         """Return how the emulator joins the wire."""
