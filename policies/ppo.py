@@ -156,11 +156,7 @@ class _Learner:
         O, A = len(env.layout.observation), len(env.layout.actuated)  # noqa: E741
         example = self._batch(np.zeros((env.num_envs, O), dtype=np.float32))
         groups = {"actor": ["observation"], "critic": ["observation", "privileged"]}
-        spread = {
-            "class_name": "GaussianDistribution",
-            "init_std": config.exploration,
-            "std_type": "log",
-        }
+        spread = {"class_name": "GaussianDistribution", "init_std": config.exploration, "std_type": "log"}
         hidden = list(config.hidden)
         self._actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
         self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu")

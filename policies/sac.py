@@ -311,11 +311,7 @@ class _Report(BaseCallback):
             return
         model: Any = self.model
         tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
-        notes = {
-            "trainer": SacTrainer.name,
-            "steps": self.num_timesteps,
-            "hidden": list(self._config.hidden),
-        }
+        notes = {"trainer": SacTrainer.name, "steps": self.num_timesteps, "hidden": list(self._config.hidden)}
         found = Checkpoint(tensors={**tensors, "entropy.log": model.log_ent_coef}, notes=notes)
         write_checkpoint(self._files.checkpoint, found, self._adapter.env.layout)
         write_model(model_path(self._files.checkpoint), model)

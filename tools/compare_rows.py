@@ -51,12 +51,7 @@ from deal_hw.ranges import option
 FIELDS: Mapping[str, str] = {"polish": "refined", **FORMER_FIELDS}
 """Old name of a row's field -> new name."""
 
-METHODS = {
-    "weki": "eki",
-    "near": "local",
-    "open-loop": "output-error",
-    "centre": "midpoint",
-}
+METHODS = {"weki": "eki", "near": "local", "open-loop": "output-error", "centre": "midpoint"}
 """Old name of a method -> new name; others keep theirs."""
 
 WHOLE = frozenset({"default", "local", "output-error"})

@@ -33,15 +33,7 @@ REFUSALS = ROOT / "tests" / "house" / "refusals.txt"
 
 CONTRACTS = {
     "Vocabulary": ("types", "errors", "clock"),
-    "Contracts": (
-        "robot",
-        "transport",
-        "description",
-        "policy",
-        "parameters",
-        "calibration",
-        "training",
-    ),
+    "Contracts": ("robot", "transport", "description", "policy", "parameters", "calibration", "training"),
     "Suites that a new robot, transport, method or trainer inherits": (
         "testing.robot_suite",
         "testing.transport_suite",

@@ -147,9 +147,7 @@ CODECS = {
     "Dynamixel, plain answers": Codec(frames=[blocks(fast=False)], contents=_answer(fast=False), bits=16),
     "Go2, LowCmd": Codec(frames=low_commands(), contents=_checked(decode_low_command, "LowCmd"), bits=32),
     "Go2, LowState": Codec(
-        frames=[encode_low_state(FakeGo2().state())],
-        contents=_checked(decode_low_state, "LowState"),
-        bits=32,
+        frames=[encode_low_state(FakeGo2().state())], contents=_checked(decode_low_state, "LowState"), bits=32
     ),
 }
 CORE = "cart-pole, the firmware's C core"

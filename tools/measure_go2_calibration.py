@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import describe_call
+from deal_hw.cli.bench import parse_seeds
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.workflows.emulation.process import EmulatorProcess
@@ -206,18 +207,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _seeds(text: str) -> list[int]:
-    low, _, high = text.partition("-")
-    return list(range(int(low), int(high or low) + 1))
-
-
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--transport", choices=tuple(PORTS), default="zenoh")
     parser.add_argument("--domain", type=int, default=77, help="DDS domain")
-    parser.add_argument("--seeds", type=_seeds, default=[1000], help="such as 1000-1004")
+    parser.add_argument("--seeds", type=parse_seeds, default=(1000,), help="such as 1000-1004")
     parser.add_argument("--profile", default="sensor", help="profile of the emulator")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the recording to fit")
     parser.add_argument("--heldout", default="steps", help="family of the held-out motion")

@@ -23,18 +23,7 @@ from fault_acts import (
     second_run,
     signal_control,
 )
-from fault_rig import (
-    ANY,
-    ARMING,
-    CONNECTING,
-    ENDING,
-    LYING_DOWN,
-    RISING,
-    RUNNING,
-    TAKING_OVER,
-    Case,
-    Rig,
-)
+from fault_rig import ANY, ARMING, CONNECTING, ENDING, LYING_DOWN, RISING, RUNNING, TAKING_OVER, Case, Rig
 from fault_table import main
 
 from deal_hw.clock import MonotonicClock

@@ -118,10 +118,7 @@ def measure(settings: TransportBench) -> tuple[dict[str, Any], dict[str, Any]]:
     wire = {**settings.wire.to_json(), "listen": False}
     # Zenoh needs one side that listens, and a client cannot; DDS has no sides.
     robot_wire = {**wire, "listen": True, "mode": "peer"} if settings.transport == "zenoh" else wire
-    with (
-        _monitored() as seen,
-        SideProcess(SIDES, "robot", {**orders, "wire": robot_wire}) as robot,
-    ):
+    with _monitored() as seen, SideProcess(SIDES, "robot", {**orders, "wire": robot_wire}) as robot:
         robot.expect("ready", _START_S)
         freeze = {"pid": robot.pid, **_freeze_cycles(settings)}
         with SideProcess(SIDES, "controller", {**orders, "wire": wire, "freeze": freeze}) as controller:

@@ -190,13 +190,6 @@ REAL = frozenset({"so101", "go2-suspended"})
 """Problems with real recordings."""
 
 
-def check_problems(names: Sequence[str]) -> None:
-    """Raise `UnknownNameError` if a name is not in `PROBLEMS`."""
-    for name in names:
-        if name not in PROBLEMS:
-            raise UnknownNameError("problem of first-answer", name, PROBLEMS)
-
-
 def cells(
     problems: Sequence[str], seeds: Sequence[int], *, real: Path | None, budget: Budget, threads: int | None
 ) -> Cells:
@@ -205,7 +198,9 @@ def cells(
     Raises:
         UnknownNameError: There is no such problem.
     """
-    check_problems(problems)
+    for name in problems:
+        if name not in PROBLEMS:
+            raise UnknownNameError("problem of first-answer", name, PROBLEMS)
 
     run = partial(run_cell, real=real, budget=budget, threads=threads)
     chosen = [(name, seed) for seed in seeds for name in problems if name not in REAL or seed == seeds[0]]
@@ -315,9 +310,7 @@ def _compared(
     whole = Problem(work.robot, work.space, joined(work.episodes), threads=threads)
     since = _Stopwatch.start()
     sysid = with_delay(settings.sysid_window_s).run(
-        whole,
-        Budget(generations=settings.sysid_iterations),
-        np.random.default_rng(seed),
+        whole, Budget(generations=settings.sysid_iterations), np.random.default_rng(seed)
     )
     sysid_s, sysid_cpu_s = since.passed()
 

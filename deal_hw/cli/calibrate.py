@@ -21,12 +21,7 @@ from deal_hw.workflows.calibration.best_so_far import (
 )
 from deal_hw.workflows.calibration.model import write_parameters
 from deal_hw.workflows.calibration.run import CalibrateReport, finish
-from deal_hw.workflows.calibration.settings import (
-    CalibrateSettings,
-    calibrate_inputs,
-    prepare,
-    usual_method,
-)
+from deal_hw.workflows.calibration.settings import CalibrateSettings, calibrate_inputs, prepare, usual_method
 from deal_hw.workflows.say import aloud, silent
 
 __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_parameters"]

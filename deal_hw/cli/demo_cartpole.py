@@ -9,15 +9,7 @@ import numpy as np
 
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import (
-    Demo,
-    Demonstrated,
-    Measure,
-    Stages,
-    first_episode,
-    read_truth,
-    show_episode,
-)
+from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, first_episode, read_truth, show_episode
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.cli.train import Train, train

@@ -14,15 +14,7 @@ import numpy as np
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import (
-    Demo,
-    Demonstrated,
-    Measure,
-    Stages,
-    first_episode,
-    read_truth,
-    show_episode,
-)
+from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, first_episode, read_truth, show_episode
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.train import Train, train
 from deal_hw.control.loop import Outcome

@@ -111,10 +111,7 @@ def _serve(rrd: Path, port: int, quiet: bool) -> None:
     # By default SIGTERM would end this process and leave the server running.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with (
-            contextlib.suppress(KeyboardInterrupt),
-            serve_web(rrd, port=port) as (address, server),
-        ):
+        with contextlib.suppress(KeyboardInterrupt), serve_web(rrd, port=port) as (address, server):
             print(f"open {address}  (Ctrl-C ends it)", flush=True)
             if not quiet:
                 print(f"on another computer, run there first: {from_elsewhere(address)}", flush=True)

@@ -69,7 +69,16 @@ def _print(training: Training) -> None:
 
 
 def _with_bar(config: Train) -> Training:
-    bar = _progress_bar(config.quiet)
+    bar = Progress(
+        TextColumn("training"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} steps"),
+        TextColumn("return {task.fields[recent]:.1f} {task.fields[measures]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        disable=config.quiet,
+    )
     try:
         return run(config, _follow(bar))
     finally:
@@ -85,19 +94,6 @@ def _words(status: TrainingStatus) -> str:
 
 def _measures(status: TrainingStatus) -> str:
     return ", ".join(f"{name} {value:.2f}" for name, value in [*status.measures.items()][:SHOWN_MEASURES])
-
-
-def _progress_bar(quiet: bool) -> Progress:
-    return Progress(
-        TextColumn("training"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} steps"),
-        TextColumn("return {task.fields[recent]:.1f} {task.fields[measures]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        disable=quiet,
-    )
 
 
 def _follow(bar: Progress) -> TrainingProgress:

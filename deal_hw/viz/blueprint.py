@@ -210,10 +210,7 @@ def _loop_timing(trajectory: Trajectory, cycles: CycleTable | None) -> Any:
         contents = tuple(f"/loop_timing/{entity}" for entity in entities)
         return Plot(name=name, origin="/loop_timing", contents=contents, curves=curves)
 
-    periods = {
-        "state_period": np.diff(trajectory.receive_s),
-        "command_period": np.diff(trajectory.sent_s),
-    }
+    periods = {"state_period": np.diff(trajectory.receive_s), "command_period": np.diff(trajectory.sent_s)}
     plots = [plot("Time between samples and between commands [ms]", periods)]
     if cycles is not None:
         delays = {"lateness": cycles.start_s - cycles.deadline_s, "state_age": cycles.state_age_s}

@@ -64,13 +64,7 @@ class Log:
         self.stream = stream
 
     def line(
-        self,
-        path: str,
-        name: str,
-        color: tuple[int, int, int],
-        *,
-        width: float = 1.5,
-        step: bool = False,
+        self, path: str, name: str, color: tuple[int, int, int], *, width: float = 1.5, step: bool = False
     ) -> None:
         """Set the style of an entity's scalars; ``step`` holds each value until the next."""
         mode = rr.components.InterpolationMode.StepAfter if step else rr.components.InterpolationMode.Linear

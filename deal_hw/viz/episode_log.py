@@ -139,12 +139,7 @@ def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
     device_s = host_to_device(trajectory, host_s)
     for name, label, values, color in (
         ("lateness", "lateness of a cycle", host_s - cycles.deadline_s, palette.SENT),
-        (
-            "state_age",
-            "age of the state",
-            cycles.state_age_s,
-            palette.CALIBRATED,
-        ),
+        ("state_age", "age of the state", cycles.state_age_s, palette.CALIBRATED),
     ):
         log.line(f"/loop_timing/{name}", label, color, step=True)
         log.scalars(f"/loop_timing/{name}", device_s, host_s, 1e3 * values)

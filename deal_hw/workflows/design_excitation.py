@@ -157,10 +157,7 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
     """
     default = ExcitationSettings(robot=config.robot, out=config.out)
     if config.family == "optimal":
-        refuse(
-            given(config, default, GIVEN_DESIGN),
-            "--family optimal searches it; name another",
-        )
+        refuse(given(config, default, GIVEN_DESIGN), "--family optimal searches it; name another")
         if config.calibration is not None:
             refuse(given(config, default, ("space", "range_ratio")), "--calibration gives the ranges")
     else:

@@ -6,13 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calibration import (
-    Budget,
-    CalibrationMethod,
-    CalibrationResult,
-    ProgressCallback,
-    StateStore,
-)
+from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback, StateStore
 from deal_hw.types import FloatArray
 
 

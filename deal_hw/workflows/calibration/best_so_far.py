@@ -11,13 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.calibration import (
-    Alarm,
-    CalibrationResult,
-    Progress,
-    ProgressCallback,
-    percent,
-)
+from deal_hw.calibration import Alarm, CalibrationResult, Progress, ProgressCallback, percent
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
@@ -147,7 +141,7 @@ def saying_how_to_resume(path: Path) -> Iterator[None]:
         if path.exists():
             aloud(
                 f"\ncalibration stopped; its state is in {path}. The same command with --resume continues, "
-                "to the same result",
+                "to the same result"
             )
         else:
             aloud("\ncalibration stopped before the search; there is no state to --resume, begin again")

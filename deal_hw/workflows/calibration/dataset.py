@@ -251,10 +251,7 @@ def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
 
 
 def _simulation(
-    robot: RobotModel,
-    recordings: Mapping[int, Trajectory],
-    names: Mapping[int, str],
-    sample_hz: float | None,
+    robot: RobotModel, recordings: Mapping[int, Trajectory], names: Mapping[int, str], sample_hz: float | None
 ) -> dict[int, SampledEpisode]:
     from deal_hw.sim.recordings.episode import align, thin
     from deal_hw.sim.recordings.standing import with_sensed_base

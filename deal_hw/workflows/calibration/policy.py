@@ -39,10 +39,7 @@ def check_policy(method: str, *, given: bool, model: bool) -> None:
 
 
 def recorded_policy(
-    dataset: Dataset,
-    runs: Mapping[int, Mapping[str, Any]],
-    description: RobotDescription,
-    given: Path | None,
+    dataset: Dataset, runs: Mapping[int, Mapping[str, Any]], description: RobotDescription, given: Path | None
 ) -> PopulationDemonstration:
     """Return the policy that moved the robot during whole episodes of a dataset.
 

@@ -27,12 +27,7 @@ from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExt
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
-from deal_hw.workflows.calibration.best_so_far import (
-    SO_FAR,
-    BestSoFar,
-    keeping_best,
-    saying_how_to_resume,
-)
+from deal_hw.workflows.calibration.best_so_far import SO_FAR, BestSoFar, keeping_best, saying_how_to_resume
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
 from deal_hw.workflows.say import Say, aloud, silent
 

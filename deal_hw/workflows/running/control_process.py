@@ -18,13 +18,7 @@ from typing import Any
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process_channel import LOADING, RecordSender, StatusSender
-from deal_hw.control.realtime import (
-    PARENT_DIED,
-    Granted,
-    become_realtime,
-    die_with_parent,
-    kill_self_after,
-)
+from deal_hw.control.realtime import PARENT_DIED, Granted, become_realtime, die_with_parent, kill_self_after
 from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 
 _START_SILENCE_S = 30.0
