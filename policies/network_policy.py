@@ -77,15 +77,7 @@ def diverged(steps: int, checkpoint: Path | None) -> TrainingDivergedError:
 
 
 def trained_spec(env: ServoVectorEnv, algorithm: str, config: Any, seed: int, **versions: str) -> PolicySpec:
-    """Return the spec of a policy with the record of its training.
-
-    Args:
-        env: The environment of the training.
-        algorithm: The trainer's name.
-        config: The trainer's settings, a dataclass.
-        seed: Seed of all randomness.
-        **versions: Versions of packages by name.
-    """
+    """Return the spec of a policy with the record of its training."""
     settings = {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(config).items()

@@ -58,9 +58,6 @@ class ProbeStates:
     """Makes the test states of one robot, inside its trip limits.
 
     Limits are those of joint positions and speeds, and of the base's tilt and turn rate, if it has one.
-
-    Args:
-        description: The robot.
     """
 
     def __init__(self, description: RobotDescription) -> None:

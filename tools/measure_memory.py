@@ -121,11 +121,7 @@ def heap_reader() -> Callable[[], float] | None:
 
 
 class Series:
-    """Memory after each generation or run.
-
-    Args:
-        wanted: Values to take.
-    """
+    """Memory after each generation or run."""
 
     def __init__(self, wanted: int) -> None:
         import psutil

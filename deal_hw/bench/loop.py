@@ -127,11 +127,6 @@ def task_score(truth: CartpoleTruth, policy: Policy) -> tuple[float, float]:
 def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[str, Any]:
     """Train under the calibrated distribution and under the truth; deploy both and the shipped UDR policy.
 
-    Args:
-        case: The robot.
-        result: Its calibration.
-        folder: Folder of the policies.
-
     Returns:
         The policies' part of the row.
     """

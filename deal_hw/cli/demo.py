@@ -290,14 +290,7 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
 
 
 def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationResult, folder: Path) -> None:
-    """Print the outcome, the estimates beside the truth, and the commands that show more.
-
-    Args:
-        console: Where to print.
-        summary: Contents of ``summary.json``.
-        result: The calibration.
-        folder: The run folder.
-    """
+    """Print the outcome, the estimates beside the truth, and the commands that show more."""
     from rich.table import Table
 
     console.print(f"\n{summary['sentence']}", markup=False)

@@ -334,11 +334,7 @@ def _to_nowhere(stream: TextIO) -> None:
 
 
 class _Stderr:
-    """The error output. If its reader closes it, the work continues, with the same exit code.
-
-    Args:
-        stream: The output itself.
-    """
+    """The error output. If its reader closes it, the work continues, with the same exit code."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -54,11 +54,7 @@ def command_device_times(trajectory: Trajectory) -> FloatArray:
 
 
 class Log:
-    """Writes columns of scalars, poses and texts of one recording.
-
-    Args:
-        stream: The rerun recording.
-    """
+    """Writes columns of scalars, poses and texts of one recording."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream

@@ -102,10 +102,6 @@ def run_viewer(
 
     It gets a settings folder of its own. So it reports no usage and looks the same on every machine, and the
     user's own settings stay unchanged.
-
-    Args:
-        arguments: Its arguments.
-        extra_environment: Variables to set for it.
     """
     binary = str(program())
     with tempfile.TemporaryDirectory(prefix="deal-hw-rerun-") as home:
@@ -146,12 +142,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def web_address(port: int, data: str) -> str:
-    """Return the address to open in a browser, in the light theme.
-
-    Args:
-        port: Port of rerun's web viewer.
-        data: Address of the data.
-    """
+    """Return the address to open in a browser, in the light theme."""
     return f"http://{LOOPBACK}:{port}?url={urllib.parse.quote(data, safe='')}&theme=light"
 
 

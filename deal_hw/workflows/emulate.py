@@ -13,9 +13,6 @@ from deal_hw.workflows.options import from_settings, refuse
 class EmulatedRobot(EmulatorProcess):
     """A robot that is emulated in its own process; a context manager.
 
-    Args:
-        settings: What to emulate.
-
     Attributes:
         robot: Its name.
         port: Its port, while it is emulated.

@@ -112,13 +112,7 @@ class BestSoFar:
 
 @contextlib.contextmanager
 def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[None]:
-    """On Ctrl-C write the best fit so far, if any, and raise the interrupt again.
-
-    Args:
-        best: The fits so far.
-        folder: Where to write.
-        robot: The nominal model.
-    """
+    """On Ctrl-C write the best fit so far, if any, and raise the interrupt again."""
     try:
         yield
     except KeyboardInterrupt:

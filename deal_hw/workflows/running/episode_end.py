@@ -16,13 +16,7 @@ _LINK_WARNING = 0.01
 
 
 def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeReport:
-    """Return the report on an episode from the ends of its processes.
-
-    Args:
-        end: Ends of the processes.
-        path: The recording, or None.
-        watchdog_s: ``Robot.watchdog_s``.
-    """
+    """Return the report on an episode from the ends of its processes."""
     result = end.result or {}
     outcome, reason, error = _verdict(end, result)
     warnings = list(result.get("warnings", ()))
