@@ -174,6 +174,12 @@ class CalibrationResult:
         named = zip(self.space.names, verdicts, strict=True)
         return tuple(name for name, verdict in named if verdict == "not identifiable")
 
+    def estimate_text(self, name: str) -> str:
+        """Return a parameter's estimate as text; one that the recordings do not determine has no value."""
+        if name in self.without_value:
+            return "no value"
+        return f"{self.estimate[self.space.names.index(name)]:.4g}"
+
     def restricted(self, space: ParameterSpace) -> CalibrationResult:
         """Return the result of a space's parameters alone, which come first; others were added to it."""
         K = len(space)

@@ -28,7 +28,6 @@ def evaluate_batch(
     seconds: float = TASK_SECONDS,
     start_position: FloatArray | None = None,
     sensor: SensorModel | None = None,
-    threads: int | None = 1,
 ) -> list[BalanceResult]:
     """Run the task on N simulated robots.
 
@@ -42,13 +41,12 @@ def evaluate_batch(
         seconds: Duration [s].
         start_position: Joint positions at the start, (N, J); the home pose by default.
         sensor: The sensor model; the description's by default.
-        threads: Threads of the physics.
 
     Returns:
         N results.
     """
     spec, count = policy.spec, len(theta)
-    loop = ServoLoop(description, space, count, sensor=sensor, threads=threads)
+    loop = ServoLoop(description, space, count, sensor=sensor)
     home = np.repeat(np.array(description.default_position)[None], count, axis=0)
     start = home if start_position is None else start_position
     loop.restart(np.ones(count, dtype=bool), theta, latency_s, start, np.zeros_like(home), rng)

@@ -110,7 +110,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         table.add_row(
             Text(f"{p.name} [{p.unit}]"),
             f"{p.nominal:.4g}",
-            "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}",
+            result.estimate_text(p.name),
             f"{low:.4g} .. {high:.4g}",
             verdict,
         )

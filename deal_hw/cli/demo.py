@@ -297,13 +297,9 @@ def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationR
     table = Table(title="estimates of the calibration beside the hidden truth")
     for name in ("parameter", "unit", "nominal", "estimate", "90 % interval", "truth"):
         table.add_column(name, justify="left" if name in ("parameter", "unit") else "right")
-    for k, (name, row) in enumerate(summary["parameters"].items()):
-        found = (
-            "no value" if result.verdicts[k : k + 1] == ("not identifiable",) else f"{row['estimate']:.4g}"
-        )
-        _add(
-            table, name, row["unit"], f"{row['nominal']:.4g}", found, (row["low"], row["high"]), row["truth"]
-        )
+    for name, row in summary["parameters"].items():
+        found, interval = result.estimate_text(name), (row["low"], row["high"])
+        _add(table, name, row["unit"], f"{row['nominal']:.4g}", found, interval, row["truth"])
     for name, row in summary["known"].items():
         unit = escape(result.space[name].unit)
         table.add_row(name, unit, "", f"{row['value']:.4g}", "not fitted", f"{row['truth']:.4g}")

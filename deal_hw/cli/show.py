@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 from deal_hw.cli.design_excitation import note, print_design
 from deal_hw.cli.piped import PipedProgress
@@ -16,33 +16,17 @@ from deal_hw.workflows.running.view import OnBeat, RunView, ignore
 from deal_hw.workflows.say import aloud
 
 
+@dataclass(frozen=True, slots=True)
 class SecondsBar:
     """A bar on the terminal; without a terminal, the text of the next line.
 
-    Args:
-        bar: A rich Progress; None: there is no terminal.
-        piped: Prints lines; None: there is a bar.
-        title: The current activity.
-        seconds: Its duration [s].
+    Attributes:
+        passed: Sets the elapsed time [s].
+        say: Sets the current activity; "": the run itself.
     """
 
-    def __init__(self, bar: Any, piped: PipedProgress | None, title: str, seconds: float) -> None:
-        self._bar, self._piped, self._title, self._seconds = bar, piped, title, seconds
-        self._task = bar.add_task(title, total=seconds) if bar is not None else None
-
-    def passed(self, seconds: float) -> None:
-        """Set the elapsed time [s]."""
-        if self._bar is not None:
-            self._bar.update(self._task, completed=min(seconds, self._seconds))
-        if self._piped is not None:
-            self._piped.at(f"running, {seconds:.0f} of {self._seconds:.0f} s")
-
-    def say(self, doing: str) -> None:
-        """Set the current activity; "": the run itself."""
-        if self._bar is not None:
-            self._bar.update(self._task, description=f"{self._title}: {doing}" if doing else self._title)
-        if self._piped is not None:
-            self._piped.at(doing)
+    passed: Callable[[float], None]
+    say: Callable[[str], None]
 
 
 @contextlib.contextmanager
@@ -50,7 +34,7 @@ def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[Sec
     """Show a bar on a terminal while the block runs, elsewhere a line every ten seconds."""
     if quiet or not sys.stderr.isatty():
         with PipedProgress(title, quiet) as piped:
-            yield SecondsBar(None, piped, title, seconds)
+            yield SecondsBar(lambda passed: piped.at(f"running, {passed:.0f} of {seconds:.0f} s"), piped.at)
         return
     # Imported here: rich takes longer to load than all other imports on a robot's computer.
     from rich.console import Console
@@ -58,7 +42,11 @@ def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[Sec
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        yield SecondsBar(bar, None, title, seconds)
+        task = bar.add_task(title, total=seconds)
+        yield SecondsBar(
+            lambda passed: bar.update(task, completed=min(passed, seconds)),
+            lambda doing: bar.update(task, description=f"{title}: {doing}" if doing else title),
+        )
 
 
 class Terminal(RunView):

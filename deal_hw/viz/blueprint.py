@@ -41,14 +41,9 @@ class Plot:
     curves: tuple[Curve, ...]
     within: tuple[float, float] = (-np.inf, np.inf)
 
-    def view(self, rows: int, limits: tuple[float, float] | None = None) -> Any:
-        """Return the view; all of them share one time axis.
-
-        Args:
-            rows: Number of plots below each other.
-            limits: The y axis; by default that of the curves.
-        """
-        limits = limits or visible_range(self.curves, self.within, rows)
+    def view(self, rows: int) -> Any:
+        """Return the view of one of some rows of plots; all of them share one time axis."""
+        limits = visible_range(self.curves, self.within, rows)
         return rrb.TimeSeriesView(
             origin=self.origin,
             contents=list(self.contents),

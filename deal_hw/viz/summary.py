@@ -132,10 +132,9 @@ def _parameters(result: CalibrationResult) -> str:
     for k, p in enumerate(result.space):
         verdict = result.verdicts[k] if result.verdicts else ""
         low, high = result.interval[k]
-        # A parameter that the data do not determine gets no value; the search's number has no meaning.
-        estimate = "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}"
         lines.append(
-            f"| {p.name} [{p.unit}] | {p.nominal:.3g} | {estimate} | {low:.3g} to {high:.3g} | "
+            f"| {p.name} [{p.unit}] | {p.nominal:.3g} | {result.estimate_text(p.name)} | "
+            f"{low:.3g} to {high:.3g} | "
             f"{'' if verdict == 'identifiable' else verdict} |"
         )
     return "\n".join(lines)

@@ -149,14 +149,16 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
 
 def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
     """Return the given settings of the driver; a driver without such a setting refuses it."""
-    given: dict[str, Any] = {
-        "stop_buttons": legs.stop_buttons,
-        "support_check": legs.support_check,
-        "state_check": link.state_check,
-        "simulator": link.simulator,
+    own = (
+        (legs, LegOptions, ("stop_buttons", "support_check")),
+        (link, LinkOptions, ("state_check", "simulator")),
+    )
+    return {
+        name: getattr(options, name)
+        for options, default, names in own
+        for name in names
+        if getattr(options, name) != getattr(default, name)
     }
-    default = {"stop_buttons": "", "support_check": True, "state_check": "strict", "simulator": "none"}
-    return {name: value for name, value in given.items() if value != default[name]}
 
 
 def _stands(description: RobotDescription) -> bool:
