@@ -54,8 +54,7 @@ class BalanceTask:
     host_delay_s: tuple[float, float] = (0.0, 0.007)
 
     def __post_init__(self) -> None:
-        positive = ("end_angle_rad", "end_position_m", "action_scale_m")
-        check_task(self.ticks, **{name: getattr(self, name) for name in positive})
+        check_task(self, "end_angle_rad", "end_position_m", "action_scale_m")
         low, high = self.host_delay_s
         if not 0 <= low <= high:
             raise ConfigurationError(

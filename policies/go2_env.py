@@ -130,16 +130,8 @@ class WalkTask:
     push_m_s: float = 0.5
 
     def __post_init__(self) -> None:
-        check_task(
-            self.ticks,
-            tracking_width=self.tracking_width,
-            turn_width=self.turn_width,
-            swing_m=self.swing_m,
-            physics_step_s=self.physics_step_s,
-            clock_hz=self.clock_hz,
-            command_ticks=self.command_ticks,
-            push_ticks=self.push_ticks,
-        )
+        positive = "tracking_width turn_width swing_m physics_step_s clock_hz command_ticks push_ticks"
+        check_task(self, *positive.split())
         for name, pair in (
             *((f"command_range[{i}]", pair) for i, pair in enumerate(self.command_range)),
             ("host_delay_s", self.host_delay_s),

@@ -43,7 +43,7 @@ class TurnTask:
     start_noise_rad: float = 0.05
 
     def __post_init__(self) -> None:
-        check_task(self.ticks, fastest_rad_s=self.fastest_rad_s, action_rad=self.action_rad)
+        check_task(self, "fastest_rad_s", "action_rad")
 
 
 def turn_spec(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from deal_hw.errors import TrainingDivergedError
+from deal_hw.errors import ConfigurationError, TrainingDivergedError
 from deal_hw.policies.vector_env import ServoVectorEnv
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray
@@ -56,6 +56,24 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def check_config(config: Any, positive: str, shares: str) -> None:
+    """Check a trainer's settings: numbers above 0, numbers in (0, 1], each by their names, and the layers.
+
+    Raises:
+        ConfigurationError: One is not.
+    """
+    for name in positive.split():
+        if not getattr(config, name) > 0:
+            raise ConfigurationError(f"{name} must be positive, got {getattr(config, name)!r}")
+    for name in shares.split():
+        if not 0 < getattr(config, name) <= 1:
+            raise ConfigurationError(f"{name} must lie in (0, 1], got {getattr(config, name)!r}")
+    if not config.hidden or min(config.hidden) < 1:
+        raise ConfigurationError(
+            f"hidden must name at least one layer of at least one unit, got {config.hidden!r}"
+        )
 
 
 def is_finite(*networks: torch.nn.Module) -> bool:

@@ -14,9 +14,15 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from deal_hw.errors import ConfigurationError
 from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from deal_hw.policies.network_policy import NetworkPolicy, diverged, is_finite, one_thread, trained_spec
+from deal_hw.policies.network_policy import (
+    NetworkPolicy,
+    check_config,
+    diverged,
+    is_finite,
+    one_thread,
+    trained_spec,
+)
 from deal_hw.policies.training_log import TrainingLog
 from deal_hw.policies.vector_env import ServoVectorEnv
 from deal_hw.policy import Observation
@@ -60,27 +66,9 @@ class PpoConfig:
     checkpoint_updates: int = 25
 
     def __post_init__(self) -> None:
-        for name in (
-            "steps",
-            "rollout",
-            "epochs",
-            "batches",
-            "learning_rate",
-            "divergence",
-            "clip",
-            "exploration",
-            "reward_scale",
-            "checkpoint_updates",
-        ):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
-        for name in ("gamma", "trace"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ConfigurationError(f"{name} must lie in (0, 1], got {getattr(self, name)!r}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ConfigurationError(
-                f"hidden must name at least one layer of at least one unit, got {self.hidden!r}"
-            )
+        positive = "steps rollout epochs batches learning_rate divergence "
+        positive += "clip exploration reward_scale checkpoint_updates"
+        check_config(self, positive, "gamma trace")
 
 
 class PpoTrainer:

@@ -48,7 +48,7 @@ class RunTask:
     start_noise_rad: float = 0.1
 
     def __post_init__(self) -> None:
-        check_task(self.ticks, top_height_m=self.top_height_m)
+        check_task(self, "top_height_m")
 
 
 def run_spec(description: RobotDescription, trained_under: str) -> PolicySpec:

@@ -18,7 +18,14 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.checkpoint import Checkpoint, write_checkpoint
-from deal_hw.policies.network_policy import NetworkPolicy, diverged, is_finite, one_thread, trained_spec
+from deal_hw.policies.network_policy import (
+    NetworkPolicy,
+    check_config,
+    diverged,
+    is_finite,
+    one_thread,
+    trained_spec,
+)
 from deal_hw.policies.sb3_model import model_path, read_start, restore_optimisers, write_model
 from deal_hw.policies.training_log import TrainingLog
 from deal_hw.policies.vector_env import ServoVectorEnv
@@ -63,24 +70,8 @@ class SacConfig:
     averaged: float = 0.25
 
     def __post_init__(self) -> None:
-        for name in (
-            "steps",
-            "gradient_steps",
-            "batch",
-            "learning_rate",
-            "final_learning_rate",
-            "entropy",
-            "buffer",
-        ):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
-        for name in ("gamma", "tau", "averaged"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ConfigurationError(f"{name} must lie in (0, 1], got {getattr(self, name)!r}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ConfigurationError(
-                f"hidden must name at least one layer of at least one unit, got {self.hidden!r}"
-            )
+        positive = "steps gradient_steps batch learning_rate final_learning_rate entropy buffer"
+        check_config(self, positive, "gamma tau averaged")
         if not 0 <= self.warmup < self.steps:
             raise ConfigurationError(
                 f"{self.steps} steps: give more than the {self.warmup} steps of warmup, which are random"

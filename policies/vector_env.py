@@ -20,21 +20,17 @@ from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray
 
 
-def check_task(ticks: int, **positive: float) -> None:
-    """Check the common settings of tasks.
-
-    Args:
-        ticks: Control periods in an episode.
-        **positive: Settings that must be positive, by name.
+def check_task(task: Any, *positive: str) -> None:
+    """Check a task's settings: at least one tick, and those that must be positive, by name.
 
     Raises:
         ConfigurationError: One is not.
     """
-    if ticks < 1:
-        raise ConfigurationError(f"ticks must be at least 1, got {ticks}")
-    for name, value in positive.items():
-        if not value > 0:
-            raise ConfigurationError(f"{name} must be positive, got {value!r}")
+    if task.ticks < 1:
+        raise ConfigurationError(f"ticks must be at least 1, got {task.ticks}")
+    for name in positive:
+        if not getattr(task, name) > 0:
+            raise ConfigurationError(f"{name} must be positive, got {getattr(task, name)!r}")
 
 
 class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):

@@ -15,7 +15,15 @@ from PIL import Image
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.viz.columns import DEVICE_TIMELINE
-from deal_hw.viz.viewer import LOOPBACK, Viewer, free_port, program, run_viewer, wait_until_listening
+from deal_hw.viz.viewer import (
+    LOOPBACK,
+    Viewer,
+    check_recording,
+    free_port,
+    program,
+    run_viewer,
+    wait_until_listening,
+)
 
 DEFAULT_SIZE = (1280, 800)
 RENDERER_INSTALL = "apt-get install -y mesa-vulkan-drivers"
@@ -47,8 +55,7 @@ def save_screenshot(
         ConfigurationError: No such recording, no Vulkan renderer on this machine (the message says how to get
             one), or the viewer shows nothing in time.
     """
-    if not rrd.is_file():
-        raise ConfigurationError(f"{rrd}: no such recording")
+    check_recording(rrd)
     port = free_port()
     arguments = [str(rrd), "--headless", "--bind", LOOPBACK, "--port", str(port), "--renderer=vulkan"]
     arguments += ["--window-size", f"{size[0]}x{size[1]}"]

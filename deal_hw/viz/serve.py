@@ -13,6 +13,7 @@ from deal_hw.viz.viewer import (
     WINDOW,
     Viewer,
     check_port,
+    check_recording,
     free_port,
     run_viewer,
     wait_until_listening,
@@ -37,7 +38,7 @@ def serve_web(rrd: Path, *, port: int = DEFAULT_WEB_PORT) -> Iterator[tuple[str,
     Raises:
         ConfigurationError: No such file, the port is taken, or the server does not start.
     """
-    _check_file(rrd)
+    check_recording(rrd)
     web_port = port or free_port()
     check_port(web_port)
     data_port = free_port()
@@ -69,13 +70,8 @@ def open_window(rrd: Path) -> None:
     Raises:
         ConfigurationError: No such file, there is no desktop, or the viewer failed.
     """
-    _check_file(rrd)
+    check_recording(rrd)
     check_display()
     with run_viewer([str(rrd), "--bind", LOOPBACK, "--port", str(free_port()), *WINDOW]) as viewer:
         if viewer.process.wait():
             viewer.check()
-
-
-def _check_file(rrd: Path) -> None:
-    if not rrd.is_file():
-        raise ConfigurationError(f"{rrd}: no such recording")

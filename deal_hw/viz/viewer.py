@@ -78,6 +78,16 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def check_recording(rrd: Path) -> None:
+    """Check that a recording is there.
+
+    Raises:
+        ConfigurationError: It is not.
+    """
+    if not rrd.is_file():
+        raise ConfigurationError(f"{rrd}: no such recording")
+
+
 def check_port(port: int) -> None:
     """Check that a TCP port is free on the loopback interface.
 

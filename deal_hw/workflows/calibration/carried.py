@@ -58,7 +58,7 @@ def prepare_carried(
     fit, held = choose_episodes(dataset, source.episodes, source.holdout, say)
     if held and config.holdout_part is None:
         share = 0.0
-    trajectories, verdicts = sound_recordings(
+    trajectories, telemetry = sound_recordings(
         {i: dataset.read(i).trajectory for i in (*fit, *held)}, source.folder, source.spikes, say
     )
     model = compile_mjcf(description.mjcf)
@@ -96,7 +96,7 @@ def prepare_carried(
         episodes=parts,
         holdout=judge,
         shown=trajectories[fit[0]],
-        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
+        telemetry=telemetry,
         provenance={
             "dataset": str(source.folder),
             "description_digest": dataset.digest,

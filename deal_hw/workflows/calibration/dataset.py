@@ -27,7 +27,6 @@ from deal_hw.workflows.shipped import balancer
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.data.recording.telemetry_checks import CheckResult
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
 
@@ -90,7 +89,7 @@ def prepare_dataset(
     if method in CLOSED_LOOP_METHODS:
         runs = {i: episodes_read[i].metadata for i in fit}
         policy = recorded_policy(dataset, runs, description, source.policy)
-    recordings, verdicts = sound_recordings(
+    recordings, telemetry = sound_recordings(
         {i: episode.trajectory for i, episode in episodes_read.items()}, source.folder, source.spikes, say
     )
     space = without_speed_limits(space, description, recordings.values(), say)
@@ -105,7 +104,7 @@ def prepare_dataset(
         episodes=[episodes[i] for i in fit],
         holdout=[episodes[i] for i in holdout],
         shown=recordings[fit[0]],
-        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
+        telemetry=telemetry,
         provenance={
             "dataset": str(source.folder),
             "description_digest": dataset.digest,
@@ -146,7 +145,7 @@ def without_speed_limits(
 
 def sound_recordings(
     trajectories: Mapping[int, Trajectory], folder: Path, spikes: SpikeSettings, say: Say
-) -> tuple[dict[int, Trajectory], dict[int, tuple[CheckResult, ...]]]:
+) -> tuple[dict[int, Trajectory], list[str]]:
     """Check episodes of a dataset and leave out their spikes.
 
     Args:
@@ -156,7 +155,7 @@ def sound_recordings(
         say: Called with a sentence on each spike.
 
     Returns:
-        The episodes without spikes, and the checks' findings, by number.
+        The episodes without spikes, by number, and the checks' findings in words.
 
     Raises:
         InsufficientDataError: An episode cannot be used.
@@ -174,7 +173,8 @@ def sound_recordings(
             )
         for jump in [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN][:1]:
             say(f"episode {index}: {jump}")
-    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, verdicts
+    told = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
+    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, told
 
 
 def named_space(robot: str, name: str = "") -> ParameterSpace:

@@ -266,35 +266,28 @@ def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None
         raise InsufficientDataError(f"the held-out recordings are too short: {problem} (--heldout-window)")
 
 
-def residual_std(words: Sequence[str], robot: RobotModel) -> FloatArray | None:
-    """Return ``--residual-std`` as an array, positions then velocities, (2 C,); None if it is not given.
-
-    Raises:
-        ConfigurationError: It is neither one number nor pairs of a joint and a number above 0.
-        UnknownNameError: A joint is unknown.
-    """
-    if not words:
-        return None
-    if len(words) == 1:
-        return residual_std_of(_number(words[0]), robot)
-    # A last word without a number is a joint without a value.
-    pairs = zip(words[::2], [*map(_number, words[1::2]), *([math.nan] * (len(words) % 2))], strict=True)
-    return residual_std_of(dict(pairs), robot)
-
-
-def residual_std_of(given: float | Mapping[str, float] | None, robot: RobotModel) -> FloatArray | None:
+def residual_std(
+    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
+) -> FloatArray | None:
     """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
 
     Args:
-        given: One number for all joints of a fixed robot, or one for each name [rad or m].
+        given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
+            line as words; None or no words: none is expected.
         robot: The robot.
 
     Raises:
         ConfigurationError: A number is missing, or is not above 0.
         UnknownNameError: A joint is not known.
     """
-    if given is None:
+    if given is None or given == ():
         return None
+    if isinstance(given, tuple) and len(given) == 1:
+        given = _number(given[0])
+    elif isinstance(given, tuple):
+        # A last word without a number is a joint without a value.
+        found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
+        given = dict(zip(given[::2], found, strict=True))
     names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
     one = not isinstance(given, Mapping)
     values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)

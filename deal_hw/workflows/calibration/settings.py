@@ -28,7 +28,6 @@ from deal_hw.workflows.calibration.run import (
     SpaceOverrides,
     calibrate_episodes,
     residual_std,
-    residual_std_of,
 )
 from deal_hw.workflows.calibration.walking import WALK_TELLS
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, given, refuse
@@ -183,8 +182,7 @@ class CalibrateSettings(Checked):
             ConfigurationError: A number is missing, or is not above 0.
             UnknownNameError: A joint is not known.
         """
-        std = self.residual_std
-        return residual_std(std, robot) if isinstance(std, tuple) else residual_std_of(std, robot)
+        return residual_std(self.residual_std, robot)
 
     @property
     def provenance(self) -> dict[str, Any]:
