@@ -258,7 +258,7 @@ def test_what_is_calibrated_is_not_drawn_by_the_task() -> None:
 def test_specs_fit_their_robots_and_stay_inside_the_limits(spec: type[PolicySpec], robot: str) -> None:
     """What is trained here may be deployed there: no reachable target is outside the safety limits."""
     description = recorded_description(robot)
-    layout: PolicySpec = spec(description)  # type: ignore[call-arg, arg-type]
+    layout: PolicySpec = spec(description, "udr")  # type: ignore[call-arg, arg-type]
     layout.check_fits(description)
     low, high = np.array(description.limits.target).T
     middle = np.array(description.default_position) if description.actuation == "position" else np.zeros(8)
