@@ -1,6 +1,7 @@
 """What holds for all tests."""
 
-from pathlib import PurePosixPath
+import os
+from collections import Counter
 from typing import Any
 
 import pytest
@@ -10,17 +11,30 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("deal_hw", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("deal_hw")
 
-REAL_TIME = {"cli", "contracts", "control", "drivers", "tools", "workflows"}
-"""Folders of tests with processes that run in real time; two of these at once would disturb each other."""
+REAL_TIME = (
+    "cli/",
+    "contracts/",
+    "control/",
+    "data/test_data_recorder_process",
+    "drivers/",
+    "house/test_reproductions",
+    "house/test_robot_computer",
+    "tools/",
+    "workflows/",
+)
+"""Folders and files of tests with processes that run in real time; two at once would disturb each other."""
 
 COMPUTING = (
     "test_cartpole_can_firmware",
     "test_cartpole_protocol",
     "test_cartpole_stm32",
     "test_cartpole_truth",
-    "test_cli_calibrate_",
+    "test_cli_calibrate",
+    "test_cli_design_excitation",
     "test_cli_every_",
     "test_cli_keys",
+    "test_cli_options",
+    "test_cli_policy_refused",
     "test_contracts_parameters",
     "test_contracts_policy",
     "test_control_excitation",
@@ -42,14 +56,29 @@ COMPUTING = (
     "test_tools_check_readers",
     "test_tools_compare_rows",
     "test_tools_convert_so101",
+    "test_tools_draw_bench",
     "test_tools_measure_size",
     "test_tools_structure",
+    "test_tools_try_diffusion_regression",
+    "test_workflows_calibrate",
     "test_workflows_environments",
+    "test_workflows_examples.py::test_a_script_runs[calibrate_from_arrays]",
+    "test_workflows_examples.py::test_a_script_runs[make_crane]",
+    "test_workflows_examples.py::test_the_notebook_runs",
     "test_workflows_refusals",
     "test_workflows_robot",
     "test_workflows_run_",
 )
-"""Files of these folders that compute and nothing else, by how their names begin: they go to any worker."""
+"""Tests of these that compute and nothing else, by how their names begin: they go to any worker."""
+
+NICE = 10
+"""Added to the niceness of a worker that computes: tests in real time get their cores at once."""
+
+
+def real_time(nodeid: str) -> bool:
+    """Return whether a test runs processes in real time."""
+    path = nodeid.removeprefix("tests/")
+    return path.startswith(REAL_TIME) and not path.partition("/")[2].startswith(COMPUTING)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -59,9 +88,26 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Scheduling(LoadScopeScheduling):  # type: ignore[misc, unused-ignore]
         def _split_scope(self, nodeid: str) -> str:
-            file = nodeid.partition("::")[0]
-            path = PurePosixPath(file)
-            real_time = path.parts[1] in REAL_TIME and not path.name.startswith(COMPUTING)
-            return "real time" if real_time else file
+            return "real time" if real_time(nodeid) else nodeid.partition("::")[0]
 
+    config.option.loadscopereorder = False  # the order is that of pytest_collection_modifyitems
     return Scheduling(config, log)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Workers start with what lasts longest: tests in real time, then the files with the most slow tests."""
+    if hasattr(config, "workerinput"):
+        slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+        items.sort(key=lambda item: (not real_time(item.nodeid), -slow[item.path]))
+
+
+computing = False
+"""Whether this worker has begun to compute. Tests in real time come first: it is given no more of them."""
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Give the cores to the worker with the tests in real time, if that wants them."""
+    global computing
+    if hasattr(item.config, "workerinput") and not computing and not real_time(item.nodeid):
+        computing = True
+        os.nice(NICE)
