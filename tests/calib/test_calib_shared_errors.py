@@ -163,7 +163,7 @@ def test_a_shared_error_is_named(fault: SharedFault, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
     """A pendulum whose clock ran twice as fast: said before the search, the first alarm, the verdict."""
-    wrong = problem("pendulum", "fast-clock", tmp_path, 4.0)
+    wrong = problem("pendulum", "fast-clock", tmp_path, 2.0)
     said: list[Progress] = []
     result = calibrate_episodes(
         wrong.robot,
