@@ -25,9 +25,9 @@ from deal_hw.calibration import Budget, Progress
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.prepare import prepare, usual_method
 from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare, usual_method
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 KEY = ("task", "seed")
 

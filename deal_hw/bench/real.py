@@ -22,9 +22,9 @@ from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.model import HELDOUT_PART
+from deal_hw.workflows.calibration.prepare import prepare as prepare_recordings
 from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings
-from deal_hw.workflows.calibration.settings import prepare as prepare_recordings
 from deal_hw.workflows.say import aloud, silent
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")

@@ -34,9 +34,9 @@ from deal_hw.testing.plain_robots import (
     shared_words,
     write,
 )
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.prepare import prepare, usual_method
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare, usual_method
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 KEY = ("task", "fault", "seed")
 RIGHT = ""

@@ -14,7 +14,7 @@ from deal_hw.calibration import Budget
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.ranges import Range, check_ranges
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.options import Only, Ratio, Threads, refuse_others
 
 if TYPE_CHECKING:

@@ -20,8 +20,9 @@ from deal_hw.workflows.calibration.best_so_far import (
     watching,
 )
 from deal_hw.workflows.calibration.model import write_parameters
+from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
 from deal_hw.workflows.calibration.run import CalibrateReport, finish
-from deal_hw.workflows.calibration.settings import CalibrateSettings, calibrate_inputs, prepare, usual_method
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.say import aloud, silent
 
 __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_parameters"]

@@ -15,16 +15,10 @@ from typing import Any
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
-from deal_hw.workflows.calibration.model import DEFAULT, Recordings
+from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
 from deal_hw.workflows.calibration.recordings import Source
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S, CalibrationInputs, judged
-from deal_hw.workflows.calibration.settings import (
-    CalibrateSettings,
-    calibrate_inputs,
-    check_source,
-    prepare,
-    usual_method,
-)
+from deal_hw.workflows.calibration.settings import DEFAULT, CalibrateSettings, Recordings, check_source
 from deal_hw.workflows.say import Say, html_table, silent, text_table
 
 _HEAD = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")

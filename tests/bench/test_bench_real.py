@@ -12,7 +12,7 @@ import pytest
 from deal_hw.cli.bench import Bench, bench
 from deal_hw.cli.main import main
 from deal_hw.errors import ConfigurationError
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.settings import Recordings
 
 HINGE = """
 <mujoco model="hinge">

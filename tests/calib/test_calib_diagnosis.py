@@ -21,9 +21,9 @@ from deal_hw.calib.validation.verdict import trust, with_causes
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
 DAMPING = 2.0

@@ -17,8 +17,9 @@ from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
+from deal_hw.workflows.calibration.prepare import usual_method
 from deal_hw.workflows.calibration.run import CalibrationInputs
-from deal_hw.workflows.calibration.settings import CalibrateSettings, usual_method
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 
 SHARE = 0.04
 """Standard deviation of each parameter before."""

@@ -24,8 +24,8 @@ from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import Recordings, prepare_model
-from deal_hw.workflows.calibration.run import SpaceOverrides
+from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 HINGE = """
 <mujoco model="hinge">
@@ -82,8 +82,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=None)
-    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1)
+    work = prepare(CalibrateSettings(recordings=source, threads=1))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

@@ -19,8 +19,8 @@ from deal_hw.calib.uncertainty.time_steps import (
     step_alarm,
 )
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import Recordings, prepare_model
-from deal_hw.workflows.calibration.run import SpaceOverrides
+from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 HINGE = """
 <mujoco model="hinge">
@@ -70,8 +70,7 @@ def checked(
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=None)
-    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1)
+    work = prepare(CalibrateSettings(recordings=source, threads=1))
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = local_fit(problem, None)
     assert fit is not None

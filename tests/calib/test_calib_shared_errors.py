@@ -27,9 +27,9 @@ from deal_hw.calib.validation.verdict import Validation, trust, unexplained
 from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 SAMPLES, JOINTS, ACTUATED = 7, 4, (0, 1, 3)
 

@@ -21,8 +21,8 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
-from deal_hw.workflows.calibration.model import Recordings
-from deal_hw.workflows.calibration.settings import prepare
+from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 

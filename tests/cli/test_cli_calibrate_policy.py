@@ -14,7 +14,7 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, InsufficientDataError
-from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, check_plan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy

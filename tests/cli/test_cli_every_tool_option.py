@@ -318,7 +318,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
     """Note all that a calibration is called with, and what its result goes into."""
     from deal_hw.cli import calibrate
-    from deal_hw.workflows.calibration import settings
+    from deal_hw.workflows.calibration import prepare
 
     def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
         rest.pop("progress"), rest.pop("say")
@@ -335,7 +335,7 @@ def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
         yield None
 
     monkeypatch.setattr(calibrate, "watching", watching)
-    monkeypatch.setattr(settings, "calibrate_episodes", search)
+    monkeypatch.setattr(prepare, "calibrate_episodes", search)
     monkeypatch.setattr(calibrate, "finish", finish)
 
 

@@ -31,7 +31,7 @@ GONE = {
     r"\bdroop": "gravity gain, sag",
     r"hand_?over\.py|control\.handover": "process_channel",
     r"\bcadence|Cadence": "loop timing",
-    r"narrowing": "SpaceOverrides",
+    r"narrowing": "searched",
     r"\bchart coordinates|chart_base": "tangent coordinates",
     r"\bhonest(y|_|:)|bench honest": "fixed-range, realism",
     r"\bP-D\b": "PD",

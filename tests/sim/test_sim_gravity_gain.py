@@ -10,8 +10,8 @@ import pytest
 from deal_hw.sim.recordings.gravity_gain import GravityGain, gravity_gain
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration import checks
-from deal_hw.workflows.calibration.model import Recordings
-from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare
+from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

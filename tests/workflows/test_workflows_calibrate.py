@@ -15,8 +15,8 @@ import deal_hw
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import Recordings, searched_space
-from deal_hw.workflows.calibration.run import SpaceOverrides
+from deal_hw.workflows.calibration.model import searched_space
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 
 Arrays = dict[str, FloatArray]
 T = np.arange(400) * 0.01
@@ -155,8 +155,7 @@ def test_what_the_model_has_as_zero_is_said(pendulum: tuple[Path, Path, Path]) -
     model = mujoco.MjModel.from_xml_path(str(pendulum[0]))
     model.dof_frictionloss[:] = 0
     said: list[str] = []
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=None)
-    searched_space(Recordings(), overrides, model, said.append)
+    searched_space(CalibrateSettings(), model, said.append)
     assert said == [
         "not searched, because they are 0 in the model: dof_frictionloss of pivot. If the robot has them, "
         "write values above 0 into the MJCF"

@@ -3,40 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw.errors import MissingExtraError
-from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.checks import require_base
-from deal_hw.workflows.calibration.dataset import DatasetRecordings, choose_episodes, sound_recordings
-from deal_hw.workflows.calibration.model import Recordings, heldout_share, parts_to_calibrate, searched_space
+from deal_hw.workflows.calibration.dataset import choose_episodes, sound_recordings
+from deal_hw.workflows.calibration.model import heldout_share, parts_to_calibrate, searched_space
 from deal_hw.workflows.calibration.recordings import aligned
-from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
+from deal_hw.workflows.calibration.run import CalibrationInputs
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.robot import recorded_robot
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
-    from deal_hw.sim.engine.model import RobotModel
+    pass
 
 
-def prepare_carried(
-    source: DatasetRecordings,
-    config: Recordings,
-    overrides: SpaceOverrides,
-    *,
-    std: Callable[[RobotModel], FloatArray | None],
-    threads: int | None = None,
-    say: Say = silent,
-) -> CalibrationInputs:
+def prepare_carried(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> CalibrationInputs:
     """Read a dataset with its own robot.yaml; its recordings are used like those of any user's robot.
 
     Args:
-        source: The recordings.
-        config: How they are used.
-        overrides: Changes of the parameters by the command line.
-        std: Standard deviation of the prediction error, as in :class:`deal_hw.calib.data.problem.Problem`.
-        threads: Simulation threads.
+        settings: The settings; they name a dataset.
+        holdout: Held-out episodes; empty: those of the motion `chirp`.
         say: Called with sentences on findings.
 
     Raises:
@@ -52,17 +42,18 @@ def prepare_carried(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
-    share = heldout_share(config, source.holdout)
-    dataset = Dataset.open(source.folder)
-    description = recorded_robot(dataset.description, source.folder)
-    fit, held = choose_episodes(dataset, source.episodes, source.holdout, say)
+    config, folder = settings.recordings, Path(str(settings.dataset))
+    share = heldout_share(config, holdout)
+    dataset = Dataset.open(folder)
+    description = recorded_robot(dataset.description, folder)
+    fit, held = choose_episodes(dataset, settings.episodes, holdout, say)
     if held and config.holdout_part is None:
         share = 0.0
     trajectories, telemetry = sound_recordings(
-        {i: dataset.read(i).trajectory for i in (*fit, *held)}, source.folder, source.spikes, say
+        {i: dataset.read(i).trajectory for i in (*fit, *held)}, folder, settings.spikes, say
     )
     model = compile_mjcf(description.mjcf)
-    space = searched_space(config, overrides, model, say)
+    space = searched_space(settings, model, say)
     timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
     rates = sampling(1.0 / description.state_rate_hz, timestep, config.window)
     description = dataclasses.replace(
@@ -77,18 +68,10 @@ def prepare_carried(
     episodes = {
         i: aligned(recording, robot, feet, dataset.path(i).name) for i, recording in recordings.items()
     }
-    if source.sample_hz is not None:
-        episodes = {i: thin(episode, source.sample_hz) for i, episode in episodes.items()}
+    if settings.sample_hz is not None:
+        episodes = {i: thin(episode, settings.sample_hz) for i, episode in episodes.items()}
     parts, judge = parts_to_calibrate(
-        robot,
-        space,
-        [episodes[i] for i in fit],
-        [episodes[i] for i in held],
-        config,
-        share=share,
-        std=std,
-        threads=threads,
-        say=say,
+        settings, robot, space, [episodes[i] for i in fit], [episodes[i] for i in held], share, say
     )
     return CalibrationInputs(
         robot=robot,
@@ -98,7 +81,7 @@ def prepare_carried(
         shown=trajectories[fit[0]],
         telemetry=telemetry,
         provenance={
-            "dataset": str(source.folder),
+            "dataset": str(folder),
             "description_digest": dataset.digest,
             "episodes": list(fit),
             "holdout": list(held) or f"last {share:.0%} of each recording",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +11,15 @@ import numpy as np
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS
 from deal_hw.calibration import listed
 from deal_hw.data.recording.episode_info import motion_of
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.data.recording.spikes import SpikeSettings
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import parameter_spaces
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 from deal_hw.workflows.calibration.policy import recorded_policy
-from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
+from deal_hw.workflows.calibration.run import CalibrationInputs
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.calibration.walking import all_walk, weighed, while_walking
 from deal_hw.workflows.robot import recorded_robot
 from deal_hw.workflows.say import Say, silent
@@ -35,39 +35,12 @@ SAMPLES_A_PERIOD = 4
 """Fitted states per control period."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetRecordings:
-    """Recordings of a dataset.
-
-    Attributes:
-        folder: The dataset.
-        episodes: Fitted episodes; empty: all but the held-out ones.
-        holdout: Held-out episodes; empty: those of the motion `chirp`.
-        parameters: File of parameters that are searched beside the robot's set; None for none.
-        policy: File of the policy that moved the robot; None: the copy in the dataset.
-        sample_hz: Rate of the fitted states; None: four per control period.
-        spikes: Definition of a spike.
-    """
-
-    folder: Path
-    episodes: Sequence[int] = ()
-    holdout: Sequence[int] = ()
-    parameters: Path | None = None
-    policy: Path | None = None
-    sample_hz: float | None = None
-    spikes: SpikeSettings = DEFAULT_SPIKES
-
-
-def prepare_dataset(
-    source: DatasetRecordings, space_name: str, overrides: SpaceOverrides, method: str, say: Say = silent
-) -> CalibrationInputs:
+def prepare_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> CalibrationInputs:
     """Read a dataset of a robot of deal-hw.
 
     Args:
-        source: The recordings.
-        space_name: Name of the robot's parameter set; "" for its first.
-        overrides: Changes of the set.
-        method: Name of the method: some need the recordings' policy.
+        settings: The settings; they name a dataset.
+        holdout: Held-out episodes; empty: those of the motion `chirp`.
         say: Called with sentences on findings in the recordings.
 
     Raises:
@@ -75,26 +48,28 @@ def prepare_dataset(
     """
     from deal_hw.data.recording.dataset import Dataset
 
-    dataset = Dataset.open(source.folder)
+    folder = Path(str(settings.dataset))
+    dataset = Dataset.open(folder)
     robot_name = dataset.description["name"]
-    description = recorded_robot(dataset.description, source.folder)
-    fit, holdout = choose_episodes(dataset, source.episodes, source.holdout, say)
+    description = recorded_robot(dataset.description, folder)
+    fit, holdout = choose_episodes(dataset, settings.episodes, holdout, say)
     robot = _model(description)
-    space = named_space(robot_name, space_name)
-    if source.parameters is not None:
-        space = _extended(space, source.parameters, robot)
-    space = overrides.apply(space)
+    space = named_space(robot_name, settings.space)
+    if settings.recordings.parameters is not None:
+        space = _extended(space, settings.recordings.parameters, robot)
+    space = settings.searched(space)
     episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
-    if method in CLOSED_LOOP_METHODS:
+    if settings.method in CLOSED_LOOP_METHODS:
         runs = {i: episodes_read[i].metadata for i in fit}
-        policy = recorded_policy(dataset, runs, description, source.policy)
+        given = None if settings.policy is None else Path(settings.policy)
+        policy = recorded_policy(dataset, runs, description, given)
     recordings, telemetry = sound_recordings(
-        {i: episode.trajectory for i, episode in episodes_read.items()}, source.folder, source.spikes, say
+        {i: episode.trajectory for i, episode in episodes_read.items()}, folder, settings.spikes, say
     )
     space = without_speed_limits(space, description, recordings.values(), say)
     names = {i: dataset.path(i).name for i in recordings}
-    episodes = _simulation(robot, recordings, names, source.sample_hz)
+    episodes = _simulation(robot, recordings, names, settings.sample_hz)
     walks = all_walk(robot, recordings.values())
     if walks:
         space = weighed(space, robot, recordings[fit[0]], say)
@@ -106,12 +81,12 @@ def prepare_dataset(
         shown=recordings[fit[0]],
         telemetry=telemetry,
         provenance={
-            "dataset": str(source.folder),
+            "dataset": str(folder),
             "description_digest": dataset.digest,
             "episodes": list(fit),
             "holdout": list(holdout),
         },
-        advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {source.folder}",
+        advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {folder}",
         balance=balancer(robot.description, None),
         name="" if robot.base is not None else robot.description.name,
         policy=policy,

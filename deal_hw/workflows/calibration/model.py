@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, MissingExtraError, short
 from deal_hw.parameters import ParameterSpace
-from deal_hw.ranges import Checked, Range
-from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.checks import (
     examine_recording,
     require_base,
@@ -31,67 +27,17 @@ from deal_hw.workflows.calibration.recordings import (
     seconds_of,
     without,
 )
-from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
+from deal_hw.workflows.calibration.run import CalibrationInputs
+from deal_hw.workflows.calibration.settings import DEFAULT, CalibrateSettings, Recordings
 from deal_hw.workflows.options import File
 from deal_hw.workflows.robot import carries_robot, recorded_robot
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
 
 HELDOUT_PART = 0.25
-DEFAULT = "default"
-"""Name of the default method."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recordings(Checked):
-    """Any robot: its MuJoCo model and its recordings (page 'Your own robot' of the documentation)."""
-
-    model: Path | None = None
-    """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
-
-    data: tuple[Path, ...] = ()
-    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
-
-    columns: Path | None = None
-    """Column map (YAML; page 'Use your recordings' of the documentation). Without one, the meaning of the
-    channels is guessed from their names."""
-
-    parameters: Path | None = None
-    """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
-    of every joint and gain of every actuator of the model. With a dataset of a robot with a driver: what to
-    search beside its set."""
-
-    write_parameters: Path | None = None
-    """Write a --parameters file for --model, to edit, and end."""
-
-    feet: tuple[str, ...] = ()
-    """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
-    recordings must contain the base's orientation and gyro."""
-
-    holdout_part: Annotated[float | None, Range(0, 0.95)] = None
-    """Share of each recording, its last part, that is held out to test the result, without --holdout; 0.25 by
-    default, 0 for none."""
-
-    leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
-    """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
-
-    fit_seconds: Annotated[float, Range(0.1, 1e5, "s")] = 60.0
-    """Fit this many seconds, in parts that lie evenly over the recordings; more is slower."""
-
-    window: Annotated[float, Range(1e-3, 60, "s")] = 0.4
-    """Length of the longest prediction windows of the search [s]; the search begins with a quarter of it.
-    Longer windows show slow effects (weight, static friction); their memory grows with the square of their
-    samples."""
-
-    physics_step: Annotated[float | None, Range(1e-6, 0.1, "s")] = None
-    """Requested physics step [s]; by default the MJCF's timestep. It is adjusted to a whole number of steps
-    per sampling period."""
-
-    force: bool = False
-    """Use recordings although a plausibility check failed."""
 
 
 def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
@@ -124,26 +70,14 @@ def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
 
 
 def prepare_model(
-    config: Recordings,
-    holdout: Sequence[Source],
-    overrides: SpaceOverrides,
-    *,
-    std: Callable[[RobotModel], FloatArray | None],
-    data: Sequence[Source] = (),
-    spikes: SpikeSettings = DEFAULT_SPIKES,
-    threads: int | None = None,
-    say: Say = silent,
+    settings: CalibrateSettings, holdout: Sequence[Source], data: Sequence[Source], say: Say
 ) -> CalibrationInputs:
     """Read and check everything that a calibration of any robot needs, in a short time.
 
     Args:
-        config: Model and recordings.
+        settings: The settings; they name a model.
         holdout: Recordings that only judge the result.
-        overrides: Changes of the parameters by the command line.
-        std: Standard deviation of the prediction error, as in :class:`deal_hw.calib.data.problem.Problem`.
         data: More recordings to fit, also from memory.
-        spikes: Definition of a spike.
-        threads: Simulation threads.
         say: Called with sentences on guesses and doubts.
 
     Raises:
@@ -161,6 +95,7 @@ def prepare_model(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
+    config, spikes = settings.recordings, settings.spikes
     share = heldout_share(config, holdout)
     data = (*config.data, *data)
     if config.model is None or not data:
@@ -175,7 +110,7 @@ def prepare_model(
         )
 
     model = compile_mjcf(config.model)
-    space = searched_space(config, overrides, model, say)
+    space = searched_space(settings, model, say)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
     said: dict[str, str] = {}
@@ -205,9 +140,7 @@ def prepare_model(
         [aligned(r, robot, config.feet, name) for name, r in recordings]
         for recordings in (fit_recordings, held_recordings)
     )
-    episodes, judge = parts_to_calibrate(
-        robot, space, episodes, judge, config, share=share, std=std, threads=threads, say=say
-    )
+    episodes, judge = parts_to_calibrate(settings, robot, space, episodes, judge, share, say)
     return CalibrationInputs(
         robot=robot,
         space=space,
@@ -252,36 +185,32 @@ def method_for(work: CalibrationInputs, *, fit_given: bool, real: bool) -> str:
 
 
 def parts_to_calibrate(
+    settings: CalibrateSettings,
     robot: RobotModel,
     space: ParameterSpace,
     episodes: Sequence[SampledEpisode],
     judge: Sequence[SampledEpisode],
-    config: Recordings,
-    *,
     share: float,
-    std: Callable[[RobotModel], FloatArray | None],
-    threads: int | None,
     say: Say,
 ) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
     """Return the fitted and the held-out recordings, checked against the parameters.
 
     Args:
+        settings: How recordings are used.
         robot: The nominal model.
         space: The parameters.
         episodes: Recordings to fit.
         judge: Held-out recordings.
-        config: How recordings are used.
         share: Share of each fitted recording, its last part, that is held out as well.
-        std: Standard deviation of the prediction error.
-        threads: Simulation threads.
         say: Called with sentences on doubts.
 
     Raises:
         InsufficientDataError: The recordings are too short, do not move, or do not depend on a parameter.
     """
+    config, std = settings.recordings, settings.known_std(robot)
     parts, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
     warn_of_gravity(robot, space, parts, say)
-    require_sensitive_parameters(robot, space, parts, std(robot), config.window, threads, say)
+    require_sensitive_parameters(robot, space, parts, std, config.window, settings.threads, say)
     return parts, judge
 
 
@@ -295,11 +224,10 @@ def heldout_share(config: Recordings, holdout: Sequence[object]) -> float:
         raise ConfigurationError("give --holdout or --holdout-part, not both")
     if holdout:
         return 0.0
-    share = HELDOUT_PART if config.holdout_part is None else config.holdout_part
-    return share
+    return HELDOUT_PART if config.holdout_part is None else config.holdout_part
 
 
-def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any, say: Say) -> ParameterSpace:
+def searched_space(settings: CalibrateSettings, model: Any, say: Say) -> ParameterSpace:
     """Return the parameters to search of a user's model; report what is not searched as it is 0 there.
 
     Raises:
@@ -309,7 +237,7 @@ def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any, sa
     from deal_hw.sim.parameters.template import left_at_zero, template
     from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
-    if config.parameters is None:
+    if settings.recordings.parameters is None:
         zero = [f"{kind} of {short(', '.join(names))}" for kind, names in left_at_zero(model).items()]
         if zero:
             say(
@@ -318,7 +246,7 @@ def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any, sa
             )
         space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
     else:
-        space = read_space(config.parameters, model)
-    space = overrides.apply(space)
+        space = read_space(settings.recordings.parameters, model)
+    space = settings.searched(space)
     check_space(model, space)
     return space

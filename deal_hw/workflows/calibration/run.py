@@ -81,45 +81,6 @@ class CalibrationInputs:
         return GAIT_SMOOTHING_S if self.walks else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpaceOverrides:
-    """Changes of a parameter space by the command line.
-
-    Attributes:
-        free: Search exactly these; empty: the space's own choice.
-        known: Values measured by other means, by name (SI).
-        ranges: Other ranges: name, low, high (SI).
-        range_ratio: Log ranges go from nominal / range_ratio to nominal * range_ratio; None: the space's own
-            ranges.
-    """
-
-    free: Sequence[str]
-    known: Mapping[str, float]
-    ranges: Sequence[tuple[str, float, float]]
-    range_ratio: float | None
-
-    def apply(self, space: ParameterSpace) -> ParameterSpace:
-        """Return the changed space.
-
-        Raises:
-            UnknownNameError: A name is not known; the message lists the names.
-            ConfigurationError: A range is empty, reversed, or excludes the nominal value; or no parameter is
-                left.
-        """
-        if self.free:
-            space = space.with_free(self.free)
-        if self.range_ratio is not None:
-            space = space.with_ratio(self.range_ratio)
-        space = space.with_known(self.known)
-        for parameter, low, high in self.ranges:
-            space = space.with_range(parameter, low, high)
-        if not len(space):
-            raise ConfigurationError(
-                "every parameter is known, so there is nothing to search; remove one from --known"
-            )
-        return space
-
-
 @dataclass(frozen=True, kw_only=True)
 class CalibrateReport:
     """What a calibration wrote.

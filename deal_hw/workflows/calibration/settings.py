@@ -1,4 +1,4 @@
-"""Settings of a calibration, and the functions that read and check their inputs."""
+"""Settings of a calibration."""
 
 from __future__ import annotations
 
@@ -7,35 +7,78 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-
 from deal_hw.calib.pipeline.methods import check_method, usual_budget
-from deal_hw.calibration import LATENCY_RANGE_S, Budget, CalibrationResult, ProgressCallback
+from deal_hw.calibration import LATENCY_RANGE_S, Budget
 from deal_hw.data.files import dataset_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError
-from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.carried import prepare_carried
-from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
-from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
 from deal_hw.workflows.calibration.policy import check_policy
 from deal_hw.workflows.calibration.recordings import Source
 from deal_hw.workflows.calibration.run import (
     HELDOUT_WINDOW_S,
-    CalibrationInputs,
-    SpaceOverrides,
-    calibrate_episodes,
     residual_std,
 )
-from deal_hw.workflows.calibration.walking import WALK_TELLS
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, given, refuse
 from deal_hw.workflows.robot import carries_robot
-from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
+
+DEFAULT = "default"
+"""Name of the default method."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recordings(Checked):
+    """Any robot: its MuJoCo model and its recordings (page 'Your own robot' of the documentation)."""
+
+    model: Path | None = None
+    """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
+
+    data: tuple[Path, ...] = ()
+    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
+
+    columns: Path | None = None
+    """Column map (YAML; page 'Use your recordings' of the documentation). Without one, the meaning of the
+    channels is guessed from their names."""
+
+    parameters: Path | None = None
+    """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
+    of every joint and gain of every actuator of the model. With a dataset of a robot with a driver: what to
+    search beside its set."""
+
+    write_parameters: Path | None = None
+    """Write a --parameters file for --model, to edit, and end."""
+
+    feet: tuple[str, ...] = ()
+    """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
+    recordings must contain the base's orientation and gyro."""
+
+    holdout_part: Annotated[float | None, Range(0, 0.95)] = None
+    """Share of each recording, its last part, that is held out to test the result, without --holdout; 0.25 by
+    default, 0 for none."""
+
+    leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
+    """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
+
+    fit_seconds: Annotated[float, Range(0.1, 1e5, "s")] = 60.0
+    """Fit this many seconds, in parts that lie evenly over the recordings; more is slower."""
+
+    window: Annotated[float, Range(1e-3, 60, "s")] = 0.4
+    """Length of the longest prediction windows of the search [s]; the search begins with a quarter of it.
+    Longer windows show slow effects (weight, static friction); their memory grows with the square of their
+    samples."""
+
+    physics_step: Annotated[float | None, Range(1e-6, 0.1, "s")] = None
+    """Requested physics step [s]; by default the MJCF's timestep. It is adjusted to a whole number of steps
+    per sampling period."""
+
+    force: bool = False
+    """Use recordings although a plausibility check failed."""
+
 
 OF_DATASETS = ("episodes", "space", "sample_hz")
 """Settings for datasets only."""
@@ -200,11 +243,30 @@ class CalibrateSettings(Checked):
         return {**noted, "residual_std": given}
 
     @property
-    def overrides(self) -> SpaceOverrides:
-        """Changes of the parameters."""
-        return SpaceOverrides(
-            free=self.free, known=dict(self.known), ranges=self.range, range_ratio=self.range_ratio
-        )
+    def spikes(self) -> SpikeSettings:
+        """Definition of a spike."""
+        return SpikeSettings(ratio=self.spike_ratio)
+
+    def searched(self, space: ParameterSpace) -> ParameterSpace:
+        """Return a parameter set with the changes of the settings.
+
+        Raises:
+            UnknownNameError: A name is not known; the message lists the names.
+            ConfigurationError: A range is empty, reversed, or excludes the nominal value; or no parameter is
+                left.
+        """
+        if self.free:
+            space = space.with_free(self.free)
+        if self.range_ratio is not None:
+            space = space.with_ratio(self.range_ratio)
+        space = space.with_known(dict(self.known))
+        for parameter, low, high in self.range:
+            space = space.with_range(parameter, low, high)
+        if not len(space):
+            raise ConfigurationError(
+                "every parameter is known, so there is nothing to search; remove one from --known"
+            )
+        return space
 
 
 def check_source(*, dataset: Path | str | None, model: bool, data: bool) -> None:
@@ -231,116 +293,3 @@ def check_source(*, dataset: Path | str | None, model: bool, data: bool) -> None
             "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
             f"(deal-hw calibrate --model robot.xml --data rec.csv), {how}"
         )
-
-
-def prepare(
-    settings: CalibrateSettings,
-    *,
-    data: Sequence[Source] = (),
-    holdout: Sequence[Any] | None = None,
-    say: Say = silent,
-) -> CalibrationInputs:
-    """Read and check the inputs of a calibration.
-
-    Args:
-        settings: The settings.
-        data: More recordings to fit, also from memory.
-        holdout: Held-out recordings, also from memory; by default those of the settings.
-        say: Called with sentences on guesses and doubts.
-
-    Raises:
-        DealHwError: A setting or a recording is unusable.
-    """
-    judges = settings.holdout if holdout is None else holdout
-    spikes = SpikeSettings(ratio=settings.spike_ratio)
-    if settings.recordings.model is not None:
-        numbers = " ".join(str(one) for one in judges if isinstance(one, int))
-        if numbers:
-            raise ConfigurationError(
-                f"--holdout {numbers}: with --model give recordings; episode numbers go with a dataset"
-            )
-        return prepare_model(
-            settings.recordings,
-            judges,
-            settings.overrides,
-            std=settings.known_std,
-            data=data,
-            spikes=spikes,
-            threads=settings.threads,
-            say=say,
-        )
-    wrong = [str(one) for one in judges if not isinstance(one, int)]
-    if wrong:
-        raise ConfigurationError(
-            f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
-        )
-    if settings.dataset is None:
-        raise ConfigurationError("no dataset was named")
-    source = DatasetRecordings(
-        folder=Path(settings.dataset),
-        episodes=settings.episodes,
-        holdout=[int(str(one)) for one in judges],
-        parameters=settings.recordings.parameters,
-        policy=None if settings.policy is None else Path(settings.policy),
-        sample_hz=settings.sample_hz,
-        spikes=spikes,
-    )
-    if carries_robot(settings.dataset):
-        return prepare_carried(
-            source,
-            settings.recordings,
-            settings.overrides,
-            std=settings.known_std,
-            threads=settings.threads,
-            say=say,
-        )
-    return prepare_dataset(source, settings.space, settings.overrides, settings.method, say)
-
-
-def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say = silent) -> str:
-    """Return the named method, or the one that suits the recordings."""
-    if settings.method != DEFAULT:
-        return settings.method
-    fit_given = settings.residual_std not in ((), None) or not settings.refine
-    real = settings.recordings.model is not None or carries_robot(settings.dataset)
-    method = method_for(work, fit_given=fit_given, real=real)
-    if work.walks and not fit_given:
-        say(WALK_TELLS)
-    if method != DEFAULT:
-        say(f"method: {method} (alternative: --method eki, which searches and refines to the sensor noise)")
-    return method
-
-
-def calibrate_inputs(
-    settings: CalibrateSettings,
-    work: CalibrationInputs,
-    method: str,
-    *,
-    progress: ProgressCallback | None = None,
-    say: Say = silent,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    keep: Path | None = None,
-) -> CalibrationResult:
-    """Calibrate from the inputs with the settings; see :func:`calibrate_episodes`."""
-    return calibrate_episodes(
-        work.robot,
-        work.space,
-        work.episodes,
-        work.holdout,
-        method=method,
-        budget=settings.budget,
-        rng=np.random.default_rng(settings.seed),
-        latency_s=settings.latency,
-        latency_range_s=settings.latency_range,
-        threads=settings.threads,
-        progress=progress,
-        say=say,
-        checkpoint=checkpoint,
-        resume=resume,
-        keep=keep,
-        known_std=settings.known_std(work.robot),
-        heldout_window_s=settings.heldout_window,
-        policy=work.policy,
-        smoothing_s=work.smoothing_s,
-    )
