@@ -252,7 +252,8 @@ class Shooting:
             hessian += np.einsum("wri,wrj->ij", jp, jp)
             gradient += np.einsum("wri,wr->i", jp, r_flat)
             cost += float(np.sum(r_flat**2))
-            count += r_flat.size
+            # Samples that filled a gap have an infinite standard deviation: they are no measurements.
+            count += int(np.isfinite(data.std).sum())
             if self.given:
                 back.append((np.zeros((W, 2 * C, K + 1)), np.zeros((W, 2 * C))))
                 if keep:
@@ -270,7 +271,7 @@ class Shooting:
             hessian -= np.einsum("wsi,wsj->ij", msp, solved[..., :-1])
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
-            count += W * int(data.prior_counts.sum()) - W * 2 * C
+            count += int((np.isfinite(data.prior_std) & data.prior_counts).sum()) - W * 2 * C
         found = tuple(residuals), self.prior_information, tuple(back), tuple(rows)
         return Normal(cost, count, hessian, gradient, *found)
 

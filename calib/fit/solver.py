@@ -296,16 +296,18 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
 def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
     """Return one plus twice the sum of the residuals' correlations up to their first zero, at least 1.
 
-    Residuals are whitened, (W, H, M) per episode; lags end at ``longest`` samples.
+    Residuals are whitened, (W, H, M) per episode, and 0 for missing samples, which do not count; lags end at
+    ``longest`` samples.
     """
     longest = min(longest, max(r.shape[1] for r in residuals) - 1)
     total = sum(float(np.sum(r**2)) for r in residuals)
-    worth, count = 1.0, sum(r.size for r in residuals)
+    worth, count = 1.0, sum(map(np.count_nonzero, residuals))
     for lag in range(1, longest + 1):
         product, pairs = 0.0, 0
         for r in residuals:
-            product += float(np.sum(r[:, lag:] * r[:, :-lag]))
-            pairs += r[:, lag:].size
+            products = r[:, lag:] * r[:, :-lag]
+            product += float(np.sum(products))
+            pairs += np.count_nonzero(products)
         correlation = product / max(pairs, 1) / max(total / max(count, 1), 1e-300)
         if correlation <= 0:
             break

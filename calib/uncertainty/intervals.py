@@ -129,17 +129,19 @@ def correlation_time(residuals: tuple[FloatArray, ...]) -> float:
     """Return the integrated autocorrelation time of whitened residuals, (W, H, J) each, in samples.
 
     It is that of the worst channel, over all recordings: each recording alone is short, and the worst of many
-    would be far from white by chance. White residuals have 1.
+    would be far from white by chance. White residuals have 1. Samples that filled a gap do not count: their
+    whitened residual is exactly 0.
     """
     worst = 1.0
     for channel in zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True):
-        power = sum(float(np.sum(r**2)) for r in channel) / sum(r.size for r in channel)
+        power = sum(float(np.sum(r**2)) for r in channel) / max(sum(map(np.count_nonzero, channel)), 1)
         if power <= 0:
             continue
         total = 1.0
         for lag in range(1, min(SETTINGS.lags, channel[0].shape[1] - 1) + 1):
-            pairs = sum(r[:, lag:].size for r in channel)
-            rho = sum(float(np.sum(r[:, lag:] * r[:, :-lag])) for r in channel) / (pairs * power)
+            products = [r[:, lag:] * r[:, :-lag] for r in channel]
+            pairs = max(sum(map(np.count_nonzero, products)), 1)
+            rho = sum(float(np.sum(p)) for p in products) / (pairs * power)
             if rho <= 2.0 / np.sqrt(pairs):
                 break
             total += 2 * rho

@@ -21,6 +21,7 @@ from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
+from deal_hw.calib.fit.solver import correlated_samples
 from deal_hw.calib.pipeline import stages
 from deal_hw.calib.pipeline.methods import make_method, usual_budget
 from deal_hw.calib.pipeline.stages import (
@@ -289,6 +290,29 @@ def test_rounding_of_an_encoder_is_no_jitter() -> None:
     found = noise_model([(np.round(motion / count) * count)[:, None]], [speed[:, None]])
     assert found.timing_std_s < 1e-5
     assert found.position_std[0] == pytest.approx(count / np.sqrt(12), rel=0.2)
+
+
+def test_filled_gaps_are_no_measurements() -> None:
+    """Interpolated samples, which are not fitted, change neither chi2's count nor the autocorrelation."""
+    white = np.random.default_rng(0).standard_normal((40, 201, 1))
+    whole = white[:, 1:] + white[:, :-1]
+    lost = np.where(np.random.default_rng(1).random(whole.shape) < 0.4, 0.0, whole)
+    assert correlation_time((lost,)) == pytest.approx(correlation_time((whole,)), abs=0.1)
+    assert correlated_samples([lost], 1) == pytest.approx(correlated_samples([whole], 1), abs=0.1)
+
+
+def test_chi2_counts_only_reported_samples(noisy_problem: Problem) -> None:
+    """With a third of the samples lost, the count of residuals is a third smaller, not the same."""
+    whole = Shooting(noisy_problem, 20)
+    lost = [np.arange(d.std.shape[1]) % 3 == 1 for d in whole.data]
+    data = [
+        dataclasses.replace(d, std=np.where(m[:, None], np.inf, d.std))
+        for d, m in zip(whole.data, lost, strict=True)
+    ]
+    part = whole.on(data)
+    counts = [s.normal(s.start(noisy_problem.space.nominal, 0.0)).count for s in (whole, part)]
+    missing = sum(np.isinf(d.std).sum() for d in data)
+    assert counts[0] - counts[1] == missing > 0.3 * counts[0]
 
 
 def test_correlation_time_by_hand() -> None:
