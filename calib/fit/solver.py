@@ -307,7 +307,7 @@ def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
         for r in residuals:
             products = r[:, lag:] * r[:, :-lag]
             product += float(np.sum(products))
-            pairs += np.count_nonzero(products)
+            pairs += int(np.count_nonzero(products))
         correlation = product / max(pairs, 1) / max(total / max(count, 1), 1e-300)
         if correlation <= 0:
             break

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_law
+from scipy.stats import norm, truncnorm
 from scipy.stats import t as t_law
-from scipy.stats import truncnorm
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
@@ -29,6 +29,7 @@ class MismatchSettings:
     Attributes:
         chi2: Mean squared residual over the noise variance above which the model is wrong [-].
         correlation_samples: Autocorrelation time above which it is wrong [samples].
+        false_alarms: Probability of the alarm where every channel's time is at that limit [-].
         negligible_chi2: Residuals this far below the noise need no explanation, autocorrelated or not [-].
         white_samples: Longest autocorrelation time of a local fit that needs no search [samples]: beyond it
             the fit may be in another minimum. Cart-poles with sensors, 15 tuning seeds of ratio 5 and 20: the
@@ -40,6 +41,7 @@ class MismatchSettings:
 
     chi2: float = 1.3
     correlation_samples: float = 2.0
+    false_alarms: float = 0.05
     negligible_chi2: float = 0.5
     white_samples: float = 1.2
     evidence: float = 20.0
@@ -125,27 +127,36 @@ class PosteriorShape:
     bound: npt.NDArray[np.int64]
 
 
-def correlation_time(residuals: tuple[FloatArray, ...]) -> float:
+def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:
     """Return the integrated autocorrelation time of whitened residuals, (W, H, J) each, in samples.
 
     It is that of the worst channel, over all recordings: each recording alone is short, and the worst of many
     would be far from white by chance. White residuals have 1. Samples that filled a gap do not count: their
     whitened residual is exactly 0.
+
+    Args:
+        residuals: The residuals.
+        chance: Return a lower bound instead, which the true time of any channel is below with this
+            probability.
     """
     worst = 1.0
-    for channel in zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True):
-        power = sum(float(np.sum(r**2)) for r in channel) / max(sum(map(np.count_nonzero, channel)), 1)
+    channels = list(zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True))
+    below = 0.0 if chance is None else float(norm.ppf(1 - chance / len(channels)))
+    for channel in channels:
+        count = max(sum(map(np.count_nonzero, channel)), 1)
+        power = sum(float(np.sum(r**2)) for r in channel) / count
         if power <= 0:
             continue
-        total = 1.0
+        total, used = 1.0, 0
         for lag in range(1, min(SETTINGS.lags, channel[0].shape[1] - 1) + 1):
             products = [r[:, lag:] * r[:, :-lag] for r in channel]
             pairs = max(sum(map(np.count_nonzero, products)), 1)
             rho = sum(float(np.sum(p)) for p in products) / (pairs * power)
             if rho <= 2.0 / np.sqrt(pairs):
                 break
-            total += 2 * rho
-        worst = max(worst, total)
+            total, used = total + 2 * rho, lag
+        # Standard error of a time summed up to a lag: Madras and Sokal (1988).
+        worst = max(worst, total * (1 - below * np.sqrt(2 * (2 * used + 1) / count)))
     return worst
 
 
@@ -177,6 +188,7 @@ def uncertainty(
     """
     K = len(space)
     tau = correlation_time(normal.residual)
+    least_tau = correlation_time(normal.residual, MISMATCH.false_alarms)
     inflation = kinks**2 * max(1.0, chi2) * tau
     slope, known = normal.gradient, normal.prior
     data = normal.hessian - np.diag(known)
@@ -211,7 +223,7 @@ def uncertainty(
         latency_interval_s=latency,
         verdicts=_verdicts(space, std[:K], blind),
         null_directions=null_directions(space, unseen),
-        alarms=_alarms(space, theta, chi2, tau, timing_std_s, bound != 0),
+        alarms=_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
         inflation=inflation,
         shape=shape,
         clustered=cluster,
@@ -315,6 +327,7 @@ def _alarms(
     theta: FloatArray,
     chi2: float,
     tau: float,
+    least_tau: float,
     timing_std_s: float,
     pressed: npt.NDArray[np.bool_],
 ) -> tuple[Alarm, ...]:
@@ -329,7 +342,7 @@ def _alarms(
         )
     if chi2 > MISMATCH.chi2:
         alarms.append(mismatch(chi2))
-    if chi2 > MISMATCH.negligible_chi2 and tau > MISMATCH.correlation_samples:
+    if chi2 > MISMATCH.negligible_chi2 and least_tau > MISMATCH.correlation_samples:
         alarms.append(
             Alarm(
                 f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",

@@ -323,6 +323,17 @@ def test_correlation_time_by_hand() -> None:
     assert correlation_time((white[:, 1:] + white[:, :-1],)) == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.parametrize(("terms", "least", "most"), [(2, 0.0, 0.1), (4, 0.95, 1.0)])
+def test_an_alarm_of_autocorrelation_is_no_chance(terms: int, least: float, most: float) -> None:
+    """Twelve channels at the limit, time 2, hardly ever exceed it beyond chance; of time 4, always."""
+    white = np.random.default_rng(0).standard_normal((40, 20, 99 + terms, 12))
+    alarms = []
+    for w in white:
+        summed = np.sum([w[:, k : k + 100] for k in range(terms)], axis=0)
+        alarms.append(correlation_time((summed,), MISMATCH.false_alarms) > MISMATCH.correlation_samples)
+    assert least <= np.mean(alarms) <= most
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_many_short_recordings_are_no_less_white_than_a_long_one(seed: int) -> None:
     """Ten of 480 samples: the worst of ten is beyond two standard errors now and then, not all together."""
