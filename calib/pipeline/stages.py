@@ -378,9 +378,9 @@ def lower_minimum(
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
     same = best = refined_from(run_part, found.theta, found.latency_s, shortest)
-    # New start states alone may lead lower. Other windows or data do not show it.
+    # New start states alone may lead lower. Of other windows or data only an explained residual shows it.
     alike = part is run.problem and same.shooting.length == found.shooting.length
-    again = alike and clearly_lower(same, found)
+    again = clearly_lower(same, found) if alike else same.chi2 < settings.explained <= found.chi2
     starts = [(theta, part.first_latency_s) for theta in part.space.sample(rng, settings.draws(part))]
     if searched is not None and searched.population is not None:
         near = rng.permutation(searched.population)[: len(starts) // 2]

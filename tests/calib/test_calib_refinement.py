@@ -126,14 +126,18 @@ def test_members_of_the_search_lead_where_its_mean_does_not() -> None:
     assert log_error_x100(found.estimate, case.theta) < 0.1
 
 
+@pytest.mark.parametrize("windows_s", [(0.2,), (0.2, 0.4)])
 @pytest.mark.parametrize(("lower", "fits"), [(True, 2), (False, 5)])
 def test_new_start_states_are_tried_before_drawn_points(
-    noisy: Case, monkeypatch: pytest.MonkeyPatch, lower: bool, fits: int
+    noisy: Case, monkeypatch: pytest.MonkeyPatch, lower: bool, fits: int, windows_s: tuple[float, ...]
 ) -> None:
-    """A fit that stopped beside the minimum goes on from smoothed start states; then no point is drawn."""
+    """A fit that stopped beside the minimum goes on from smoothed start states; then no point is drawn.
+
+    Also where only the shortest windows are explained from there.
+    """
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     best = refine(problem, noisy.theta, noisy.latency_s, (0.2,))
-    stuck = dataclasses.replace(best, chi2=9.0)
+    stuck = dataclasses.replace(refine(problem, noisy.theta, noisy.latency_s, windows_s), chi2=9.0)
     search = FixedSearch(noisy.theta, noisy.latency_s, 0.05)
     run = CalibrationRun(
         problem=problem,
