@@ -74,7 +74,7 @@ class OutputErrorFit:
             scaled median.
         iterations: Steps used.
         plain: The windows, with the sensors' noise.
-        weighed: The windows, with ``scale`` and the residuals' correlation time.
+        weighed: The windows, with ``scale``. An uncertainty counts the residuals' correlation itself.
         point: The solver's point.
         fixed_latency: Whether the latency was not fitted.
         central: Whether predictions are linearised by central differences, which an uncertainty needs.
@@ -171,7 +171,7 @@ def fit_output_error(
         left, used = left - max(more, 1), used + more
         if not before - normal.cost > recipe.converged * before:
             break
-    weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf)
+    weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf, correlated=False)
     return OutputErrorFit(
         plain.theta(point), float(point.value[-1]), recipe, scale, used, plain, weighed, point, fixed, central
     )
@@ -200,18 +200,25 @@ def _errors(data: WindowData, residual: FloatArray) -> FloatArray:
 
 
 def _weighed(
-    plain: Shooting, point: Point, recipe: Recipe, prior_share: float | None = None
+    plain: Shooting,
+    point: Point,
+    recipe: Recipe,
+    *,
+    prior_share: float | None = None,
+    correlated: bool = True,
 ) -> tuple[Shooting, FloatArray]:
     """Return the fit with each channel scaled by its own residual, and these scales, (M,).
 
-    Standard deviations grow with the residuals' correlation time.
+    With ``correlated``, standard deviations grow with the residuals' correlation time.
     """
     problem = plain.problem
     errors = [_errors(d, r) for d, r in zip(plain.data, plain.residuals(point), strict=True)]
     seen = [np.isfinite(d.std) for d in plain.data]
     scale = channel_scale(errors, seen, recipe.robust)
-    longest = round(recipe.longest_lag_s / problem.episodes[0].period_s)
-    correlation = correlated_samples([e / scale for e in errors], longest)
+    correlation = 1.0
+    if correlated:
+        longest = round(recipe.longest_lag_s / problem.episodes[0].period_s)
+        correlation = correlated_samples([e / scale for e in errors], longest)
     data = []
     for d, error, reported in zip(plain.data, errors, seen, strict=True):
         weight = huber_weights(error / scale) if recipe.robust else np.ones_like(error)

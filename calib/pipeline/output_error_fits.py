@@ -162,7 +162,7 @@ class OutputErrorFits(Fits):
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
-        known = _known(problem, fit)
+        known = known_of(problem, fit)
         split = self._split_half(problem, fit, recipe, known)
         known = widened_by_split_half(problem, known, theta, split)
         if settings.hold_first:
@@ -303,7 +303,7 @@ class OutputErrorFits(Fits):
             except InsufficientDataError as err:
                 return SplitHalf((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
             estimates.append(half.theta)
-            halves.append(_known(problem, half))
+            halves.append(known_of(problem, half))
         return agreement(problem, fit.theta, known, estimates, halves, problem.steps - before)
 
     def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
@@ -399,7 +399,8 @@ def _member(fit: OutputErrorFit) -> Member:
     return fit.theta, fit.latency_s
 
 
-def _known(problem: Problem, fit: OutputErrorFit) -> Uncertainty:
+def known_of(problem: Problem, fit: OutputErrorFit) -> Uncertainty:
+    """Return the uncertainty of a fit; residuals of its own scale count as noise."""
     return uncertainty(
         problem.space,
         fit.theta,
