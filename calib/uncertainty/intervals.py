@@ -441,5 +441,6 @@ def widened_to(problem: Problem, known: Uncertainty, theta: FloatArray, std: Flo
         known,
         covariance=covariance,
         interval=intervals(problem.space, theta, covariance, known.shape),
+        verdicts=_verdicts(problem.space, np.sqrt(np.diag(covariance)), known.shape.blind),
         widened=known.widened * factor,
     )

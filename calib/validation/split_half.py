@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from deal_hw.calib.data.problem import Problem, taken
 from deal_hw.calib.fit.refinement import Refined, refine_windows
@@ -76,6 +76,9 @@ class SplitHalf:
         flagged: Parameters that differ by more than chance.
         reach: Largest distance of a half's estimate from that on all data, in each parameter's own scale,
             (K,).
+        scale: Factor on all standard deviations: the root mean square distance of the halves over that which
+            the intervals expect. 1 where chance explains the distance. Tables of particle data use the same
+            factor where measurements disagree.
         steps: Physics steps used.
         note: Why nothing was compared.
     """
@@ -83,6 +86,7 @@ class SplitHalf:
     rows: tuple[SplitHalfRow, ...]
     flagged: tuple[str, ...]
     reach: FloatArray
+    scale: float = 1.0
     steps: int = 0
     note: str = ""
 
@@ -96,6 +100,7 @@ class SplitHalf:
                 for r in self.rows
             },
             "flagged": list(self.flagged),
+            "scale": self.scale,
             "steps": self.steps,
         }
 
@@ -173,19 +178,29 @@ def agreement(
     identified = ~known.shape.blind
     least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
-    far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*(np.sqrt(np.diag(h.covariance)) for h in halves))
-    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and identified[k] and r.agree is False)
-    return SplitHalf(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
+    expected = np.sqrt(sum(np.diag(h.covariance) for h in halves))
+    z = np.abs(scaled[0] - scaled[1]) / np.maximum(expected, 1e-300)
+    flagged = tuple(r.name for k, r in enumerate(rows) if z[k] > least and identified[k] and r.agree is False)
+    compared = z[identified & [r.agree is not None for r in rows]]
+    power, count = float(np.sum(compared**2)), len(compared)
+    by_chance = not count or power <= chi2.ppf(1 - SETTINGS.false_alarms, count)
+    scale = 1.0 if by_chance else float(np.sqrt(power / count))
+    reach = np.max(np.abs(scaled - space.to_scale(theta)), axis=0)
+    return SplitHalf(rows, flagged, reach, scale, steps)
 
 
 def widened_by_split_half(
     problem: Problem, known: Uncertainty, theta: FloatArray, split: SplitHalf
 ) -> Uncertainty:
-    """Return ``known`` with intervals of flagged parameters that hold the estimates of both halves."""
-    if not split.flagged:
+    """Return ``known`` with all intervals wider by the scale of the halves' distance.
+
+    Those of flagged parameters hold the estimates of both halves.
+    """
+    if not split.flagged and split.scale == 1.0:
         return known
     flagged = np.array([name in split.flagged for name in problem.space.names])
-    wider = widened_to(problem, known, theta, np.where(flagged, split.reach / Z90, 0.0))
+    std = split.scale * np.sqrt(np.diag(known.covariance))
+    wider = widened_to(problem, known, theta, np.maximum(std, np.where(flagged, split.reach / Z90, 0.0)))
     return dataclasses.replace(wider, alarms=(*wider.alarms, *split.alarms(problem.space)))
 
 

@@ -22,6 +22,7 @@ from deal_hw.calib.validation.split_half import (
 from deal_hw.calib.validation.verdict import Validation, judge
 from deal_hw.calibration import BEFORE_SEARCH, Identifiability, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
+from deal_hw.types import FloatArray
 
 
 def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refined: Refined) -> None:
@@ -89,6 +90,28 @@ def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
     assert wide.interval[k, 1] == pytest.approx(far)
     assert wide.interval[0] == pytest.approx(known.interval[0])
     assert any("disagree about servo.stiffness" in alarm.seen for alarm in wide.alarms)
+
+
+def test_halves_that_differ_more_than_intervals_expect_widen_all_of_them(
+    noisy_problem: Problem, noisy_refined: Refined
+) -> None:
+    """Each half is off by 2.1 standard deviations, to either side: 2.97 times the expected distance."""
+    problem, theta = noisy_problem, noisy_refined.theta
+    known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
+    std, at = np.sqrt(np.diag(known.covariance)), problem.space.to_scale(theta)
+    told = ~known.shape.blind
+
+    def halves(off: float) -> list[FloatArray]:
+        return [problem.space.from_scale(at + side * off * std * told) for side in (-1, 1)]
+
+    wide = dataclasses.replace(known, interval=np.stack([problem.space.low, problem.space.high], axis=1))
+    split = agreement(problem, theta, known, halves(2.1), [wide, wide], 0)
+    assert split.flagged == () and split.scale == pytest.approx(2.1 * np.sqrt(2), rel=1e-6)
+    assert split.to_json()["scale"] == split.scale
+    wider = widened_by_split_half(problem, known, theta, split)
+    assert np.sqrt(np.diag(wider.covariance)) == pytest.approx(split.scale * std)
+    by_chance = agreement(problem, theta, known, halves(0.7), [wide, wide], 0)
+    assert by_chance.scale == 1.0 and widened_by_split_half(problem, known, theta, by_chance) is known
 
 
 def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:
