@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -62,11 +63,12 @@ def test_a_search_that_is_kept_gets_start_states_and_intervals(noisy: Case, nois
     assert there.chi2 < 1.3 and not unexplained(there)
 
 
-def test_unexplained_data_go_through_the_folds_and_are_diagnosed(noisy: Case) -> None:
+def test_unexplained_data_go_through_the_folds_and_are_diagnosed(
+    small_problem: Callable[..., Problem],
+) -> None:
     """With a latency 10 ms off the model fails: folds are run, provenance says what was chosen and why."""
-    wrong = noisy.latency_s + 0.01
-    problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=wrong)
-    search = FixedSearch(noisy.theta, wrong)
+    problem = small_problem(fixed_latency_s=0.01)
+    search = FixedSearch(problem.space.nominal, 0.01)
     result = CalibrationPipeline(search, settings=Validation(split_half=False)).run(
         problem, Budget(generations=16), np.random.default_rng(0)
     )

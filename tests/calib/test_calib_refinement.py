@@ -235,10 +235,10 @@ def test_no_prediction_of_noisy_samples_errs_by_less_than_their_noise(noisy: Cas
     assert exact.errors({"truth": truth}).to_json()["noise"]["mean"] is None
 
 
-def test_a_residual_that_no_drawn_point_lowers_is_the_models(ideal: Case) -> None:
+def test_a_residual_that_no_drawn_point_lowers_is_the_models(small_problem: Callable[..., Problem]) -> None:
     """With a wrong latency forced on it nothing explains the data: one search, two folds, an alarm."""
-    problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
-    search = FixedSearch(ideal.theta, 0.021, 0.05)
+    problem = small_problem(fixed_latency_s=0.02)
+    search = FixedSearch(problem.space.nominal, 0.021, 0.05)
     method = CalibrationPipeline(search, fits=Refinement(RestartSettings(drawn=1)))
     result = method.run(problem, Budget(), np.random.default_rng(0))
     assert [budget.brief for budget in search.budgets] == [True] * 3
