@@ -161,7 +161,7 @@ class SearchCheckpoint:
 
 
 class Restarts:
-    """Runs a search repeatedly; searches that an interrupted run had finished are not run again.
+    """Runs a search repeatedly; one that this run or an interrupted one had finished is not run again.
 
     It is the running search's store, and puts the last state of each search into the whole run's store. From
     its last state a finished search makes its result again, with the generator as that search left it.
@@ -173,7 +173,7 @@ class Restarts:
         self._search, self._rng, self._store = search, rng, store
         saved = store.load() if store is not None else None
         self._states: list[State] = [] if saved is None else list(saved["searches"])
-        self._number = 0
+        self._done: list[tuple[Problem, int, Budget, CalibrationResult]] = []
         self.earlier_steps = 0
         """Physics steps of the searches before this process resumed them."""
         self.earlier_seconds = 0.0
@@ -182,27 +182,30 @@ class Restarts:
     def run(
         self, problem: Problem, number: int, budget: Budget, progress: ProgressCallback | None
     ) -> CalibrationResult:
-        """Return the result of search ``number``, 0 for the first; searches run in order.
+        """Return the result of search ``number`` on a problem, 0 for the first; searches run in order.
 
         See :meth:`CalibrationMethod.run` for the other arguments.
         """
-        self._number = number
+        for before, *same, result in self._done:
+            if before is problem and same == [number, budget]:
+                return result
         steps, began = problem.steps, time.perf_counter()
         kept = () if self._store is None else (self,)
         result = self._search.run(problem, budget, self._rng, progress, *kept)
         self.earlier_steps += result.steps - (problem.steps - steps)
         self.earlier_seconds += max(result.seconds - (time.perf_counter() - began), 0.0)
+        self._done.append((problem, number, budget, result))
         return result
 
     def save(self, state: State) -> None:
         """Store the running search's state; see :class:`deal_hw.calibration.StateStore`."""
-        self._states[self._number :] = [state]
+        self._states[len(self._done) :] = [state]
         if self._store is not None:
             self._store.save({"searches": self._states})
 
     def load(self) -> State | None:
         """Return the running search's state, or None where it has not begun."""
-        return self._states[self._number] if self._number < len(self._states) else None
+        return self._states[len(self._done)] if len(self._done) < len(self._states) else None
 
 
 def run_identity(
