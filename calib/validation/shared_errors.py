@@ -308,8 +308,13 @@ def find_shared_error(
 
 
 def _decides(before: float, after: float, count: int) -> bool:
-    """Return whether the prediction improves so much that the candidate is named."""
+    """Return whether the prediction improves so much that the candidate is named.
+
+    Residuals far below the noise need no explanation.
+    """
     settings = SETTINGS
+    if before <= MISMATCH.negligible_chi2:
+        return False
     share = settings.noticed if after <= MISMATCH.chi2 else settings.decisive
     if not np.isfinite(after) or not after < (1 - share) * before:
         return False

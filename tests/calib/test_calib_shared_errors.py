@@ -17,6 +17,7 @@ from deal_hw.calib.pipeline import stages
 from deal_hw.calib.pipeline.stages import CalibrationRun, Refinement, with_shared_error
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.shared_errors import (
     ChannelChange,
     FoundError,
@@ -130,6 +131,17 @@ def test_a_slide_is_in_millimetres_and_no_pair_of_a_hinge(tmp_path: Path) -> Non
         "all positions were multiplied by 2",
     } <= words
     assert not any(e.kind == "order" for e in found)
+
+
+@pytest.mark.parametrize(("chi2", "confirmed"), [(0.13, False), (1.2, True), (9.0, True)])
+def test_a_residual_far_below_the_noise_needs_no_correction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chi2: float, confirmed: bool
+) -> None:
+    """The correction left 0.08 of the noise; what the search left decides, 0.13 is no sign of an error."""
+    right = problem("pendulum", None, tmp_path, 3.0)
+    suspicion = FoundError(tuple(shared_errors(right))[:1], 0.08, 13.9, 500.0, right, 10)
+    monkeypatch.setattr(shared_errors_module, "_predicted", lambda *_: chi2)
+    assert suspicion.confirmed(right.space.nominal, 0.0) is confirmed
 
 
 @pytest.mark.slow
