@@ -183,7 +183,7 @@ class OutputErrorFits(Fits):
             lost = run.local.chi2 >= REFINEMENT.local_hopeless
             judged = (problem, with_rows(left)) if lost else (run.problem, local)
             if unexplained(judged[1]):
-                known, facts["diagnosis"] = with_causes(*judged, known)
+                known, facts["diagnosis"] = with_causes(*judged, known, run.play)
         found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {

@@ -43,7 +43,7 @@ from deal_hw.calib.uncertainty.intervals import (
 )
 from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
 from deal_hw.calib.validation.cross_validation import Choice, choose
-from deal_hw.calib.validation.diagnosis import find_play
+from deal_hw.calib.validation.diagnosis import PlayFit, find_play, fit_play
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.verdict import Validation, judge, unexplained
 from deal_hw.calibration import (
@@ -128,6 +128,7 @@ class CalibrationRun:
         attempts: Runs the search on all recordings and stores its results.
         settings: Which checks to run.
         local: The local fit, if there is one.
+        play: The fit with play in the gears, if there is one.
         progress: Receives progress reports.
     """
 
@@ -138,6 +139,7 @@ class CalibrationRun:
     attempts: Restarts
     settings: Validation
     local: Refined | None = None
+    play: PlayFit | None = None
     progress: ProgressCallback | None = None
 
     def say(self, stage: str, message: str) -> None:
@@ -256,6 +258,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
             fits = self.fits.started(run)
+            if local is not None and self.settings.diagnosis:
+                run = dataclasses.replace(run, play=fit_play(problem))
             found = with_play(run) or with_shared_error(fits, run)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
@@ -427,7 +431,7 @@ def conclude_fit(
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:
         known = averaged(problem, whole, known)
-    known, checked = judge(problem, refined, known, run.settings)
+    known, checked = judge(problem, refined, known, run.settings, run.play)
     facts: dict[str, Any] = {
         "restarts": restarts,
         "window_s": refined.shooting.length * problem.episodes[0].period_s,
@@ -475,9 +479,9 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
 
     No search follows: nothing but noise is left to explain.
     """
-    if run.local is None or not run.settings.diagnosis:
+    if run.local is None or run.play is None:
         return None
-    play = find_play(run.problem, run.local)
+    play = find_play(run.problem, run.local, run.play)
     if play is None or not play.explains:
         return None
     wide = dataclasses.replace(run, problem=play.problem, progress=None)

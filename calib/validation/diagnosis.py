@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
@@ -134,6 +135,25 @@ class Diagnosis:
 
 
 @dataclass(frozen=True, slots=True)
+class PlayFit:
+    """A fit with play in every gear, to a part of the recordings.
+
+    Attributes:
+        of: The recordings, without play among the parameters.
+        plays: The plays.
+        fit: The fit.
+        rest: Samples that were not fitted, per recording.
+        prediction: The fitted values on these samples.
+    """
+
+    of: Problem
+    plays: Sequence[Parameter]
+    fit: Refined
+    rest: Sequence[npt.NDArray[np.bool_]]
+    prediction: Refined
+
+
+@dataclass(frozen=True, slots=True)
 class Play:
     """Play in the gears, found by fitting a model with it to a part of the recordings.
 
@@ -180,9 +200,12 @@ class Evidence:
     names: Sequence[str]
 
 
-def diagnose(problem: Problem, refined: Refined) -> tuple[Diagnosis, ...]:
-    """Return the causes of a fit's residual, best supported first; the fit has linearised residuals."""
-    found_play = find_play(problem, refined)
+def diagnose(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> tuple[Diagnosis, ...]:
+    """Return the causes of a fit's residual, best supported first; the fit has linearised residuals.
+
+    ``fitted`` is a fit with play, if there is one of this problem.
+    """
+    found_play = find_play(problem, refined, fitted)
     play = None if found_play is None else found_play.diagnosis
     if play is not None and play.share >= SETTINGS.decisive:
         return (play,)
@@ -211,11 +234,8 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
     )
 
 
-def find_play(problem: Problem, refined: Refined) -> Play | None:
-    """Fit a model with play in every gear to a part of the recordings, and compare predictions of the rest.
-
-    The fit without play, ``refined``, has used all recordings.
-    """
+def fit_play(problem: Problem) -> PlayFit | None:
+    """Fit a model with play in every gear to a part of the recordings; None where it cannot be fitted."""
     description, names = problem.robot.description, problem.robot.actuator_names
     known = any(p.kind == "servo_play" for p in problem.space.parameters)
     if description.actuation != "position" or problem.robot.base is not None or problem.noise_free or known:
@@ -242,17 +262,34 @@ def find_play(problem: Problem, refined: Refined) -> Play | None:
     part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
     seen = [e.usable for e in part.episodes]
     rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
-    length = samples_in(problem, SETTINGS.play_s)
     try:
         fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.play_s,))
-        with_play = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
-        # The wider fit may have left another minimum; then its parameters predict as well without their play.
-        own, found = np.split(fit.theta, [len(problem.space)])
-        starts = (refined.theta, refined.latency_s), (own, fit.latency_s)
-        bare = [at_parameters(problem.part(rest), *start, length) for start in starts]
-        without = min(bare, key=lambda fit: fit.chi2 if np.isfinite(fit.chi2) else np.inf)
+        length = samples_in(problem, SETTINGS.play_s)
+        prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
+    return PlayFit(problem, plays, fit, rest, prediction)
+
+
+def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> Play | None:
+    """Compare predictions with play in the gears and without, of samples that the fit with play has not seen.
+
+    The fit without play, ``refined``, has used all recordings. ``fitted`` is the fit with play; it is made
+    where it is of another problem, or missing.
+    """
+    wide = fitted if fitted is not None and fitted.of is problem else fit_play(problem)
+    if wide is None:
+        return None
+    plays, fit, with_play = wide.plays, wide.fit, wide.prediction
+    # The wider fit may have left another minimum; then its parameters predict as well without their play.
+    own, found = np.split(fit.theta, [len(problem.space)])
+    starts = (refined.theta, refined.latency_s), (own, fit.latency_s)
+    unseen, length = problem.part(wide.rest), with_play.shooting.length
+    try:
+        bare = [at_parameters(unseen, *start, length) for start in starts]
+    except CalibrationError:
+        return None
+    without = min(bare, key=lambda fit: fit.chi2 if np.isfinite(fit.chi2) else np.inf)
     share = 1 - with_play.chi2 / without.chi2
     deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
     if not (deviance > MISMATCH.evidence and share > SETTINGS.noticed):

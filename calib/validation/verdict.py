@@ -11,7 +11,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
 from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
-from deal_hw.calib.validation.diagnosis import diagnose
+from deal_hw.calib.validation.diagnosis import PlayFit, diagnose
 from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
 from deal_hw.calibration import Alarm, CalibrationResult, percent
 from deal_hw.parameters import LONGEST_LATENCY_S
@@ -94,11 +94,15 @@ def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples)
 
 
 def judge(
-    problem: Problem, refined: Refined, known: Uncertainty, settings: Validation
+    problem: Problem,
+    refined: Refined,
+    known: Uncertainty,
+    settings: Validation,
+    fitted: PlayFit | None = None,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
 
-    ``refined`` has linearised residuals, and ``known`` is its uncertainty.
+    ``refined`` has linearised residuals, and ``known`` is its uncertainty. ``fitted`` is a fit with play.
     """
     facts: dict[str, Any] = {
         "inflation": known.inflation,
@@ -119,7 +123,7 @@ def judge(
         known = widened_by_split_half(problem, known, refined.theta, split)
         facts["split_half"] = split.to_json()
     if settings.diagnosis and unexplained(refined):
-        known, facts["diagnosis"] = with_causes(problem, refined, known)
+        known, facts["diagnosis"] = with_causes(problem, refined, known, fitted)
     return known, facts
 
 
@@ -137,10 +141,10 @@ def with_step(
 
 
 def with_causes(
-    problem: Problem, refined: Refined, known: Uncertainty
+    problem: Problem, refined: Refined, known: Uncertainty, fitted: PlayFit | None = None
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
-    found = diagnose(problem, refined)
+    found = diagnose(problem, refined, fitted)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
     return dataclasses.replace(known, alarms=(*alarms, *known.alarms)), [dataclasses.asdict(f) for f in found]
 
