@@ -46,6 +46,8 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.types import FloatArray
 
+UNCHECKED = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
+
 
 def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[..., Problem]) -> None:
     """Residuals of the noise's size end the calibration only where they are white as noise is."""
@@ -104,7 +106,7 @@ def test_a_search_that_ends_in_another_minimum_is_not_the_answer(noisy: Case, re
         rng=np.random.default_rng(0),
         search=search,
         attempts=Restarts(search, np.random.default_rng(0), None),
-        settings=Validation(cross_validation=False),
+        settings=UNCHECKED,
         local=best if rescued_by == "local fit" else None,
     )
     method = Refinement(RestartSettings(drawn=0 if rescued_by == "local fit" else 8))
