@@ -35,6 +35,8 @@ class MismatchSettings:
             the fit may be in another minimum. Cart-poles with sensors, 15 tuning seeds of ratio 5 and 20: the
             11 local fits that agreed with a fit from the truth were at 1.00. One in another minimum, with a
             chi2 of 1.16, was at 1.39.
+        least_jitter_s: Least jitter of the sample times that is an alarm [s]. Fast motion without noise looks
+            like jitter of some hundredths of a millisecond.
         evidence: Least gain in deviance of a cause, a correction or another minimum [-]: 20 is odds of 22,000
             to 1.
     """
@@ -44,6 +46,7 @@ class MismatchSettings:
     false_alarms: float = 0.05
     negligible_chi2: float = 0.5
     white_samples: float = 1.2
+    least_jitter_s: float = 1e-4
     evidence: float = 20.0
 
 
@@ -332,7 +335,7 @@ def _alarms(
     pressed: npt.NDArray[np.bool_],
 ) -> tuple[Alarm, ...]:
     alarms = []
-    if timing_std_s > 0:
+    if timing_std_s >= MISMATCH.least_jitter_s:
         alarms.append(
             Alarm(
                 f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",

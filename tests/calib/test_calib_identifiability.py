@@ -26,6 +26,7 @@ def _told(
     hessian: FloatArray,
     gradient: FloatArray | None = None,
     prior: FloatArray | None = None,
+    jitter_s: float = 0.0,
 ) -> Uncertainty:
     """Statement with a decided latency and white residuals of variance 1 / 1.44: inflation is then 1.44."""
     whole = np.zeros((len(space) + 1,) * 2)
@@ -34,7 +35,9 @@ def _told(
     nothing = np.zeros(len(whole))
     slope, known = (nothing if given is None else given for given in (gradient, prior))
     normal = Normal(1.0, 1, whole, slope, (white,), known)
-    return uncertainty(space, np.array(theta), 0.0, normal, 1.0, (0.0, 0.04), fixed_latency=True)
+    return uncertainty(
+        space, np.array(theta), 0.0, normal, 1.0, (0.0, 0.04), fixed_latency=True, timing_std_s=jitter_s
+    )
 
 
 def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
@@ -46,6 +49,14 @@ def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
     assert at.covariance[0, 0] == pytest.approx(1.44 / 1e4, rel=1e-3)
     assert inside.covariance[0, 0] == pytest.approx(1.44 / 1e4 / 0.19, rel=1e-2)
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in at.alarms)
+
+
+@pytest.mark.parametrize(("jitter_s", "seen"), [(4e-5, []), (4e-4, ["jitter by 0.4 ms"])])
+def test_a_jitter_too_small_to_matter_is_no_alarm(jitter_s: float, seen: list[str]) -> None:
+    """Fast motion without noise looks like 0.04 ms of it, and the alarm said 0.0 ms."""
+    told = _told(_space("a", "b"), [1.0, 2.0], 1e4 * np.eye(2), jitter_s=jitter_s)
+    assert len(told.alarms) == len(seen)
+    assert all(words in alarm.seen for words, alarm in zip(seen, told.alarms, strict=True))
 
 
 @pytest.mark.parametrize(("kind", "alarms"), [("servo_play", False), ("encoder_bias", True)])
