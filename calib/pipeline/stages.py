@@ -499,10 +499,11 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
-    """Return a strategy's result; a brief one, with an alarm, if commands and measurements share an error.
+    """Return a strategy's result, with an alarm if commands and measurements share an error.
 
-    The alarm is reported before the search. A search may still find a simulator that predicts as well as the
-    corrected recordings; then they are right, and the strategy runs. Otherwise no parameters can be.
+    The alarm is reported before the search. If a simulator is found that predicts as well as the corrected
+    recordings, they are right, and there is no alarm. Where the correction leaves only noise, no parameters
+    are likely to be right, so a brief search has to find it; otherwise the whole strategy.
     """
     problem, local = run.problem, run.local
     suspect = None
@@ -512,10 +513,14 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     if suspect is None:
         return fits.best(run)
     run.say(BEFORE_SEARCH, str(suspect.alarm))
-    unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
-    found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
+    brief = suspect.chi2 <= MISMATCH.chi2
+    if brief:
+        unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
+        found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
+    else:
+        found = fits.best(run)
     if not suspect.confirmed(found.theta, found.latency_s):
-        return fits.best(run)
+        return fits.best(run) if brief else found
     known = dataclasses.replace(found.known, alarms=(suspect.alarm, *found.known.alarms))
     return dataclasses.replace(found, known=known, facts={**found.facts, "shared_error": suspect.to_json()})
 
