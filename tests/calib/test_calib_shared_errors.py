@@ -99,7 +99,7 @@ def test_a_change_takes_each_channel_of_a_joint_along() -> None:
     assert np.array_equal(efforts.target[:, 2], recorded.target[:, 2])
 
 
-def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds: float = 4.0) -> Problem:
+def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds: float = 2.5) -> Problem:
     """Return the problem of a simulated robot's recordings."""
     robot = make_robot(kind, 3, fault)
     model, paths, held_out = write(robot, folder, seconds=seconds)
