@@ -25,7 +25,7 @@ import torch
 
 from deal_hw.bench.calibration import make_cells, run_cell
 from deal_hw.bench.rows import write_rows
-from deal_hw.calib.deal_paper.diffusion_evolution import Schedule, alpha_schedule
+from deal_hw.calib.search.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
 from deal_hw.cli.bench import parse_seeds
 from deal_hw.types import FloatArray

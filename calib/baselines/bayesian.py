@@ -35,8 +35,8 @@ from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
+from deal_hw.calib.search.fitness import FitnessSettings
 from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray

@@ -11,15 +11,15 @@ from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings
-from deal_hw.calib.deal_paper.fitness import (
+from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings
+from deal_hw.calib.search.critic import CriticSettings
+from deal_hw.calib.search.fitness import (
     FITNESSES,
     FitnessSettings,
     energy_distance,
     make_fitness,
     squared_mmd,
 )
-from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError

@@ -12,7 +12,6 @@ from fakes.recorded_commands import RecordedCommands
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings, _Box
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
@@ -22,6 +21,7 @@ from deal_hw.calib.pipeline.methods import (
     make_method,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
+from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings, _Box
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint

@@ -45,7 +45,7 @@ ROOMS = {
     "calib": (
         {"data"},
         {"search", "fit"},
-        {"deal_paper", "uncertainty"},
+        {"uncertainty"},
         {"validation", "design", "baselines"},
         {"pipeline", "report"},
     ),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.deal_paper.fitness import Fitness, RolloutView, Samples
 from deal_hw.calib.search.critic import ClippedCritic, CriticSettings, torch_threads
+from deal_hw.calib.search.fitness import Fitness, RolloutView, Samples
 from deal_hw.types import FloatArray
 
 

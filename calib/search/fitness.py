@@ -17,7 +17,9 @@ from scipy.spatial.distance import cdist, pdist
 
 from deal_hw.calib.data.innovations import Members, Whitening, cut, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.deal_paper.rollouts import (
+from deal_hw.calib.search.base import Coordinates
+from deal_hw.calib.search.resume import Stateful
+from deal_hw.calib.search.rollouts import (
     TransitionScale,
     control_ticks,
     demonstration,
@@ -25,8 +27,6 @@ from deal_hw.calib.deal_paper.rollouts import (
     rollout_population,
     transitions,
 )
-from deal_hw.calib.search.base import Coordinates
-from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
 
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 Samples = npt.NDArray[np.float32]
 
 FITNESSES: dict[str, str] = {
-    "critic": "deal_hw.calib.deal_paper.critic_fitness:CriticFitness",
-    "trajectory": "deal_hw.calib.deal_paper.fitness:TrajectoryFitness",
-    "energy": "deal_hw.calib.deal_paper.fitness:EnergyFitness",
-    "mmd": "deal_hw.calib.deal_paper.fitness:KernelFitness",
-    "flat": "deal_hw.calib.deal_paper.fitness:FlatFitness",
+    "critic": "deal_hw.calib.search.critic_fitness:CriticFitness",
+    "trajectory": "deal_hw.calib.search.fitness:TrajectoryFitness",
+    "energy": "deal_hw.calib.search.fitness:EnergyFitness",
+    "mmd": "deal_hw.calib.search.fitness:KernelFitness",
+    "flat": "deal_hw.calib.search.fitness:FlatFitness",
 }
 """Name -> ``module:class``, imported on use: only the critic needs torch. ``flat`` ignores the data."""
 

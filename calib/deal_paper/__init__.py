@@ -1,1 +1,0 @@
-"""DEAL as published, line by line."""
