@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
+from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.intervals import MISMATCH, uncertainty_at, with_rows
 from deal_hw.calib.validation import diagnosis
@@ -281,6 +281,19 @@ def test_another_minimum_is_no_play(tmp_path: Path) -> None:
     elsewhere = at_parameters(problem, 1.5 * fit.theta, fit.latency_s + 0.008, fit.shooting.length)
     assert elsewhere.chi2 > 10 * fit.chi2
     assert find_play(problem, elsewhere) is None
+
+
+def test_half_of_two_recordings_is_a_part(small_problem: Callable[..., Problem]) -> None:
+    """Of 1 s and 1.11 s, whose sum over its half is 1.9999999999999996, the rest is left to predict."""
+    whole = small_problem()
+    ends = (slice(200), slice(222))
+    names = ("sample", "position", "velocity", "usable")
+    (episode,) = whole.episodes
+    parts = [dataclasses.replace(episode, **{n: getattr(episode, n)[end] for n in names}) for end in ends]
+    problem = whole.on(parts, None)
+    total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
+    left_out = [~e.usable for e in part_of(problem, total_s / 2).episodes]
+    assert sum(map(np.count_nonzero, left_out)) >= 200
 
 
 def test_play_is_found_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
