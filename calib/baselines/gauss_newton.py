@@ -14,7 +14,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.data.innovations import Members, cut, is_noisy, linearise, whitened_residual
+from deal_hw.calib.data.innovations import (
+    Members,
+    cut,
+    is_noisy,
+    linearise,
+    measurements,
+    whitened_residual,
+)
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
@@ -88,6 +95,8 @@ class Innovations:
         mean, std = problem.space.prior
         self._expected = np.flatnonzero(np.isfinite(std))
         self._mean, self._std = problem.space.to_scale(mean)[self._expected], std[self._expected]
+        self.count = measurements(self.windows) + len(self._expected)
+        """Measurements and priors."""
 
     def residuals(self, values: FloatArray) -> FloatArray:
         """Return the whitened residuals, (N, M), of values, (N, K + 1), in one batch."""
@@ -191,7 +200,7 @@ class _MultiStart(Stepper):
         for _ in range(settings.rounds):
             innovations = Innovations(self.problem, ticks, value, follow=follow)
             value, _ = minimise(innovations, value, self._bounds, settings.solver, fixed_latency=fixed)
-            before, chi2 = chi2, float(np.mean(innovations.residual(value) ** 2))
+            before, chi2 = chi2, float(np.sum(innovations.residual(value) ** 2)) / innovations.count
             if not chi2 < before * (1 - settings.converged):
                 break
         self._values[number], self._chi2[number] = value, chi2 if math.isfinite(chi2) else math.inf
@@ -231,13 +240,14 @@ class _MultiStart(Stepper):
         problem, value = self.problem, self._best[1]
         innovations = Innovations(problem, self._ticks[-1], value, follow=True)
         residual, jacobian = np.nan_to_num(innovations.residual(value)), innovations.jacobian(value)
-        chi2, nothing = float(np.mean(residual**2)), np.zeros(len(value))
+        cost, nothing = float(np.sum(residual**2)), np.zeros(len(value))
+        chi2 = cost / innovations.count
         split = innovations.split(residual)
         known = uncertainty(
             problem.space,
             problem.space.from_scale(value[:-1]),
             self.coordinates.clip_latency(float(value[-1])),
-            Normal(residual.size * chi2, residual.size, jacobian.T @ jacobian, nothing, split, nothing),
+            Normal(cost, innovations.count, jacobian.T @ jacobian, nothing, split, nothing),
             chi2,
             problem.latency_range_s,
             fixed_latency=problem.fixed_latency_s is not None,

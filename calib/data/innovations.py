@@ -90,7 +90,7 @@ class Whitening:
 
     Attributes:
         reference: Prediction at the linearisation point, (W, H, M).
-        factor: Inverse Cholesky factors of Sigma, (W, H M, H M).
+        factor: Inverse Cholesky factors of Sigma, (W, H M, H M); rows of 0 for missing samples.
         root: J sqrt(P0): effect of one standard deviation of each start coordinate, (W, H M, 2 C).
         std: Standard deviations of each start state, (W, 2 C).
         offset: Start states at the linearisation point relative to the smoothed ones, in units of ``std``,
@@ -172,10 +172,13 @@ def linearise(
     # Where predictions nearly diverge, the noise would be lost to rounding beside them.
     most = np.abs(root).max(axis=(1, 2)) / noise.min(axis=1)
     root = root / np.maximum(most / _MOST_SPREAD, 1.0)[:, None, None]
-    sigma = root @ np.swapaxes(root, 1, 2)
+    # Samples that filled a gap have infinite noise, which no factorisation is safe from: they get rows of 0.
+    seen = np.isfinite(noise)
+    known = np.where(seen[..., None], root, 0.0)
+    sigma = known @ np.swapaxes(known, 1, 2)
     diagonal = np.arange(noise.shape[1])
-    sigma[:, diagonal, diagonal] += noise**2
-    factor = np.linalg.inv(np.linalg.cholesky(sigma))
+    sigma[:, diagonal, diagonal] += np.where(seen, noise, 1.0) ** 2
+    factor = np.linalg.inv(np.linalg.cholesky(sigma)) * seen[..., None]
     return Whitening(reference, factor, root, std, around)
 
 
@@ -225,5 +228,10 @@ def explained(problem: Problem, centre: Members, ticks: int) -> float:
     Windows have ``ticks`` control periods.
     """
     windows = cut(problem, ticks)
-    chi2 = float(np.mean(whitened_residual(problem, centre, centre, windows) ** 2))
+    chi2 = float(np.sum(whitened_residual(problem, centre, centre, windows) ** 2)) / measurements(windows)
     return chi2 if np.isfinite(chi2) else float("inf")
+
+
+def measurements(windows: Sequence[WindowData]) -> int:
+    """Return the number of measurements in windows; samples that filled a gap are none."""
+    return sum(int(np.isfinite(data.std).sum()) for data in windows)

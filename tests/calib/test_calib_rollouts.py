@@ -155,6 +155,18 @@ def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Case, problem: P
     assert explained(problem, wrong, 10) > 1e3
 
 
+def test_lost_samples_do_not_lower_the_residual(noisy: Case, noisy_problem: Problem) -> None:
+    """The truth leaves as much residual of a recording without every fourth sample: those have none."""
+    kept = np.arange(len(noisy.fit.sample)) % 4 != 1
+    names = ("sample", "position", "velocity", "usable")
+    lost = dataclasses.replace(noisy.fit, **{name: getattr(noisy.fit, name)[kept] for name in names})
+    truth = Members(noisy.theta[None], np.array([noisy.latency_s]))
+    whole, part = (
+        explained(noisy_problem.on([e], noisy_problem.noise_std), truth, 20) for e in (noisy.fit, lost)
+    )
+    assert part == pytest.approx(whole, rel=0.15)
+
+
 def test_start_states_are_less_certain_at_both_ends_of_a_recording() -> None:
     """A cubic fitted to 21 samples: at the middle 8 times, at the end 1.24 times as certain as one sample.
 
