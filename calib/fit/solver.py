@@ -271,9 +271,10 @@ def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) 
 
 
 def kurtosis(residuals: Sequence[FloatArray]) -> float:
-    """Return the fourth moment over the squared second; 3 for noise."""
+    """Return the fourth moment over the squared second; 3 for noise. A 0 is a missing sample."""
     values = np.concatenate([r.ravel() for r in residuals])
-    return float(np.mean(values**4) / max(float(np.mean(values**2)) ** 2, 1e-300))
+    count = np.count_nonzero(values)
+    return float(count * np.sum(values**4) / max(float(np.sum(values**2)) ** 2, 1e-300))
 
 
 def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robust: bool) -> FloatArray:

@@ -184,13 +184,16 @@ def _residual_row(shown: Residuals, m: int, size: float) -> Iterator[Panel]:
 def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
     """Return the autocorrelation of a channel's residuals, (W, H), at lags 1, 2, ... and white noise's band.
 
-    The band holds 95 %.
+    The band holds 95 %. A missing sample is NaN and does not count.
     """
-    clean = np.nan_to_num(values)
-    power = float(np.mean(clean**2)) or 1.0
-    lags = range(1, min(SETTINGS.lags, values.shape[1] - 1) + 1)
-    rho = [float(np.mean(clean[:, lag:] * clean[:, :-lag]) / power) for lag in lags]
-    return np.array(rho), 2.0 / float(np.sqrt(max(values.size, 1)))
+    seen = np.isfinite(values)
+    clean, count = np.where(seen, values, 0.0), max(int(seen.sum()), 1)
+    power = float(np.sum(clean**2)) / count or 1.0
+    rho = []
+    for lag in range(1, min(SETTINGS.lags, values.shape[1] - 1) + 1):
+        pairs = max(int(np.sum(seen[:, lag:] & seen[:, :-lag])), 1)
+        rho.append(float(np.sum(clean[:, lag:] * clean[:, :-lag])) / pairs / power)
+    return np.array(rho), 2.0 / float(np.sqrt(count))
 
 
 def latency_scan(scan: Mapping[str, Any], tick_s: float | None) -> Markup | None:

@@ -450,8 +450,9 @@ class _Left:
 
     @property
     def count(self) -> int:
-        """Degrees of freedom of the residuals."""
-        return sum(r.size - len(r) * n.shape[1] for r, n in zip(self.rest, self.normal, strict=True))
+        """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
+        each = zip(self.rest, self.normal, strict=True)
+        return max(sum(int(np.count_nonzero(r)) - len(r) * n.shape[1] for r, n in each), 1)
 
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
@@ -486,14 +487,16 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     """Return when the residual comes in bursts; None where it does not."""
     power: list[FloatArray] = []
     values: list[FloatArray] = []
-    for time_s, rows in zip(known.time_s, residual, strict=True):
-        W, H = time_s.shape
-        M = rows.shape[1] // H
-        r = rows[:, : H * M].reshape(W, H, M)
+    for time_s, of_episode, rows in zip(known.time_s, known.rows, residual, strict=True):
+        # The rows of the start states' prior come last.
+        r = rows[:, : rows.shape[1] - of_episode.start.shape[2]].reshape(*time_s.shape, -1)
         power.append(np.sum(r**2, axis=2).ravel())
         values.append(r.ravel())
     each, time = np.concatenate(power), np.concatenate([t.ravel() for t in known.time_s])
     source = np.repeat(known.names, [t.size for t in known.time_s])
+    # Samples that filled a gap have a residual of 0.
+    seen = each > 0
+    each, time, source = each[seen], time[seen], source[seen]
     most = np.argsort(-each)[: max(round(SETTINGS.burst_part * len(each)), 1)]
     most = most[each[most] > SETTINGS.burst_size * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))

@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from deal_hw.calib.data.innovations import measurements
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.uncertainty.intervals import MISMATCH
@@ -322,7 +323,7 @@ def _decides(before: float, after: float, count: int) -> bool:
 
 
 def _samples(test: Problem, length: int) -> int:
-    return sum(data.measured.size for data in test.windows(length))
+    return measurements(test.windows(length))
 
 
 def _screened(

@@ -102,6 +102,8 @@ def test_huber_weights_by_hand() -> None:
     assert weights == pytest.approx([1.0, 1.0, 0.1, 1.0, 1.0])
     assert huber_weights(np.full(5, 10.0)) == pytest.approx(np.ones(5))
     assert kurtosis([np.array([1.0, -1.0])]) == 1.0
+    # Missing samples are no quiet ones.
+    assert kurtosis([np.array([1.0, 0.0, 0.0, -1.0, 0.0])]) == 1.0
 
 
 def test_robust_refinement_shrugs_off_wild_samples(

@@ -155,6 +155,36 @@ def test_contact_comes_in_bursts() -> None:
     assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].alarm.do
 
 
+def _with_gaps(known: Evidence, share: float) -> Evidence:
+    """Return evidence of a recording with a share of its samples lost: their rows are 0."""
+    (rows,) = known.rows
+    lost = np.random.default_rng(1).random((WINDOWS, SAMPLES)) < share
+    kept = np.concatenate([~lost, np.ones((WINDOWS, 2), dtype=bool)], axis=1)
+    return dataclasses.replace(
+        known,
+        rows=[
+            WindowRows(rows.residual * kept, rows.parameter * kept[..., None], rows.start * kept[..., None])
+        ],
+        found=[
+            dataclasses.replace(s, columns=tuple(x * kept[:, :SAMPLES, None] for x in s.columns))
+            for s in known.found
+        ],
+    )
+
+
+def test_lost_samples_are_no_quiet_ones_between_bursts() -> None:
+    """White noise in a third of the samples, the others lost, touches nothing."""
+    assert name_causes(_with_gaps(_evidence(np.zeros((WINDOWS, SAMPLES))), 0.7)) == []
+
+
+def test_lost_samples_are_no_evidence() -> None:
+    """With 40 % of the samples lost, a load gains about 60 % of the deviance of all samples."""
+    known = _evidence(_moved_by(np.full((WINDOWS, SAMPLES), 0.3)))
+    whole, part = (name_causes(k)[0] for k in (known, _with_gaps(known, 0.4)))
+    assert part.cause == whole.cause == "load"
+    assert part.deviance == pytest.approx(0.6 * whole.deviance, rel=0.15)
+
+
 def test_direction_is_kept_where_a_joint_is_still() -> None:
     """0.5, 0.0001, -0.0001, -0.5, 0.0001 with 0.001 as still: up, up, up, down, down."""
     v = np.array([[0.5, 1e-4, -1e-4, -0.5, 1e-4]])

@@ -373,6 +373,15 @@ def test_autocorrelation_of_an_alternating_series() -> None:
     assert rho[:4].tolist() == [-1, 1, -1, 1] and band == pytest.approx(0.4472, abs=1e-4)
 
 
+def test_missing_samples_do_not_whiten_residuals() -> None:
+    """A moving sum of two has a correlation of 0.5 at lag 1, also with 40 % of the samples lost."""
+    white = np.random.default_rng(0).standard_normal((40, 201))
+    lost = np.random.default_rng(1).random((40, 200)) < 0.4
+    rho, band = autocorrelation(np.where(lost, np.nan, white[:, 1:] + white[:, :-1]))
+    assert rho[0] == pytest.approx(0.5, abs=0.03) and abs(rho[1]) < 0.05
+    assert band == pytest.approx(2 / np.sqrt(np.sum(~lost)))
+
+
 def test_held_out_error_of_each_joint_stands_in_its_unit() -> None:
     """A row for each joint and their mean, a column for each predictor; what diverged says so."""
     rmse: dict[str, Any] = {
