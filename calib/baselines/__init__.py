@@ -1,1 +1,1 @@
-"""Calibration methods to compare with: simple, published or deliberately ignorant ones."""
+"""Calibration methods to compare with: simple or published ones."""

@@ -36,10 +36,10 @@ METHODS: dict[str, str] = {
     "ekf": "deal_hw.calib.baselines.ekf:Ekf",
     "ekf-one-pass": "deal_hw.calib.baselines.ekf:one_pass",
     "mujoco-sysid": "deal_hw.calib.baselines.sysid:MujocoSysid",
-    "random": "deal_hw.calib.baselines.simple:RandomSearch",
-    "midpoint": "deal_hw.calib.baselines.simple:Midpoint",
-    "midpoint-linear": "deal_hw.calib.baselines.simple:LinearMidpoint",
-    "nominal": "deal_hw.calib.baselines.simple:Nominal",
+    "random": "deal_hw.calib.baselines.random_search:RandomSearch",
+    "midpoint": "deal_hw.calib.search.no_data:Midpoint",
+    "midpoint-linear": "deal_hw.calib.search.no_data:LinearMidpoint",
+    "nominal": "deal_hw.calib.search.no_data:Nominal",
 }
 """Name -> ``module:callable`` without arguments. ``default`` did best on the tuning seeds."""
 

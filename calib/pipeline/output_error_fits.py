@@ -24,13 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.baselines.simple import Nominal
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
 from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.no_data import Nominal
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
     Uncertainty,
