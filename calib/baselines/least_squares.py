@@ -28,7 +28,7 @@ from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_er
 from deal_hw.calib.fit.residual import DIFFERENCES
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
-from deal_hw.calib.uncertainty.intervals import intervals
+from deal_hw.calib.validation.intervals import intervals
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace

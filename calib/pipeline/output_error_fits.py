@@ -31,15 +31,6 @@ from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.no_data import Nominal
-from deal_hw.calib.uncertainty.intervals import (
-    MISMATCH,
-    Uncertainty,
-    mismatch,
-    names_at_bound,
-    uncertainty,
-    with_rows,
-)
-from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import (
     Choice,
     Member,
@@ -48,6 +39,15 @@ from deal_hw.calib.validation.cross_validation import (
     on_folds,
     time_masks,
 )
+from deal_hw.calib.validation.intervals import (
+    MISMATCH,
+    Uncertainty,
+    mismatch,
+    names_at_bound,
+    uncertainty,
+    with_rows,
+)
+from deal_hw.calib.validation.null_space import confounded
 from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_split_half
 from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Z90, Alarm, CalibrationResult

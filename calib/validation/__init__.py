@@ -1,1 +1,1 @@
-"""What a calibration is judged by."""
+"""What a fit is worth: its uncertainty, the causes of its residual, and the verdict on its use."""

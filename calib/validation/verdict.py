@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
-from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import PlayFit, diagnose
+from deal_hw.calib.validation.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
 from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
+from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calibration import Alarm, CalibrationResult, percent
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray

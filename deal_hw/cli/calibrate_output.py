@@ -86,7 +86,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     from rich.text import Text
 
     from deal_hw.calib.design.advice import next_step
-    from deal_hw.calib.uncertainty.intervals import MISMATCH
+    from deal_hw.calib.validation.intervals import MISMATCH
     from deal_hw.calib.validation.verdict import trust
 
     table = Table(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.fit.residual import Normal, WindowRows
-from deal_hw.calib.uncertainty.cluster_robust import clustered, eliminated
-from deal_hw.calib.uncertainty.intervals import uncertainty
+from deal_hw.calib.validation.cluster_robust import clustered, eliminated
+from deal_hw.calib.validation.intervals import uncertainty
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
 

@@ -12,7 +12,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import Sticking, settle
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.uncertainty.intervals import MISMATCH, correlation_time
+from deal_hw.calib.validation.intervals import MISMATCH, correlation_time
 from deal_hw.calib.validation.verdict import unexplained
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, parameter_space
 from deal_hw.drivers.go2.motions import FEET, sway

@@ -23,8 +23,8 @@ from deal_hw.calib.pipeline.output_error_fits import (
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
-from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
+from deal_hw.calib.validation.null_space import confounded
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode

@@ -33,10 +33,10 @@ from deal_hw.calib.pipeline.stages import (
     lower_minimum,
 )
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.uncertainty.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
-from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calib.uncertainty.time_steps import LatencyScan
+from deal_hw.calib.validation.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.validation.metrics import HeldOut
+from deal_hw.calib.validation.null_space import null_directions, null_space
+from deal_hw.calib.validation.time_steps import LatencyScan
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space

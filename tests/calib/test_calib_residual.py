@@ -10,7 +10,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import refine, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.uncertainty.time_steps import scan_latency
+from deal_hw.calib.validation.time_steps import scan_latency
 
 
 def stepped(shooting: Shooting, problem: Problem) -> tuple[Point, Point]:

@@ -11,7 +11,7 @@ from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.stages import report_unidentifiable
-from deal_hw.calib.uncertainty.intervals import uncertainty_at, with_rows
+from deal_hw.calib.validation.intervals import uncertainty_at, with_rows
 from deal_hw.calib.validation.split_half import (
     SplitHalf,
     agreement,

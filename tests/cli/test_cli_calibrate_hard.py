@@ -89,7 +89,7 @@ def test_a_step_that_cannot_be_halved_in_time_is_said(
     calibrated: Calibrated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether the physics step is fine enough stays open, and terminal and result say so."""
-    from deal_hw.calib.uncertainty import time_steps
+    from deal_hw.calib.validation import time_steps
 
     monkeypatch.setattr(time_steps, "STEP", time_steps.StepSettings(most_steps=10.0))
     code, said, folder = calibrated(DAMPING)

@@ -67,7 +67,7 @@ def test_each_alarm_is_on_its_page() -> None:
     """Alarms of all folders are found with their three parts, and causes beside them."""
     found = docs_pages.alarms()
     assert {path for path, *_ in found} >= {
-        "calib/uncertainty/intervals.py",
+        "calib/validation/intervals.py",
         "calib/validation/verdict.py",
         "deal_hw/workflows/calibration/best_so_far.py",
     }

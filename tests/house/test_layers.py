@@ -45,8 +45,8 @@ ROOMS = {
     "calib": (
         {"data"},
         {"search", "fit"},
-        {"uncertainty"},
-        {"validation", "design", "baselines"},
+        {"validation"},
+        {"design", "baselines"},
         {"pipeline", "report"},
     ),
     "drivers.go2": (

@@ -14,8 +14,8 @@ from scipy.stats import t as t_law
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
-from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
-from deal_hw.calib.uncertainty.null_space import null_directions, null_space
+from deal_hw.calib.validation.cluster_robust import Clustered, clustered
+from deal_hw.calib.validation.null_space import null_directions, null_space
 from deal_hw.calibration import Z90, Alarm, Identifiability, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import find_kind

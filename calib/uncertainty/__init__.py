@@ -1,1 +1,0 @@
-"""What the data say of the parameters."""
