@@ -451,8 +451,8 @@ class _Left:
     @property
     def count(self) -> int:
         """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
-        each = zip(self.rest, self.normal, strict=True)
-        return max(sum(int(np.count_nonzero(r)) - len(r) * n.shape[1] for r, n in each), 1)
+        measured = sum(int(np.count_nonzero(r)) for r in self.rest)
+        return max(measured - sum(len(n) * int(n.shape[1]) for n in self.normal), 1)
 
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
