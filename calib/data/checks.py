@@ -43,7 +43,8 @@ def check_excitation(problem: Problem) -> None:
         )
     names = problem.robot.description.joint_names
     joints = problem.robot.joints
-    spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
+    used = [e.position[e.usable][:, joints] for e in problem.episodes if e.usable.any()]
+    spans = np.max([np.ptp(position, axis=0) for position in used], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
     settings = problem.settings
     if problem.known_std is None and not problem.noise_free:

@@ -441,6 +441,12 @@ def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) 
         check_excitation(Problem(ideal.robot, ideal.space, [short], threads=1))
 
 
+def test_a_recording_without_usable_samples_does_no_harm(ideal: Case) -> None:
+    """Beside another that moves: such as a walk's part in which the robot only stands up."""
+    unusable = dataclasses.replace(ideal.fit, usable=np.zeros(len(ideal.fit.sample), dtype=bool))
+    check_excitation(Problem(ideal.robot, ideal.space, [ideal.fit, unusable], threads=1))
+
+
 def test_diverged_members_are_nan_and_the_others_untouched() -> None:
     """A state that MuJoCo calls unstable is reported, not silently reset."""
     robot, space = load_model(DESCRIPTION), k9_space()
