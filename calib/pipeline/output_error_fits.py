@@ -42,6 +42,7 @@ from deal_hw.calib.validation.cross_validation import (
 from deal_hw.calib.validation.intervals import (
     MISMATCH,
     Uncertainty,
+    kinks_of,
     mismatch,
     names_at_bound,
     uncertainty,
@@ -409,4 +410,5 @@ def known_of(problem: Problem, fit: OutputErrorFit) -> Uncertainty:
         1.0,
         problem.latency_range_s,
         fixed_latency=problem.fixed_latency_s is not None,
+        kinks=kinks_of(problem),
     )

@@ -417,6 +417,12 @@ def with_rows(refined: Refined) -> Refined:
     return dataclasses.replace(refined, normal=normal)
 
 
+def kinks_of(problem: Problem) -> float:
+    """Return the factor on standard deviations for nonlinearity: larger with feet on the floor."""
+    free = problem.robot.base is None or problem.noise_free
+    return SETTINGS.kinks if free else SETTINGS.contact_kinks
+
+
 def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> Uncertainty:
     """Return the uncertainty of a refinement; variances are clustered if it holds linearised residuals."""
     return uncertainty(
@@ -428,7 +434,7 @@ def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> U
         problem.latency_range_s,
         fixed_latency=fixed_latency,
         timing_std_s=problem.noise.timing_std_s,
-        kinks=SETTINGS.kinks if problem.robot.base is None or problem.noise_free else SETTINGS.contact_kinks,
+        kinks=kinks_of(problem),
     )
 
 
