@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +13,7 @@ from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.options import OWN_ROBOT, File, from_settings
+from deal_hw.workflows.options import OWN_ROBOT, File, from_settings, refuse
 from deal_hw.workflows.robot import carries_robot, user_robot
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
@@ -82,8 +83,14 @@ def run(config: ReplaySettings, view: RunView) -> RunReport:
         return _rehearse(config, view, robot, path, trajectory)
     require_driver(robot, config.port)
     behaviour = ReplayBehaviour(trajectory, driver_description(robot))
+    legs = config.legs
+    if trajectory.metadata.get("stand"):
+        # The recording stands up and lies down itself. A robot that already stands would fall: its first
+        # targets are those of a lying one.
+        refuse(["--stand"] if legs.stand else [], "the recording stands up and lies down itself")
+        legs = dataclasses.replace(legs, stand=False)
     plan = RunPlan(
-        **plan_options(robot, config.link, config.legs, walks=False),
+        **plan_options(robot, config.link, legs, walks=False),
         motion="replay",
         recording=str(path.resolve()),
         seconds=behaviour.duration_s,

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.posture import PostureConfig
 from deal_hw.drivers import make_robot
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
+from deal_hw.types import Trajectory
+from deal_hw.workflows import replay
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.settings import LegOptions, LinkOptions, plan_options
 
@@ -77,3 +83,45 @@ def test_the_drivers_own_settings_are_carried_where_they_were_given() -> None:
     assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, settings).info is None  # type: ignore[attr-defined]
     with pytest.raises(ConfigurationError, match="--support-check, --state-check would have no effect"):
         make_robot("cartpole", "serial", "/dev/ttyUSB0", clock, None, settings)
+
+
+def test_a_recording_that_stands_up_is_replayed_without_standing_up(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its first targets are those of a lying robot: one that already stands would fall."""
+    empty, none, column = np.empty(0), np.empty(0, dtype=np.int64), np.ones((3, 12))
+    recording = Trajectory(
+        joint_names=DRIVER.joint_names,
+        actuated=DRIVER.actuated,
+        receive_s=empty,
+        device_s=empty,
+        position=empty,
+        velocity=empty,
+        effort=empty,
+        status=none,
+        command_sequence=none,
+        command_age_s=empty,
+        sent_s=np.array([0.0, 0.02, 0.04]),
+        sent_sequence=np.arange(3),
+        requested_position=column,
+        position_target=column,
+        stiffness=column,
+        damping=column,
+        effort_limit=column,
+        speed_limit=column,
+        metadata={"robot": "go2", "stand": True},
+    )
+    lying = dataclasses.replace(recording, metadata={"robot": "go2", "stand": False})
+    plans: list[RunPlan] = []
+    monkeypatch.setattr(replay, "run_episodes", lambda plan, **more: plans.append(plan))
+    path = tmp_path / "000000.mcap"
+    path.touch()
+
+    def replayed(found: Trajectory, **more: Any) -> bool:
+        monkeypatch.setattr(replay, "read_trajectory", lambda path: found)
+        replay.replay(path, port="127.0.0.1", legs=LegOptions(**more))
+        return plans[-1].stand
+
+    assert replayed(lying) and not replayed(recording) and not replayed(recording, stand=False)
+    with pytest.raises(ConfigurationError, match="the recording stands up and lies down itself"):
+        replayed(recording, stand=True)

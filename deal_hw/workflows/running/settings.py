@@ -21,7 +21,8 @@ class LegOptions:
     """Options of a robot with legs."""
 
     stand: bool | None = None
-    """Whether to stand up first and lie down at the end; by default True if the robot has a rest pose."""
+    """Whether to stand up first and lie down at the end; by default True if the robot has a rest pose. A
+    recording that did both is replayed without."""
 
     velocity: str = "0,0,0"
     """Requested velocity of a walking policy: ahead, left, turn, such as 0.3,0,0 [m/s, m/s, rad/s]; or remote
