@@ -17,7 +17,7 @@ from deal_hw.control.process_channel import ARMING, CONNECTING, HANDING_BACK, HO
 from deal_hw.control.repeater import Repeater
 from deal_hw.control.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
-from deal_hw.errors import DealHwError, TransportError, TransportTimeoutError
+from deal_hw.errors import TransportError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message
 from deal_hw.types import Event, JointCommand, RobotState
@@ -337,22 +337,22 @@ class ControlLoop:
         try:
             self._robot.hand_back(timeout_s)
             self.note("handed back", "the robot's own controller has the robot again")
-        except (DealHwError, OSError) as err:
+        except Exception as err:
             self.note("warning", f"the robot did not return to its own controller: {err}")
 
     def _close(self, reason: str) -> None:
-        """Send the remaining records, then disconnect."""
+        """Send the remaining records, then disconnect.
+
+        Nothing is raised, not even for a bug: the report must say whether the robot is passive.
+        """
         try:
             now = self._clock.now_ns()
             self.note("ended", reason or "the run ended")
             self._hand_over(self._loop_timing.next_index, now, now)
-        except (DealHwError, OSError):
+        except Exception:
             self._losses += 1
-        finally:
-            try:
-                self._robot.disconnect()
-            except (TransportError, OSError):
-                pass
+        with contextlib.suppress(Exception):
+            self._robot.disconnect()
 
     def _report(self) -> LoopTimingReport:
         return self._loop_timing.report(

@@ -321,6 +321,21 @@ def test_a_recorder_that_is_gone_ends_the_run_passively(rig: Any) -> None:
     assert report.passive_confirmed
 
 
+def test_a_record_that_cannot_be_made_does_not_hide_how_the_robot_is(rig: Any) -> None:
+    """A bug while records are written, and a robot that no longer answers: the report says both."""
+
+    def silent(timeout_s: float) -> Any:
+        raise TransportTimeoutError("no answer")
+
+    def sink(record: CycleRecord) -> bool:
+        rig.transport.receive = silent
+        raise RuntimeError("cannot encode")
+
+    report = make_loop(rig, balance(), sink=sink, passive=PassiveConfig(timeout_s=0.2)).run()
+    assert (report.outcome, report.reason, report.error) == (Outcome.FAILED, "cannot encode", "RuntimeError")
+    assert not report.passive_confirmed
+
+
 def test_rich_runs_twice_alike_and_reaches_the_devices_own_limits(rig: Any) -> None:
     """The same seed gives the same motion, bit for bit; the device clamps, we do not."""
     report = make_loop(rig, RichBehaviour(DESCRIPTION, balance(), RichConfig(), 5), duration_s=4.0).run()

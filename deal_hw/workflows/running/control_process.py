@@ -74,9 +74,15 @@ def main() -> int:
             }
         )
     except Exception as err:
-        # Nothing was armed yet, since the loop reports its errors instead of raising them.
+        # Before there is a loop, nothing is armed. A loop reports its errors; if it raises one, nobody knows
+        # how the robot is, and the supervisor makes it passive.
         status.result(
-            {"outcome": "failed", "reason": str(err), "error": type(err).__name__, "passive_confirmed": True}
+            {
+                "outcome": "failed",
+                "reason": str(err),
+                "error": type(err).__name__,
+                "passive_confirmed": stopper.loop is None,
+            }
         )
     return 0
 
