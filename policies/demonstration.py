@@ -13,6 +13,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import UnknownNameError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
@@ -92,9 +93,7 @@ class PopulationDemonstration:
         self.spec_digest = spec.digest()
         self._policy, self._description = policy, description
         self._scale = np.array(spec.action_scale)
-        self._offset = np.zeros(len(spec.actuated))
-        if description.actuation == "position":
-            self._offset = np.array(spec.default_position)[list(description.actuated_index)]
+        self._offset = centre(description)
 
     @property
     def history(self) -> int:

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
@@ -98,10 +99,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self._elapsed = np.zeros(count, dtype=np.int64)
         self._recent_shares: deque[float] = deque(maxlen=100)
         self._scale = np.array(layout.action_scale)
-        self._default = np.array(layout.default_position)[list(description.actuated_index)]
-        if description.actuation == "motor":
-            # For a motor an action is an effort, so there is no reference pose.
-            self._default = np.zeros_like(self._default)
+        self._default = centre(description)
 
     @abc.abstractmethod
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
@@ -160,10 +158,10 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         """Return which members failed, (N,)."""
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Restart all members; a whole-number seed fixes everything that follows."""
-        super().reset(seed=seed if isinstance(seed, int) else None, options=options)
+        """Restart all members; a seed fixes everything that follows."""
+        super().reset(seed=seed, options=options)
         self._last_action = np.zeros((self.num_envs, len(self.layout.actuated)))
         self._restart(np.ones(self.num_envs, dtype=bool))
         return self._observe(), {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Protocol
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from deal_hw.control.velocity import FixedVelocity, VelocitySource
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
-from deal_hw.policy import BASE_QUANTITIES, ObservationBuilder, Policy, rotation_vector
+from deal_hw.policy import BASE_QUANTITIES, ObservationBuilder, Policy, PolicySpec, rotation_vector
 from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
 
 
@@ -36,30 +35,29 @@ class Behaviour(Protocol):
         ...
 
 
-def position_command(
-    description: RobotDescription,
-    target: FloatArray,
-    *,
-    stiffness: float = 1.0,
-    damping: float = 1.0,
-    effort_limit: float = 1.0,
-    speed_limit: float = 1.0,
-) -> JointCommand:
-    """Return a position target, (A,), with the description's gains and limits, each times a factor."""
+def centre(description: RobotDescription) -> FloatArray:
+    """Return the centre of signals and actions, (A,): the default pose; for motors zero effort."""
+    if description.actuation == "motor":
+        return np.zeros(len(description.actuated))
+    return np.array(description.default_position)[list(description.actuated_index)]
+
+
+def position_command(description: RobotDescription | PolicySpec, target: FloatArray) -> JointCommand:
+    """Return a position target, (A,), with the gains and limits of a robot or of a policy."""
     zeros = np.zeros(len(description.actuated))
     return JointCommand(
         position_target=np.array(target, dtype=float),
         velocity_target=zeros,
-        stiffness=stiffness * np.array(description.stiffness),
-        damping=damping * np.array(description.damping),
+        stiffness=np.array(description.stiffness),
+        damping=np.array(description.damping),
         effort=zeros,
-        effort_limit=effort_limit * np.array(description.effort_limit),
-        speed_limit=speed_limit * np.array(description.speed_limit),
+        effort_limit=np.array(description.effort_limit),
+        speed_limit=np.array(description.speed_limit),
     )
 
 
 class PolicyBehaviour:
-    """Runs a policy: target = default + scale x action, with the gains and limits of the policy's spec.
+    """Runs a policy: target = centre + scale x action, with the gains and limits of the policy's spec.
 
     Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on. A requested velocity
     is clipped to the policy's training range, if its spec contains one.
@@ -95,17 +93,7 @@ class PolicyBehaviour:
         self._policy = policy
         self._observations = ObservationBuilder(spec)
         self._scale = np.array(spec.action_scale)
-        self._default = np.array(spec.default_position)[list(description.actuated_index)]
-        zeros = np.zeros(len(spec.actuated))
-        self._template = JointCommand(
-            zeros,
-            zeros,
-            np.array(spec.stiffness),
-            np.array(spec.damping),
-            zeros,
-            np.array(spec.effort_limit),
-            np.array(spec.speed_limit),
-        )
+        self._centre = centre(description)
         self.action: FloatArray | None = None
 
     def reset(self) -> None:
@@ -127,7 +115,7 @@ class PolicyBehaviour:
             )
         self.action = np.clip(action, -1.0, 1.0)
         self._observations.record_action(self.action)
-        return dataclasses.replace(self._template, position_target=self._default + self._scale * self.action)
+        return position_command(self._policy.spec, self._centre + self._scale * self.action)
 
     def _coordinates(self, state: RobotState) -> tuple[FloatArray, FloatArray]:
         """Return positions and velocities in the policy's layout, with the base's first if it needs them."""
@@ -153,8 +141,7 @@ class HoldBehaviour:
     action: FloatArray | None = None
 
     def __init__(self, description: RobotDescription, position: FloatArray | None = None) -> None:
-        default = np.array(description.default_position)[list(description.actuated_index)]
-        self._command = position_command(description, default if position is None else position)
+        self._command = position_command(description, centre(description) if position is None else position)
 
     def reset(self) -> None:
         """No memory to clear."""

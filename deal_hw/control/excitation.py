@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour, position_command
+from deal_hw.control.behaviours import Behaviour, centre, position_command
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.schema import STRICT
@@ -21,7 +22,7 @@ LONGEST_S = 3600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segment:
-    """A part of the run with other commanded gains and limits, as factors of the description's."""
+    """A part of the run with other commanded gains and limits, as factors of the usual ones."""
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
@@ -46,21 +47,18 @@ class Segment:
                 )
 
 
-def segment_command(
-    description: RobotDescription, segments: Sequence[Segment], target: FloatArray, fraction: float
-) -> JointCommand:
-    """Return the command for a target, with the factors of the first segment at this time."""
+def segment_command(command: JointCommand, segments: Sequence[Segment], fraction: float) -> JointCommand:
+    """Return a command with its gains and limits times the factors of the first segment at this time."""
     for part in segments:
         if part.start <= fraction < part.stop:
-            return position_command(
-                description,
-                target,
-                stiffness=part.stiffness,
-                damping=part.damping,
-                effort_limit=part.effort_limit,
-                speed_limit=part.speed_limit,
+            return dataclasses.replace(
+                command,
+                stiffness=part.stiffness * command.stiffness,
+                damping=part.damping * command.damping,
+                effort_limit=part.effort_limit * command.effort_limit,
+                speed_limit=part.speed_limit * command.speed_limit,
             )
-    return position_command(description, target)
+    return command
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +114,7 @@ class RichBehaviour:
         self._balance = balance
         self._config = config
         self._seed = seed
-        self._default = np.array(description.default_position)[list(description.actuated_index)]
+        self._centre = centre(description)
         self.action: FloatArray | None = None
         self.reset()
 
@@ -124,7 +122,7 @@ class RichBehaviour:
         """Restart with the same set-points."""
         self._rng = np.random.default_rng(self._seed)
         self._until_s = -math.inf
-        self._target = self._default
+        self._target = self._centre
         self.action = None
         if self._balance is not None:
             self._balance.reset()
@@ -134,20 +132,18 @@ class RichBehaviour:
         if self._balance is not None and time_s < self._config.balance_s:
             wanted = self._balance.command(state, time_s)
             self.action = self._balance.action
-            return self._scaled(wanted.position_target, time_s)
+            return self._scaled(wanted, time_s)
         self.action = None
         # Half a millisecond of slack: times are multiples of the control period, not exact in binary.
         if time_s + 5e-4 >= self._until_s:
             self._target = (
-                self._default + self._rng.uniform(-1.0, 1.0, self._default.shape) * self._config.amplitude
+                self._centre + self._rng.uniform(-1.0, 1.0, self._centre.shape) * self._config.amplitude
             )
             self._until_s = time_s + self._rng.uniform(*self._config.hold_s)
-        return self._scaled(self._target, time_s)
+        return self._scaled(position_command(self._description, self._target), time_s)
 
-    def _scaled(self, target: FloatArray, time_s: float) -> JointCommand:
-        return segment_command(
-            self._description, self._config.segments, target, time_s / self._config.duration_s
-        )
+    def _scaled(self, command: JointCommand, time_s: float) -> JointCommand:
+        return segment_command(command, self._config.segments, time_s / self._config.duration_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,7 +172,7 @@ class ChirpBehaviour:
     def __init__(self, description: RobotDescription, config: ChirpConfig | None = None) -> None:
         self._description = description
         self._config = config or ChirpConfig()
-        self._default = np.array(description.default_position)[list(description.actuated_index)]
+        self._centre = centre(description)
 
     def reset(self) -> None:
         """No memory to clear."""
@@ -186,4 +182,4 @@ class ChirpBehaviour:
         c = self._config
         slope = (c.high_hz - c.low_hz) / c.duration_s
         phase = 2 * math.pi * (c.low_hz * time_s + 0.5 * slope * time_s**2)
-        return position_command(self._description, self._default + c.amplitude * math.sin(phase))
+        return position_command(self._description, self._centre + c.amplitude * math.sin(phase))

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 MARGIN = 0.9
 """Share of a limit that an excitation may use; noise and the transition from balancing need the rest."""
-
-
-def centre(description: RobotDescription) -> FloatArray:
-    """Return the centre of signals, (A,): the default pose; for motors zero effort."""
-    if description.actuation == "motor":
-        return np.zeros(len(description.actuated))
-    return np.array(description.default_position)[list(description.actuated_index)]
 
 
 def room(description: RobotDescription) -> FloatArray:

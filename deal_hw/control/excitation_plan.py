@@ -16,9 +16,9 @@ from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.behaviours import Behaviour, centre, position_command
 from deal_hw.control.excitation import Segment, segment_command
-from deal_hw.control.excitation_limits import centre, fit_to_limits, room
+from deal_hw.control.excitation_limits import fit_to_limits, room
 from deal_hw.control.waveforms import (
     Arrangement,
     Law,
@@ -332,10 +332,11 @@ class ExcitationBehaviour:
         if self._balance is not None and time_s + 5e-4 < self._plan.balance_s:
             wanted = self._balance.command(state, time_s)
             self.action, self._last = self._balance.action, wanted.position_target
-            return self._scaled(wanted.position_target, time_s)
+            return self._scaled(wanted, time_s)
         self.action = None
         offset = self._plan.offsets(np.array([max(time_s, self._plan.balance_s)]))[0]
-        return self._scaled(self._centre + offset + self._left(time_s) * (self._last - self._centre), time_s)
+        target = self._centre + offset + self._left(time_s) * (self._last - self._centre)
+        return self._scaled(position_command(self._description, target), time_s)
 
     def _left(self, time_s: float) -> float:
         """Return the remaining share of the balancing's last set-point at a time."""
@@ -344,5 +345,5 @@ class ExcitationBehaviour:
         since = max(time_s - self._plan.balance_s, 0.0)
         return 1.0 - float(ease(np.array([since]), float("inf"), self._plan.ease_s)[0])
 
-    def _scaled(self, target: FloatArray, time_s: float) -> JointCommand:
-        return segment_command(self._description, self._plan.segments, target, time_s / self._plan.seconds)
+    def _scaled(self, command: JointCommand, time_s: float) -> JointCommand:
+        return segment_command(command, self._plan.segments, time_s / self._plan.seconds)

@@ -130,6 +130,32 @@ def test_rich_segments_scale_gains_and_limits() -> None:
     )
 
 
+def test_balancing_keeps_the_policys_own_gains() -> None:
+    """A policy trained at half the robot's gains balances with these, times the segment's factors."""
+    soft = dataclasses.replace(
+        SPEC, stiffness=(40.0,), damping=(4.0,), effort_limit=(2.0,), speed_limit=(0.5,)
+    )
+    half = Segment(start=0.0, stop=1.0, stiffness=0.5)
+    config = RichConfig(balance_s=1.0, segments=(half,))
+    behaviour = RichBehaviour(DESCRIPTION, PolicyBehaviour(LinearPolicy(soft), DESCRIPTION), config, seed=0)
+    command = behaviour.command(at(0.05), 0.0)
+    sent = (command.stiffness, command.damping, command.effort_limit, command.speed_limit)
+    assert [part[0] for part in sent] == [20.0, 4.0, 2.0, 0.5]
+    assert behaviour.command(at(0.05), 2.0).stiffness[0] == 40.0
+
+
+def test_motions_of_motors_are_around_no_effort() -> None:
+    """For a motor a command is an effort: its default pose, 0.1 rad here, is none."""
+    motor = dataclasses.replace(DESCRIPTION, actuation="motor", default_position=(0.1, 0.0))
+    assert HoldBehaviour(motor).command(NOWHERE, 0.0).position_target[0] == 0.0
+    assert ChirpBehaviour(motor).command(NOWHERE, 0.0).position_target[0] == 0.0
+    rich = RichBehaviour(motor, None, RichConfig(balance_s=0.0, amplitude=1e-6), seed=0)
+    assert abs(rich.command(NOWHERE, 0.0).position_target[0]) <= 1e-6
+    spec = dataclasses.replace(SPEC, default_position=(0.1, 0.0))
+    still = LinearPolicy(spec, disturb=lambda k, a: 0.0 * a)
+    assert PolicyBehaviour(still, motor).command(NOWHERE, 0.0).position_target[0] == 0.0
+
+
 def test_chirp_follows_the_integral_of_its_frequency() -> None:
     """At 1 s of 0.3..4 Hz over 4 s the phase is 2 pi (0.3 + 0.5 * 0.925) = 2 pi * 0.7625."""
     behaviour = ChirpBehaviour(DESCRIPTION)

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.excitation_limits import centre, fit_to_limits, predicted_effort, room
+from deal_hw.control.behaviours import HoldBehaviour, centre
+from deal_hw.control.excitation_limits import fit_to_limits, predicted_effort, room
 from deal_hw.control.excitation_plan import (
     FAMILIES,
     ExcitationBehaviour,
