@@ -76,9 +76,8 @@ class ScriptVelocity:
     """
 
     def __init__(self, path: Path) -> None:
-        rows = _read_script(path)
-        self._time_s = np.array([row[0] for row in rows])
-        self._velocity = np.stack([_checked(row[1:], f"{path}: line {i + 2}") for i, row in enumerate(rows)])
+        rows = np.array(_read_script(path))
+        self._time_s, self._velocity = rows[:, 0], rows[:, 1:]
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
         """Return the velocity of the last line up to this time; zero before the first."""
@@ -215,13 +214,13 @@ def _read_script(path: Path) -> list[list[float]]:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.reader(file)
             head = next(reader, [])
-            lines = [line for line in reader if line]
+            lines = [(reader.line_num, line) for line in reader if line]
     if [name.strip() for name in head] != names:
         raise ConfigurationError(
             f"{path}: its first line is {shown(','.join(head))}, expected {','.join(names)}"
         )
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=2):
+    for number, line in lines:
         try:
             row = [float(part) for part in line]
         except ValueError:
@@ -231,6 +230,7 @@ def _read_script(path: Path) -> list[list[float]]:
                 f"{path}: line {number} is {shown(','.join(line))}; expected four numbers, with increasing "
                 "times"
             )
+        _checked(row[1:], f"{path}: line {number}")
         rows.append(row)
     if not rows:
         raise ConfigurationError(f"{path} contains no line after its header; add lines of time_s,x,y,yaw")

@@ -90,6 +90,8 @@ def test_a_script_holds_each_line_until_the_next(tmp_path: Path) -> None:
         ("time_s,x,y,yaw\n1,0,0,0\n1,0,0,0\n", "line 3"),
         ("time_s,x,y,yaw\n0,9,0,0\n", "line 2"),
         ("time_s,x,y,yaw\nnan,0,0,0\n", "line 2"),
+        ("time_s,x,y,yaw\n\n\n0,9,0,0\n", "line 4"),
+        ("time_s,x,y,yaw\n\n0,0,0,0\n\n0,0,0,0\n", "line 5"),
     ],
 )
 def test_a_wrong_script_names_its_line(tmp_path: Path, text: str, words: str) -> None:
