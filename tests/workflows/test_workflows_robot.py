@@ -10,9 +10,12 @@ import pytest
 
 import deal_hw
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.robot import described, load_robot
+from deal_hw.workflows.running.supervised import InterruptedRunError
 
 
 @pytest.fixture(scope="module")
@@ -94,17 +97,43 @@ def test_a_carried_robot_leaves_with_its_shapes(made: Path, tmp_path: Path) -> N
     assert b"/scene" in (tmp_path / "out" / written[0]).read_bytes()
 
 
-def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A simulated robot is recorded, again and by its dataset; what it hides is the seed's."""
+@pytest.fixture
+def noisy(made: Path, tmp_path: Path) -> Path:
+    """The pendulum's robot.yaml with a range and noise."""
     yaml = tmp_path / "robot.yaml"
     text = (made / "robot.yaml").read_text(encoding="utf-8").replace("robot.xml", str(made / "robot.xml"))
     text = text.replace("position_range: null", "position_range: [-1.0, 1.0]").replace(
         "sensor_noise: 0.0", "sensor_noise: 0.001"
     )
     yaml.write_text(text, encoding="utf-8")
+    return yaml
+
+
+def test_ctrl_c_ends_a_program_that_records_simulations(
+    noisy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a robot, it is raised again after the recording is complete: a loop over `collect` ends."""
+    write_record = EpisodeRecorder.write
+
+    def interrupted(self: EpisodeRecorder, record: CycleRecord) -> None:
+        write_record(self, record)
+        if record.cycle == 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(EpisodeRecorder, "write", interrupted)
+    simulation = deal_hw.SimulationOptions(simulated=True)
+    with pytest.raises(InterruptedRunError, match="stopped by the operator") as raised:
+        deal_hw.collect(str(noisy), simulation=simulation, motion="chirp", episodes=2, out=tmp_path / "run")
+    assert raised.value.report.exit_code == 130 and raised.value.signal == "SIGINT"
+    (path,) = raised.value.report.paths
+    assert len(deal_hw.inspect(path).episode.trajectory.sent_s) == 6
+
+
+def test_a_rehearsal_without_a_robot(noisy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A simulated robot is recorded, again and by its dataset; what it hides is the seed's."""
     simulation = deal_hw.SimulationOptions(simulated=True, truth_seed=2, reveal_to=tmp_path / "truth.json")
     report = deal_hw.collect(
-        str(yaml), simulation=simulation, motion="chirp", seconds=3.0, out=tmp_path / "run"
+        str(noisy), simulation=simulation, motion="chirp", seconds=3.0, out=tmp_path / "run"
     )
     assert report.exit_code == 0 and report.episodes[0].states_recorded == 151
     truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop import ControlLoop, LoopConfig
+from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.safety import Safety
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.excitation import Excitation
@@ -22,7 +23,7 @@ from deal_hw.workflows.options import File, Ratio, Seed, given, refuse
 from deal_hw.workflows.robot import default_space, is_user_robot, user_robot
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
-from deal_hw.workflows.running.supervised import play_episodes
+from deal_hw.workflows.running.supervised import InterruptedRunError, play_episodes
 from deal_hw.workflows.running.view import RunView
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ def run_simulated(
 
     Raises:
         DealHwError: The robot cannot be used, or an episode failed.
+        InterruptedRunError: Ctrl-C; the recordings are complete.
     """
     try:
         from deal_hw.data.recording.dataset import Dataset
@@ -155,7 +157,11 @@ def run_simulated(
     if options.reveal_to is not None:
         write_json(Path(options.reveal_to), truth.to_json())
     reports[-1].raise_error()
-    return RunReport(dataset=dataset, episodes=tuple(reports))
+    report = RunReport(dataset=dataset, episodes=tuple(reports))
+    if report.outcome is Outcome.STOPPED:
+        # The loop made the robot passive. A program that collects in a loop must end all the same.
+        raise InterruptedRunError(report, signal.SIGINT.name)
+    return report
 
 
 def _record(
