@@ -53,13 +53,15 @@ def evaluate_batch(
     builder = ObservationBuilder(spec, (count,))
     default = home[:, list(description.actuated_index)]
     positions, velocities = [], []
+    lost = np.zeros(count, dtype=bool)
     for _ in range(round(seconds * description.control_rate_hz)):
         observation = builder.build(loop.reported_position, loop.reported_velocity)
         action = np.clip(policy.act_batch(observation), -1.0, 1.0)
         builder.record_action(action)
-        loop.step(default + np.array(spec.action_scale) * action, rng)
-        positions.append(loop.reported_position.copy())
-        velocities.append(loop.reported_velocity.copy())
+        # A robot whose physics diverged reports the home pose, which is perfect balance. It counts as fallen.
+        lost |= loop.step(default + np.array(spec.action_scale) * action, rng)
+        positions.append(np.where(lost[:, None], (0.0, np.pi), loop.reported_position))
+        velocities.append(np.where(lost[:, None], 0.0, loop.reported_velocity))
     position, velocity = np.stack(positions, axis=1), np.stack(velocities, axis=1)
     period_s = 1.0 / description.control_rate_hz
     return [balance_result(position[i], velocity[i], period_s) for i in range(count)]

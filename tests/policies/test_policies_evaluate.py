@@ -94,3 +94,19 @@ def test_batched_evaluation_tells_who_balances() -> None:
     assert [r.fell for r in good] == [False, False]
     assert [r.fell for r in bad] == [True, True]
     assert max(r.angle_error_rad for r in good) < 0.04 < min(r.angle_error_rad for r in bad)
+
+
+def test_a_robot_whose_physics_diverges_has_fallen() -> None:
+    """It reports the home pose, as if it balanced perfectly; it counts as a hanging pole."""
+    (lost,) = evaluate_batch(
+        Feedback(),
+        DESCRIPTION,
+        SPACE,
+        SPACE.nominal[None],
+        np.array([0.005]),
+        np.random.default_rng(0),
+        seconds=0.2,
+        start_position=np.array([[0.0, np.nan]]),
+        sensor=EXACT_SENSOR,
+    )
+    assert lost.fell and lost.upright_s == 0.0 and lost.angle_error_rad == pytest.approx(math.pi)
