@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError, short
 from deal_hw.parameters import ParameterDistribution
@@ -107,7 +108,9 @@ class _Member(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._late.append(np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0))
         given = self._control.of(self._late.popleft())
         observation, reward, terminated, truncated, info = self.env.step(given)
-        return np.asarray(observation, dtype=np.float32), float(reward), terminated, truncated, info
+        # An episode that fails in its last step has failed: nothing comes after it that has a value.
+        truncated = bool(truncated and not terminated)
+        return np.asarray(observation, dtype=np.float32), float(reward), bool(terminated), truncated, info
 
 
 def _made(env: str) -> Any:
@@ -199,9 +202,7 @@ def _tried(
 
 def _plain_layout(description: RobotDescription, distribution: ParameterDistribution) -> PolicySpec:
     low, high = np.array(description.limits.target).T
-    middle = np.zeros(len(low))
-    if description.actuation == "position":
-        middle = np.array(description.default_position)[list(description.actuated_index)]
+    middle = centre(description)
     scale = np.minimum(middle - low, high - middle)
     if not (np.isfinite(scale) & (scale > 0)).all() or not np.isfinite(description.effort_limit).all():
         raise ConfigurationError(
@@ -242,8 +243,5 @@ def _control(env: Any, layout: PolicySpec, description: RobotDescription) -> _Co
     if getattr(env.unwrapped, "policy_spec", None) is not None:
         # Such an environment takes the policy's actions unchanged.
         return _Control(np.zeros(A), np.ones(A), np.arange(A))
-    middle = np.zeros(A)
-    if description.actuation == "position":
-        middle = np.array(layout.default_position)[list(description.actuated_index)]
     order = np.array([actuator_of(env.unwrapped.model, name) for name in layout.actuated])
-    return _Control(middle, np.array(layout.action_scale), order)
+    return _Control(centre(description), np.array(layout.action_scale), order)

@@ -160,6 +160,22 @@ def test_a_policy_is_trained_and_exported(robot: Path, tmp_path: Path) -> None:
         assert policy.spec.action_scale == (1.0,) and policy.spec.training["algorithm"] == trainer
 
 
+def test_a_failure_in_the_last_step_is_no_timeout(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ends at once: trainers would give the failed state the value of going on."""
+    step = Swing.step
+
+    def failing(self: Swing, action: Any) -> Any:
+        seen, reward, _, truncated, info = step(self, action)
+        return seen, reward, truncated, truncated, info
+
+    env = OwnVectorEnv("Swing-v0", described(str(robot)), spread(), 1)
+    env.reset(seed=0)
+    monkeypatch.setattr(Swing, "step", failing)
+    ends = [env.step(np.zeros((1, 1)))[2:4] for _ in range(50)]
+    assert [bool(end[0]) for end in ends[-1]] == [True, False]
+    assert not any(end[0] for both in ends[:-1] for end in both)
+
+
 def test_an_environment_may_say_itself_what_it_observes(robot: Path) -> None:
     """Then nothing is tried, and its actions are the policy's."""
     env = OwnVectorEnv("SwingSpec-v0", described(str(robot)), spread(), 2)
