@@ -46,6 +46,24 @@ class Checkpoint:
                     "checkpoint of the same kind, or train with its settings"
                 )
 
+    def check_resumed(self, layout: PolicySpec, steps: int) -> None:
+        """Check that a training of so many steps in all can go on from here.
+
+        Raises:
+            CheckpointError: It is complete, or was done under another distribution.
+        """
+        if self.notes["trained_under"] != layout.trained_under:
+            raise CheckpointError(
+                f"{self.path} was trained under another distribution ({self.notes['trained_under']}, this "
+                f"training's is {layout.trained_under}); resume with the same one, or fine-tune from it "
+                "with --start"
+            )
+        if self.notes["steps"] >= steps:
+            raise CheckpointError(
+                f"{self.path} has done {self.notes['steps']} of {steps} steps: nothing is left to resume; "
+                "give more --steps, or deploy its policy"
+            )
+
     def part(self, part: str, like: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return the tensors of a part, which must have the names and shapes of ``like``.
 
@@ -113,4 +131,4 @@ def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
         raise CheckpointError(
             f"{path} is of a policy with another {', '.join(wrong)}; give a checkpoint of the same task"
         )
-    return Checkpoint(tensors=tensors, notes=notes, path=path)
+    return Checkpoint(tensors=tensors, notes={**notes, "trained_under": found.trained_under}, path=path)

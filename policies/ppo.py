@@ -108,6 +108,8 @@ class PpoTrainer:
             learner = _Learner(env, config)
             found = files.source(env.layout, read_checkpoint)
             if found is not None:
+                if files.resume:
+                    found.check_resumed(env.layout, config.steps)
                 learner.load(found, whole=files.resume)
                 # Another seed than at the start, to get other episodes.
                 seed = int(np.random.default_rng([seed, learner.steps]).integers(2**31))

@@ -121,14 +121,15 @@ class SacTrainer:
             adapter = _Adapter(env, seed)
             model = _model(adapter, config, seed)
             if found is not None:
+                if files.resume:
+                    found.check_resumed(env.layout, config.steps)
                 _load(model, config, found)
                 model.num_timesteps = done
             if files.resume and files.checkpoint is not None:
                 restore_optimisers(model_path(files.checkpoint), model)
             mean = _MeanActor(config.steps * (1.0 - config.averaged))
             report = _Report(adapter, config, progress, files, log)
-            if done < config.steps:
-                model.learn(config.steps - done, callback=[mean, report], reset_num_timesteps=False)
+            model.learn(config.steps - done, callback=[mean, report], reset_num_timesteps=False)
             report.keep()
         actor = mean.apply(model)
         network = torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh())

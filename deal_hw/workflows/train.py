@@ -294,7 +294,7 @@ def train_policy(
         "started_from": str(files.start or "") if files is not None else "",
         "seconds": spent.get("seconds", 0.0) + time.monotonic() - started,
         "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
-        "resumed": bool(spent),
+        "resumed": files is not None and files.resume,
     }
     # `deploy` reads the calibration's verdict from the policy.
     training = {**policy.spec.training, **({VERDICT: verdict} if verdict else {})}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import zipfile
 from pathlib import Path
@@ -161,6 +162,17 @@ def test_a_resumed_training_takes_up_the_optimisers_memory(kept: Path, tmp_path:
         next(fresh.policy.parameters()).add_(1.0)
     assert not restore_optimisers(model_path(kept), fresh)
     assert not restore_optimisers(tmp_path / "none.zip", fresh)
+
+
+def test_only_the_same_unfinished_training_is_resumed(kept: Path) -> None:
+    """A complete one would lose its averaged weights; of another distribution it would claim all steps."""
+    rng, files = np.random.default_rng(0), TrainingFiles(checkpoint=kept, resume=True)
+    with pytest.raises(CheckpointError, match="has done 800 of 800 steps: nothing is left to resume"):
+        SacTrainer().train(toy(), SHORT, rng, files=files)
+    other = dataclasses.replace(TOY, latency_s=(0.0, 0.001))
+    env = CartPoleEnv(DESCRIPTION, other, 4, task=TASK, sensor=EXACT_SENSOR)
+    with pytest.raises(CheckpointError, match=r"trained under another distribution .* with --start"):
+        SacTrainer().train(env, dataclasses.replace(SHORT, steps=900), rng, files=files)
 
 
 def test_models_that_are_none_are_refused(tmp_path: Path) -> None:
