@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -52,6 +53,12 @@ def test_same_seed_same_episode() -> None:
     np.testing.assert_array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
     assert runs[0].dtype == np.float32
+
+
+def test_a_seed_that_cannot_be_used_is_refused() -> None:
+    """A seed for each member, as other environments take, would fix nothing here."""
+    with pytest.raises(gymnasium.error.Error, match="Seed must be a python integer"):
+        exact_env(2).reset(seed=[1, 2])  # type: ignore[arg-type]
 
 
 def test_every_member_draws_its_own_physics_and_draws_anew() -> None:
