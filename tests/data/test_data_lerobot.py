@@ -166,6 +166,21 @@ def test_lost_samples_are_filled_flagged_and_left_out_on_the_way_back(
     np.testing.assert_allclose(back.position, cut.position[1:], atol=1e-6)
 
 
+def test_commands_during_lost_samples_survive(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
+    """Samples 301 to 312 report commands 75 to 77: these were sent, although no sample shows them."""
+    ramp = 1e-3 * np.arange(200)[:, None]
+    whole = make_trajectory(position_target=ramp, requested_position=ramp)
+    cut = make_trajectory(position_target=ramp, **without(whole, slice(301, 313)))
+    export_lerobot([cut], tmp_path / "out")
+    frames = pq.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
+    action = np.array(frames.column("action").to_pylist())
+    # The first sample has no command and is no frame.
+    np.testing.assert_allclose(action, ramp[whole.command_sequence[1:], 0], atol=1e-7)
+    (back,) = load_tables(tmp_path / "out")
+    assert back.time_s.size == 787
+    np.testing.assert_allclose(np.unique(back.target), ramp[:, 0].astype(np.float32), atol=1e-9)
+
+
 def test_a_recording_that_would_mostly_be_filled_is_refused(
     make_trajectory: MakeTrajectory, tmp_path: Path
 ) -> None:

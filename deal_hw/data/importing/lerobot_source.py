@@ -181,9 +181,10 @@ def _stamped(arrays: dict[str, FloatArray], fps: float) -> dict[str, FloatArray]
     if "command_age" in arrays:  # Written by our own export: the start of each action.
         sent = np.round(arrays["timestamp"] - arrays["command_age"], 6)
         arrays["command_time_s"] = np.maximum.accumulate(sent)
-    lost = arrays.pop("filled", np.zeros(1))
-    if lost.any():  # Interpolated by our own export: no measurement.
-        arrays = {name: values[lost == 0] for name, values in arrays.items()}
+    filled = arrays.pop("filled", np.zeros(1)) != 0
+    if filled.any():  # Interpolated by our own export: no measurement, but the commands were sent.
+        for name in (name for name in arrays if name.startswith("observation.")):
+            arrays[name][filled] = np.nan
     return {name: values for name, values in arrays.items() if name not in _DROPPED}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,7 @@ from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
 from deal_hw.data.recording.spikes import position_units
 from deal_hw.errors import DatasetError, short
-from deal_hw.types import FloatArray, Trajectory
+from deal_hw.types import FloatArray, IntArray, Trajectory
 
 _QUANTITIES = ("pos", "position", "vel", "velocity", "effort", "torque")
 
@@ -147,13 +148,7 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
 
 def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
     """Return a trajectory as a table, with commands at the device time of their start."""
-    seen = trajectory.command_sequence
-    order = {int(number): row for row, number in enumerate(trajectory.sent_sequence)}
-    numbers, first = np.unique(seen, return_index=True)
-    known = [(order[int(n)], int(at)) for n, at in zip(numbers, first, strict=True) if int(n) in order]
-    rows = np.array([row for row, _ in known], dtype=np.int64)
-    at = np.array([sample for _, sample in known], dtype=np.int64)
-    age = np.nan_to_num(trajectory.command_age_s[at]) if at.size else np.empty(0)
+    rows, command_s = _receptions(trajectory)
     return Table(
         joint_names=trajectory.joint_names,
         actuated=trajectory.actuated,
@@ -162,12 +157,38 @@ def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
         position=trajectory.position,
         velocity=trajectory.velocity,
         effort=trajectory.effort if np.isfinite(trajectory.effort).any() else None,
-        command_s=trajectory.device_s[at] - age if at.size else np.empty(0),
+        command_s=command_s,
         target=trajectory.position_target[rows],
         orientation=None,
         gyro=None,
         source={"file": name, "part": "", "kind": "deal-hw", "sha256": "", "columns": [], "notes": []},
     )
+
+
+def _receptions(trajectory: Trajectory) -> tuple[IntArray, FloatArray]:
+    """Return the commands that came into force, (C,), and the device time of each, (C,) [s].
+
+    A command that no sample reports was lost, unless no sample came while it would have been reported. Then
+    it is placed by the clocks' offset, which follows from the reported commands.
+    """
+    row_of = {int(number): row for row, number in enumerate(trajectory.sent_sequence)}
+    numbers, first = np.unique(trajectory.command_sequence, return_index=True)
+    received_s = trajectory.device_s[first] - np.nan_to_num(trajectory.command_age_s[first])
+    begins = {
+        row_of[int(n)]: float(at) for n, at in zip(numbers, received_s, strict=True) if int(n) in row_of
+    }
+    reported = sorted(begins)
+    sent_s = trajectory.sent_s
+    offset = float(np.median([begins[row] - sent_s[row] for row in reported])) if reported else 0.0
+    for before, after in itertools.pairwise(reported):
+        for row in range(before + 1, after):
+            begin = float(sent_s[row] + offset)
+            until = begins[after] if row + 1 == after else float(sent_s[row + 1] + offset)
+            sampled = np.searchsorted(trajectory.device_s, [begin, until])
+            if begins[before] < begin < until and sampled[0] == sampled[1]:
+                begins[row] = begin
+    rows = np.array(sorted(begins), dtype=np.int64)
+    return rows, np.array([begins[int(row)] for row in rows])
 
 
 def _ordered(
