@@ -141,6 +141,21 @@ def test_npz_arrays(tmp_path: Path) -> None:
         load_tables(tmp_path / "b.npz", joints=("u", "v"))
 
 
+def test_npz_with_several_lists_of_names(tmp_path: Path) -> None:
+    """The names of the joints count, whatever other text is in the file; without them none does."""
+    time = np.arange(4.0)
+    position = np.stack([time, -time], axis=1)
+    arrays: dict[str, Any] = {"time": time, "dof_pos": position, "dof_target": np.ones((4, 2))}
+    others: dict[str, Any] = {"actuator_names": np.array(["knee", "hip"]), "task": np.array(["walk"])}
+    np.savez(tmp_path / "a.npz", joint_names=np.array(["hip", "knee"]), **arrays, **others)
+    told: list[str] = []
+    (table,) = load_tables(tmp_path / "a.npz", joints=("hip", "knee"), say=told.append)
+    np.testing.assert_array_equal(table.position, position)
+    assert any("actuator_names is left out: not the joints' names" in line for line in told)
+    np.savez(tmp_path / "b.npz", **arrays, **others)
+    assert read_npz(tmp_path / "b.npz").joint_names == ()
+
+
 def test_npz_never_unpickles(tmp_path: Path) -> None:
     """A pickled object is left out with a note; a file of another kind is refused."""
     np.savez(

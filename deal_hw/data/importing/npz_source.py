@@ -11,12 +11,16 @@ from deal_hw.data.importing.channels import Channels, as_floats, digest_of_file
 from deal_hw.errors import DatasetError, short
 from deal_hw.reading import NAMES, RECORDING_BYTES, check_size, read_arrays, reading
 
+JOINT_NAMES = ("joint_names", "joints", "dof_names", "names")
+"""Arrays of text that name the joints."""
+
 
 def read_npz(path: Path) -> Channels:
     """Read the arrays of numbers, (T,) or (T, K), and the joint names of an NPZ file.
 
-    Joint names are a one-dimensional array of text. Arrays of other shapes or kinds are left out with a note;
-    so are pickled objects, which could run anything. Sizes are limited, see :mod:`deal_hw.reading`.
+    Joint names are the one-dimensional array of text; of several, the one named as in :data:`JOINT_NAMES`.
+    Arrays of other shapes or kinds are left out with a note, and so are pickled objects, which could run
+    anything. Sizes are limited, see :mod:`deal_hw.reading`.
 
     Raises:
         DatasetError: It cannot be read.
@@ -31,13 +35,12 @@ def read_npz(path: Path) -> Channels:
                     f"{path} holds one unnamed array; save it with numpy.savez(path, time=...)"
                 )
         found, left_out = read_arrays(path, _is_channel)
-        joint_names: tuple[str, ...] = ()
-        arrays = {}
-        for name, values in found.items():
-            if values.dtype.kind in "US":
-                joint_names = tuple(str(text) for text in values.astype(str))
-            else:
-                arrays[name] = as_floats(values)
+        texts = {name: values for name, values in found.items() if values.dtype.kind in "US"}
+        arrays = {name: as_floats(values) for name, values in found.items() if name not in texts}
+        # With several, such as names of actuators or bodies too, the wrong one would swap joints.
+        chosen = list(texts) if len(texts) < 2 else [name for name in JOINT_NAMES if name in texts][:1]
+        joint_names = tuple(str(text) for name in chosen for text in texts[name].astype(str))
+        left_out |= {name: "not the joints' names" for name in texts if name not in chosen}
     notes = tuple(f"{short(name, 60)} is left out: {why}" for name, why in left_out.items())
     return Channels(path=path, kind="npz", digest=digest, arrays=arrays, joint_names=joint_names, notes=notes)
 
