@@ -131,6 +131,21 @@ def test_actuator_table_by_hand(robot: RobotModel, result: CalibrationResult) ->
         assert not any("shoulder.stiffness" in text for text in part["cannot_express"])
 
 
+def test_armature_and_damping_of_an_actuator_count(robot: RobotModel, result: CalibrationResult) -> None:
+    """They act on the joint as its own do, times the gear squared: MuJoCo's mass matrix is the judge."""
+    model = robot.model
+    before = model.dof_M0[robot.qvel[0]]
+    model.actuator_armature[0], model.actuator_damping[0] = 0.5, 0.1
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    added = model.dof_M0[robot.qvel[0]] - before
+    isaac = actuator_tables(robot, result)["isaac_lab"]
+    assert isaac["armature"]["shoulder"] == pytest.approx(0.03 + added) == pytest.approx(0.03 + 0.5 * 3**2)
+    # kv 1 * 3^2, the joint's own 0.2, the actuator's 0.1 * 3^2.
+    assert isaac["damping"]["shoulder"] == pytest.approx(10.1)
+    dynamics = urdf_values(robot, result)["joints"]["shoulder"]["dynamics"]
+    assert dynamics == {"damping": pytest.approx(1.1), "friction": 0.1}
+
+
 def test_urdf_side_by_hand(robot: RobotModel, result: CalibrationResult) -> None:
     """Inertia scales with the mass and is turned into the link's frame; gains have no place."""
     values = urdf_values(robot, result)

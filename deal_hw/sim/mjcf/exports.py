@@ -56,7 +56,7 @@ _MJLAB = (
 _URDF = (
     "armature has no field: most importers set 0",
     "stiffness, the servo's D gain and delays have no field: they go into the controller's settings",
-    "damping is the joint's own alone",
+    "damping is the joint's and its actuator's alone",
     "contact friction and restitution have no field",
 )
 
@@ -148,7 +148,7 @@ def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
             limit["lower"], limit["upper"] = map(float, model.jnt_range[index])
         if joint in description.actuated:
             row = _actuator(robot, model, result, description.actuated.index(joint))
-            limit["effort"] = row["effort_limit"]
+            limit["effort"], damping = row["effort_limit"], row["joint_damping"]
         joints[joint] = {"dynamics": {"damping": damping, "friction": friction}, "limit": limit}
     moved = [p for p in result.space.parameters if p.kind in _BODY_KINDS]
     bodies = dict.fromkeys(name for parameter in moved for name in parameter.elements)
@@ -200,8 +200,9 @@ def _actuator(robot: RobotModel, model: Any, result: CalibrationResult, number: 
     return {
         "stiffness": kp * gear**2 if servo else None,
         "damping": -float(bias[2]) * gear**2 if servo else None,
-        "joint_damping": float(model.dof_damping[dof]),
-        "armature": float(model.dof_armature[dof]),
+        # MuJoCo adds those of the actuator to those of the joint.
+        "joint_damping": float(model.dof_damping[dof] + gear**2 * model.actuator_damping[actuator]),
+        "armature": float(model.dof_armature[dof] + gear**2 * model.actuator_armature[actuator]),
         "friction": float(model.dof_frictionloss[dof]),
         "effort_limit": effort,
         "velocity_limit": _device_value(robot, result, "servo_speed_limit", number),
