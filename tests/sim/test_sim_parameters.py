@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -14,8 +15,10 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.sim.mjcf.calibrated import LATENCY_NUMERIC, SPEED_LIMIT_NUMERIC, write_calibrated_mjcf
+from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.parameters import KINDS, apply_parameters
 from deal_hw.sim.parameters.fields import ModelFields, element_id
+from deal_hw.sim.parameters.yaml_space import parse_space
 
 
 def test_mass_takes_the_inertia_along() -> None:
@@ -45,6 +48,25 @@ def test_servo_parameters_are_gain_bias_and_range() -> None:
     assert model.actuator_gainprm[0, 0] == 50.0
     assert model.actuator_biasprm[0, :3].tolist() == [0.0, -50.0, -3.0]
     assert model.actuator_forcerange[0].tolist() == [-2.5, 2.5]
+
+
+def test_a_sent_effort_limit_acts_beside_an_actuator_without_one(tmp_path: Path) -> None:
+    """One servo has a forcerange, the other none: the host's smaller limit acts on the first."""
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+        <body pos="0 0 0.3"><joint name="b" axis="0 1 0"/><geom size="0.1"/></body></body></worldbody>
+        <actuator><position name="a" joint="a" kp="9" forcerange="-4 4"/>
+        <position name="b" joint="b" kp="9"/></actuator></mujoco>"""
+    )
+    rates = sampling(0.01, 0.002, 0.2)
+    description = describe(path, mujoco.MjModel.from_xml_path(str(path)), ["a", "b"], ["a", "b"], rates)
+    entry = "parameters: [{kind: servo_stiffness, elements: a}]"
+    robot = load_model(description)
+    batch = ServoBatch(robot, parse_space(entry, robot.model), 1, threads=1)
+    gains = np.full(2, 9.0), np.zeros(2)
+    batch.set_sent(*gains, np.array([1.5, np.inf]))
+    assert batch.batch.expand("actuator_forcerange")[0].tolist() == [[-1.5, 1.5], [0.0, 0.0]]
 
 
 @pytest.mark.parametrize("name", [p.name for p in parameter_space()])

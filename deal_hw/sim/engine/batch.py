@@ -164,13 +164,13 @@ class ServoBatch:
         force = self._fields.get("actuator_forcerange")
         kp, kd = self._act("servo_stiffness", stiffness), self._act("servo_damping", damping)
         limit = self._act("servo_effort_limit", effort_limit)
-        actuator = list(self.robot.actuator)
+        actuator = np.array(self.robot.actuator)
         gain[:, actuator, 0] = kp
         bias[:, actuator, 1] = -kp
         bias[:, actuator, 2] = -kd
-        if np.isfinite(limit).all():
-            force[:, actuator, 0] = -limit
-            force[:, actuator, 1] = limit
+        limited = np.isfinite(limit).all(axis=0)
+        force[:, actuator[limited], 0] = -limit[:, limited]
+        force[:, actuator[limited], 1] = limit[:, limited]
 
     def set_state(
         self,
