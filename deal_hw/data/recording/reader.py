@@ -16,7 +16,7 @@ from mcap.records import Message as McapMessage
 from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.recording.schemas import BODY, CHANNELS, OLD_TOPICS, STANDARD, RosMessageType, message_type
+from deal_hw.data.recording.schemas import BODY, OLD_TOPICS, RosMessageType, message_type
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -188,15 +188,19 @@ class _Content:
 
     Attributes:
         preamble: Values given to the recorder.
-        state: The state samples, at least one.
-        body: Sensor values of the body; None for robots without legs.
+        tables: Fields of the messages without text, by topic; none of a topic without messages.
         rows: Values of the other messages, by topic.
     """
 
     preamble: Mapping[str, str]
-    state: npt.NDArray[np.void]
-    body: npt.NDArray[np.void] | None
+    tables: Mapping[str, _Fields]
     rows: Mapping[str, Sequence[tuple[Any, ...]]]
+
+
+_TABLES = ("/state", "/body", "/command", "/command/requested")
+"""Topics of messages without text."""
+_Fields = dict[str, npt.NDArray[Any]]
+"""Values of each field of N messages, by name, (N,) or (N, K)."""
 
 
 class _Table:
@@ -205,7 +209,8 @@ class _Table:
     def __init__(self, kind: RosMessageType) -> None:
         self._kind = kind
         self._waiting: list[bytes] = []
-        self._blocks: list[npt.NDArray[np.void]] = []
+        self._layout: np.dtype[np.void] | None = None
+        self._blocks: dict[str, list[npt.NDArray[Any]]] = {name: [] for _, name in kind.fields}
 
     def append(self, data: bytes) -> None:
         """Take the next message."""
@@ -213,24 +218,29 @@ class _Table:
         if len(self._waiting) == _BLOCK:
             self._decode()
 
-    def records(self) -> npt.NDArray[np.void] | None:
-        """Return all messages, (N,); None where there are none."""
+    def fields(self) -> _Fields:
+        """Hand over all messages; nothing where there are none."""
         if self._waiting:
             self._decode()
-        return np.concatenate(self._blocks) if self._blocks else None
+        if self._layout is None:
+            return {}
+        # One field after the other, so that there is never a second copy of all of them.
+        return {name: np.concatenate(self._blocks.pop(name)) for name in list(self._blocks)}
 
     def _decode(self) -> None:
-        self._blocks.append(self._kind.decode_all(self._waiting))
+        block = self._kind.decode_all(self._waiting)
         self._waiting = []
-        if self._blocks[-1].dtype != self._blocks[0].dtype:
+        if self._layout not in (None, block.dtype):
             raise ProtocolError(f"{self._kind.name}: the messages have different lengths")
+        self._layout = block.dtype
+        for name, values in self._blocks.items():
+            values.append(block[name].copy())
 
 
 def _collect(path: Path) -> _Content:
     preamble: dict[str, str] | None = None
-    tables = {topic: _Table(message_type(topic)) for topic in ("/state", "/body")}
-    wanted = [topic for topic in CHANNELS if topic not in STANDARD and not topic.startswith("/wire/")]
-    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in wanted}
+    tables = {topic: _Table(message_type(topic)) for topic in _TABLES}
+    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in ("/cycle", "/events")}
     channels: dict[int, Channel] = {}
     for found in _records(path):
         if isinstance(found.record, Metadata) and found.record.name == METADATA_NAME:
@@ -249,29 +259,29 @@ def _collect(path: Path) -> _Content:
             "import a "
             "foreign file with `deal-hw data import`"
         )
-    state, body = (table.records() for table in tables.values())
-    if state is None:
+    found_in = {topic: fields for topic, table in tables.items() if (fields := table.fields())}
+    if "/state" not in found_in:
         raise EmptyRecordingError(
             f"{path} contains no state sample: the robot sent none; check it with `deal-hw doctor` and "
             "record again"
         )
-    return _Content(preamble, state, body, rows)
+    return _Content(preamble, found_in, rows)
 
 
 def _episode(path: Path, content: _Content) -> Episode:
-    preamble, state, rows = content.preamble, content.state, content.rows
+    preamble, tables, rows = content.preamble, content.tables, content.rows
+    state, body = tables["/state"], tables.get("/body")
     description = read_json(dict[str, Any], preamble["description"])
     check_description(description)
     metadata = read_json(dict[str, Any], preamble["metadata"])
     J, A = len(description["joint_names"]), len(description["actuated"])
     start_ns, device_start_ns = int(state["receive_ns"][0]), int(state["device_ns"][0])
-    numbers = state["sequence"].copy()
-    cycles = _cycles(rows, start_ns, A)
+    cycles = _cycles(rows["/cycle"], tables.get("/command/requested"), start_ns, A)
     for name in ("position", "velocity", "effort"):
         _check_width(state[name].shape[1], J)
     facts = {
         "description": description,
-        "lost_frames": lost_frames(numbers),
+        "lost_frames": lost_frames(state["sequence"]),
         "hand_over_losses": hand_over_losses(cycles),
         "start_ns": start_ns,
     }
@@ -280,19 +290,19 @@ def _episode(path: Path, content: _Content) -> Episode:
         actuated=tuple(description["actuated"]),
         receive_s=_since(state["receive_ns"], start_ns),
         device_s=_since(state["device_ns"], device_start_ns),
-        position=state["position"].copy(),
-        velocity=state["velocity"].copy(),
-        effort=state["effort"].copy(),
+        position=state["position"],
+        velocity=state["velocity"],
+        effort=state["effort"],
         status=state["status"].astype(np.int64),
-        command_sequence=state["command_sequence"].copy(),
+        command_sequence=state["command_sequence"],
         command_age_s=_seconds_or_nan(state["command_age_ns"]),
         events=tuple(
             Event(stamp, kind, text, read_json(dict[str, Any], data))
             for stamp, kind, text, data in rows["/events"]
         ),
         metadata={**metadata, **facts},
-        body=None if content.body is None else _body(content.body, state),
-        **_commands(rows, start_ns, A),
+        body=None if body is None else _body(body, state),
+        **_commands(tables.get("/command"), tables.get("/command/requested"), start_ns, A),
     )
     return Episode(
         path=path,
@@ -302,54 +312,72 @@ def _episode(path: Path, content: _Content) -> Episode:
         anchor_ns=int(preamble["host_ns"]),
         start_ns=start_ns,
         device_start_ns=device_start_ns,
-        sequence=numbers,
+        sequence=state["sequence"],
         trajectory=trajectory,
         cycles=cycles,
     )
 
 
-def _body(table: npt.NDArray[np.void], state: npt.NDArray[np.void]) -> BodyTrajectory:
-    """Return the body's sensor values at each state sample, matched by stamp and number."""
-    row_of = {key: row for row, key in enumerate(_keys(table))}
-    row = np.array([row_of.get(key, -1) for key in _keys(state)])
+def _body(table: _Fields, state: _Fields) -> BodyTrajectory:
+    """Return the body's sensor values at each state sample, by stamp and number; empties the table."""
+    if all(np.array_equal(table[name], state[name]) for name in ("receive_ns", "sequence")):
+        row = np.arange(len(state["sequence"]))
+    else:
+        row_of = {key: row for row, key in enumerate(_keys(table))}
+        row = np.array([row_of.get(key, -1) for key in _keys(state)])
     columns = {}
     for field, (_, name) in zip(dataclasses.fields(BodyTrajectory), BODY.fields[2:], strict=True):
-        values = table[name].astype(np.float64)[row]
-        values[row < 0] = np.nan
+        values = table.pop(name)[row]
+        if name == "buttons":
+            values[row < 0] = -1
+        else:
+            values = values.astype(np.float64, copy=False)
+            values[row < 0] = np.nan
         columns[field.name] = values
-    buttons = np.where(row < 0, -1, table["buttons"][row])
-    return BodyTrajectory(**{**columns, "buttons": buttons})
+    return BodyTrajectory(**columns)
 
 
-def _keys(table: npt.NDArray[np.void]) -> Iterator[tuple[int, int]]:
+def _keys(table: _Fields) -> Iterator[tuple[int, int]]:
     """Yield stamp and number of each sample."""
     return zip(table["receive_ns"].tolist(), table["sequence"].tolist(), strict=True)
 
 
-def _commands(rows: Mapping[str, Sequence[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:
+def _commands(
+    sent: _Fields | None, requested: _Fields | None, start_ns: int, actuated: int
+) -> dict[str, Any]:
     """Return the command fields of a Trajectory."""
-    sent = rows["/command"]
-    asked = {row[1]: row[3] for row in rows["/command/requested"]}
-    nothing = np.full(actuated, np.nan)
+    names = ("position_target", "stiffness", "damping", "effort_limit", "speed_limit")
+    if sent is None:
+        nothing = dict.fromkeys(("requested_position", *names), np.empty((0, actuated)))
+        return {"sent_s": np.empty(0), "sent_sequence": np.empty(0, dtype=np.int64), **nothing}
+    for name in names:
+        _check_width(sent[name].shape[1], actuated)
     return {
-        "sent_s": _since([row[0] for row in sent], start_ns),
-        "sent_sequence": np.array([row[2] for row in sent], dtype=np.int64),
-        "requested_position": _table([asked.get(row[1], nothing) for row in sent], actuated),
-        "position_target": _table([row[3] for row in sent], actuated),
-        "stiffness": _table([row[5] for row in sent], actuated),
-        "damping": _table([row[6] for row in sent], actuated),
-        "effort_limit": _table([row[8] for row in sent], actuated),
-        "speed_limit": _table([row[9] for row in sent], actuated),
+        "sent_s": _since(sent["stamp_ns"], start_ns),
+        "sent_sequence": sent["sequence"],
+        "requested_position": _requested(requested, sent["cycle"], actuated),
+        **{name: sent[name] for name in names},
     }
 
 
-def _cycles(rows: Mapping[str, Sequence[tuple[Any, ...]]], start_ns: int, actuated: int) -> CycleTable:
-    table = rows["/cycle"]
-    asked = {row[1]: row[3] for row in rows["/command/requested"]}
+def _requested(requested: _Fields | None, cycle: IntArray, actuated: int) -> FloatArray:
+    """Return the position targets that were requested in each cycle, (N, A); NaN for none."""
+    found = np.full((len(cycle), actuated), np.nan)
+    if requested is not None:
+        _check_width(requested["position_target"].shape[1], actuated)
+        row_of = {number: row for row, number in enumerate(requested["cycle"].tolist())}
+        row = np.array([row_of.get(number, -1) for number in cycle.tolist()], dtype=np.int64)
+        found[row >= 0] = requested["position_target"][row[row >= 0]]
+    return found
+
+
+def _cycles(
+    table: Sequence[tuple[Any, ...]], requested: _Fields | None, start_ns: int, actuated: int
+) -> CycleTable:
     width = max((row[7].size for row in table), default=0)
-    nothing = np.full(actuated, np.nan)
+    cycle = np.array([row[0] for row in table], dtype=np.int64)
     return CycleTable(
-        cycle=np.array([row[0] for row in table], dtype=np.int64),
+        cycle=cycle,
         deadline_s=_since([row[1] for row in table], start_ns),
         start_s=_since([row[2] for row in table], start_ns),
         state_age_s=_seconds_or_nan([row[3] for row in table]),
@@ -357,7 +385,7 @@ def _cycles(rows: Mapping[str, Sequence[tuple[Any, ...]]], start_ns: int, actuat
         lost=np.array([row[4] for row in table], dtype=np.int64),
         safety_state=tuple(row[8] for row in table),
         action=_table([row[7] if row[6] else np.full(width, np.nan) for row in table], width),
-        requested_position=_table([asked.get(row[0], nothing) for row in table], actuated),
+        requested_position=_requested(requested, cycle, actuated),
     )
 
 
