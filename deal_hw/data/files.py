@@ -12,18 +12,19 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mcap.writer import MCAP0_MAGIC
 
 from deal_hw.errors import DatasetError, EmptyRecordingError
-from deal_hw.reading import read_bytes, reading
+from deal_hw.reading import check_size, reading
 
 INDEX_NAME = "dataset.json"
 """File name of a dataset's index."""
 MAX_EPISODE_BYTES = 4 << 30
-"""Largest episode, since it is read into memory as a whole; a Go2 with its raw bytes records at most 0.7 MB/s
+"""Largest episode, since its samples are kept in memory; a Go2 with its raw bytes records at most 0.7 MB/s
 [B]."""
+_WINDOW_BYTES = 1 << 20
 
 
 def sha256_of(path: Path) -> hashlib._Hash:
@@ -39,25 +40,72 @@ def sha256_of(path: Path) -> hashlib._Hash:
     return found
 
 
-def read_episode_bytes(path: Path) -> bytes:
-    """Return an MCAP file as bytes.
+class EpisodeFile:
+    """The bytes of a file, read where they are needed; slices and :meth:`find` work as those of ``bytes``.
+
+    Args:
+        path: Its name in messages.
+        file: An ordinary file, open for reading.
+    """
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        self._path = path
+        self._descriptor = file.fileno()
+        self._size = os.fstat(self._descriptor).st_size
+        self._start = 0
+        self._window = b""
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        start, stop, _ = part.indices(self._size)
+        wanted = max(stop - start, 0)
+        try:
+            found = os.pread(self._descriptor, wanted, start)
+        except OSError as error:
+            raise DatasetError(f"{self._path} cannot be read: {error.strerror}") from error
+        if len(found) < wanted:
+            raise DatasetError(f"{self._path} became shorter while it was read; read it again")
+        return found
+
+    def find(self, mark: bytes, start: int) -> int:
+        """Return where a few bytes stand first, at or after ``start``; -1 if they do not."""
+        while start + len(mark) <= self._size:
+            # Places may be close together, so a part of the file is kept.
+            if not self._start <= start <= self._start + len(self._window) - len(mark):
+                self._start, self._window = start, self[start : start + _WINDOW_BYTES]
+            at = self._window.find(mark, start - self._start)
+            if at >= 0:
+                return self._start + at
+            start = self._start + len(self._window) - len(mark) + 1
+        return -1
+
+
+@contextlib.contextmanager
+def opened_episode(path: Path) -> Iterator[EpisodeFile]:
+    """Open an MCAP file for reading.
 
     Raises:
         EmptyRecordingError: It has 0 bytes.
         DatasetError: It cannot be read, is too large, or does not begin like an MCAP file.
     """
-    with reading(path, "an episode"):
-        data = read_bytes(Path(path), MAX_EPISODE_BYTES)
-    if not data:
-        raise EmptyRecordingError(
-            f"{path} is empty (0 bytes): nothing was recorded, so it cannot be repaired; record again"
-        )
-    if not data.startswith(MCAP0_MAGIC[: len(data)]):
-        raise DatasetError(
-            f"{path} is not an MCAP file, it starts with {data[:8]!r}; episodes are files such as "
-            "DIR/episodes/000000.mcap"
-        )
-    return data
+    with contextlib.ExitStack() as stack:
+        with reading(path, "an episode"):
+            check_size(Path(path), MAX_EPISODE_BYTES)
+            file = stack.enter_context(open(path, "rb"))
+        data = EpisodeFile(Path(path), file)
+        head = data[: len(MCAP0_MAGIC)]
+        if not head:
+            raise EmptyRecordingError(
+                f"{path} is empty (0 bytes): nothing was recorded, so it cannot be repaired; record again"
+            )
+        if not MCAP0_MAGIC.startswith(head):
+            raise DatasetError(
+                f"{path} is not an MCAP file, it starts with {head!r}; episodes are files such as "
+                "DIR/episodes/000000.mcap"
+            )
+        yield data
 
 
 def write_json(path: Path, values: Any) -> None:

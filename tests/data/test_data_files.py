@@ -1,4 +1,4 @@
-"""Files that appear together, and interrupts that wait for them."""
+"""Files that appear together, interrupts that wait for them, and files that are read in parts."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ import signal
 from pathlib import Path
 
 import pytest
+from mcap.writer import MCAP0_MAGIC
 
-from deal_hw.data.files import interrupts_deferred, published_together
+from deal_hw.data import files
+from deal_hw.data.files import interrupts_deferred, opened_episode, published_together
+from deal_hw.errors import DatasetError
 
 
 def test_files_appear_together(tmp_path: Path) -> None:
@@ -54,3 +57,19 @@ def test_an_interrupt_waits_for_the_outermost_block() -> None:
         done.append("outer")
     assert done == ["inner", "outer"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_episode_file_finds_what_its_bytes_do(tmp_path: Path) -> None:
+    """Marks close together, across the parts that are kept, and at both ends; slices as of bytes."""
+    mark, gap = b"\x04\0\0\0zstd", files._WINDOW_BYTES
+    content = MCAP0_MAGIC + mark * 3 + bytes(gap - 36) + mark + bytes(gap) + mark
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    with opened_episode(path) as data:
+        starts = [*range(40), gap - 40, gap + 4, len(content) - 8, len(content) - 7, len(content) + 5]
+        assert [data.find(mark, at) for at in starts] == [content.find(mark, at) for at in starts]
+        for part in (slice(3, 20), slice(20, 3), slice(len(content) - 3, len(content) + 9)):
+            assert data[part] == content[part]
+        os.truncate(path, 100)
+        with pytest.raises(DatasetError, match=r"a\.mcap became shorter while it was read"):
+            data[90:110]

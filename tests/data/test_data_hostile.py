@@ -75,14 +75,14 @@ class Work:
         self.heads = self.bytes = 0
         real = mcap_scan._PREFIX
         self.size = real.size
-        self._unpack = real.unpack_from
+        self._unpack = real.unpack
         monkeypatch.setattr(mcap_scan, "_PREFIX", self)
         for name, at in (("_read_chunk", 0), ("_read_record", 1)):
             monkeypatch.setattr(mcap_scan, name, self._counted(getattr(mcap_scan, name), at))
 
-    def unpack_from(self, data: bytes, offset: int) -> tuple[int, ...]:
+    def unpack(self, data: bytes) -> tuple[int, ...]:
         self.heads += 1
-        return self._unpack(data, offset)
+        return self._unpack(data)
 
     def _counted(self, real: Callable[..., object], at: int) -> Callable[..., object]:
         def read(*values: Any) -> object:

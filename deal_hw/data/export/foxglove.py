@@ -8,17 +8,17 @@ from __future__ import annotations
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from deal_hw.data.files import read_episode_bytes
+from deal_hw.data.files import EpisodeFile, opened_episode
 from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
 from deal_hw.data.recording.schemas import TRANSFORM, RosMessageType
 from deal_hw.errors import DatasetError
+from deal_hw.sim.engine.scene import Shape
 from deal_hw.types import FloatArray, IntArray
 
 _SECTION = "=" * 80 + "\nMSG: "
@@ -64,53 +64,13 @@ _LISTS = ("metadata", "arrows", "cubes", "spheres", "cylinders", "lines", "trian
 _TOPICS = ("/tf", "/scene")
 
 
-class Drawn(Protocol):
-    """A shape that is fixed to a link; :class:`deal_hw.sim.engine.scene.Shape` is one."""
-
-    @property
-    def name(self) -> str:
-        """Unique name."""
-
-    @property
-    def body(self) -> int:
-        """Index of the link; 0 is the world."""
-
-    @property
-    def kind(self) -> str:
-        """Kind of shape: box, sphere, ellipsoid, capsule, cylinder or mesh."""
-
-    @property
-    def size(self) -> FloatArray:
-        """Half extents, or radius and half length along z, (3,) [m]."""
-
-    @property
-    def position(self) -> FloatArray:
-        """Of the centre, in the link's frame, (3,) [m]."""
-
-    @property
-    def quaternion(self) -> FloatArray:
-        """In the link's frame, w x y z, (4,)."""
-
-    @property
-    def color(self) -> FloatArray:
-        """Red, green, blue, alpha from 0 to 1, (4,)."""
-
-    @property
-    def vertices(self) -> FloatArray:
-        """Of a mesh, (V, 3) [m]."""
-
-    @property
-    def faces(self) -> IntArray:
-        """Vertex indices of a mesh's triangles, (F, 3)."""
-
-
 def export_foxglove(
     episode: Path,
     target: Path,
     links: Sequence[str],
     stamps_ns: IntArray,
     poses: tuple[FloatArray, FloatArray],
-    shapes: Sequence[Drawn],
+    shapes: Sequence[Shape],
     rate_hz: float = 50.0,
 ) -> int:
     """Write an episode with the robot in 3D; return the number of moments.
@@ -130,9 +90,8 @@ def export_foxglove(
     Raises:
         DatasetError: The target exists already or cannot be written.
     """
-    data = read_episode_bytes(episode)
     try:
-        with open(target, "xb") as file:
+        with opened_episode(episode) as data, open(target, "xb") as file:
             writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
             writer.start(profile="ros2", library=LIBRARY)
             shift_ns = _copy(data, writer)
@@ -145,7 +104,7 @@ def export_foxglove(
     return len(moments)
 
 
-def _copy(data: bytes, writer: Writer) -> int:
+def _copy(data: EpisodeFile, writer: Writer) -> int:
     """Copy all but the base's transforms; return wall clock minus host clock [ns]."""
     schemas: dict[int, int] = {}
     channels: dict[int, int | None] = {}
@@ -211,7 +170,7 @@ def _write_transforms(
                 writer.add_message(channel, at_ns, data, at_ns)
 
 
-def _write_shapes(writer: Writer, links: Sequence[str], shapes: Sequence[Drawn], at_ns: int) -> None:
+def _write_shapes(writer: Writer, links: Sequence[str], shapes: Sequence[Shape], at_ns: int) -> None:
     schema = writer.register_schema(SCENE_NAME, "ros2msg", SCENE_TEXT.encode())
     channel = writer.register_channel("/scene", "cdr", schema)
     for shape in shapes:
@@ -219,7 +178,7 @@ def _write_shapes(writer: Writer, links: Sequence[str], shapes: Sequence[Drawn],
         writer.add_message(channel, at_ns, scene_update(shape, frame, at_ns), at_ns)
 
 
-def scene_update(shape: Drawn, frame: str, at_ns: int) -> bytes:
+def scene_update(shape: Shape, frame: str, at_ns: int) -> bytes:
     """Return a ``foxglove.SceneUpdate`` that draws one shape in a frame for ever, as CDR."""
     values: list[tuple[str, object]] = [("uint32", 0), ("uint32", 1)]
     values += zip(("int32", "uint32"), divmod(at_ns, 10**9), strict=True)
@@ -233,7 +192,7 @@ def scene_update(shape: Drawn, frame: str, at_ns: int) -> bytes:
     return RosMessageType(SCENE_NAME, kinds).encode(*(value for _, value in values))
 
 
-def _primitives(shape: Drawn) -> dict[str, list[list[tuple[str, object]]]]:
+def _primitives(shape: Shape) -> dict[str, list[list[tuple[str, object]]]]:
     """Return the primitives of a shape by list of the entity: type and value of each field, in order."""
     w, x, y, z = shape.quaternion
     turn, color = (x, y, z, w), tuple(shape.color)

@@ -21,6 +21,8 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Me
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
+from deal_hw.data.files import EpisodeFile
+
 MAX_CHUNK_BYTES = 16 << 20
 """Largest record, and largest unpacked chunk [B]. The recorder closes a chunk at 1 MiB."""
 MAX_RATIO = 256
@@ -35,6 +37,8 @@ and in the search for the next one. Only a file with records that overlap needs 
 _PREFIX = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII4sQ")
 """Head of a zstd chunk, after its prefix: first and last stamp, size, CRC, the compression's name, length."""
+_HEAD_BYTES = _CHUNK_HEAD.size + 18
+"""The same, and the longest head of a zstd frame [B]."""
 _CHUNK_MARK = struct.pack("<I", 4) + b"zstd"
 _CHUNK_MARK_OFFSET = _PREFIX.size + 8 + 8 + 8 + 4
 """From a chunk record's first byte to its compression name: prefix, start, end, uncompressed size, CRC."""
@@ -101,7 +105,7 @@ class Lost:
     torn: bool
 
 
-def scan(data: bytes) -> Iterator[FoundRecord | Lost]:
+def scan(data: bytes | EpisodeFile) -> Iterator[FoundRecord | Lost]:
     """Yield the records of a file in order, and one :class:`Lost` for each unreadable place between them.
 
     Ends after the footer. A file without one ends with a torn :class:`Lost`, of size 0 if it was cut between
@@ -127,9 +131,8 @@ def scan(data: bytes) -> Iterator[FoundRecord | Lost]:
 class _Scanner:
     """Reads a file once, and remembers where the next readable chunk is."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes | EpisodeFile) -> None:
         self._data = data
-        self._view = memoryview(data)
         self._left = _TRIES * len(data) + MAX_CHUNK_BYTES
         self._room = MAX_RATIO * len(data) + _FREE_BYTES
         self._chunk: FoundRecord | None = None
@@ -142,10 +145,10 @@ class _Scanner:
             if offset + _PREFIX.size > len(data):
                 yield Lost(offset, len(data) - offset, "the file ends without a footer", torn=True)
                 return
-            opcode, size = _PREFIX.unpack_from(data, offset)
+            opcode, size = self._prefix(offset)
             end = offset + _PREFIX.size + size
             # Zeros are no record: their length field has no meaning, and there may be millions of them.
-            result = self._parse(offset, end) if opcode and end <= len(data) else None
+            result = self._parse(opcode, offset, end) if opcode and end <= len(data) else None
             if not in_data_section and result is None:
                 yield Lost(offset, len(data) - offset, "the index is cut off", torn=True)
                 return
@@ -163,7 +166,7 @@ class _Scanner:
                 yield result
                 in_data_section = in_data_section and not isinstance(result.record, DataEnd)
                 if isinstance(result.record, Footer):
-                    if self._view[end:] != MCAP0_MAGIC:
+                    if data[end : end + 2 * len(MCAP0_MAGIC)] != MCAP0_MAGIC:
                         left = len(data) - end
                         yield Lost(end, left, "bytes behind the footer", torn=left < len(MCAP0_MAGIC))
                     return
@@ -183,37 +186,46 @@ class _Scanner:
         stop = min(stops, default=len(self._data))
         return Lost(offset, stop - offset, reason, torn=not stops)
 
-    def _parse(self, offset: int, end: int) -> FoundRecord | str | bool:
+    def _prefix(self, offset: int) -> tuple[int, int]:
+        """Return opcode and length of the record there."""
+        opcode, size = _PREFIX.unpack(self._data[offset : offset + _PREFIX.size])
+        return opcode, size
+
+    def _parse(self, opcode: int, offset: int, end: int) -> FoundRecord | str | bool:
         """Return the record, or why it is unusable, or True for a kind that is skipped."""
         if self._chunk is not None and self._chunk.offset == offset:
             return self._chunk
-        opcode, body = self._data[offset], self._view[offset + _PREFIX.size : end]
-        kind = _TYPES.get(opcode)
+        kind, start = _TYPES.get(opcode), offset + _PREFIX.size
+        size = end - start
+        # Places that only look like records may be many and long, so a record is read after its head.
+        head = self._data[start : min(end, start + _HEAD_BYTES)]
         if kind is None:
-            sound = _is_message_index(body) if opcode == Opcode.MESSAGE_INDEX else opcode in _SUMMARY_ONLY
+            index = opcode == Opcode.MESSAGE_INDEX
+            sound = _is_message_index(head, size) if index else opcode in _SUMMARY_ONLY
             return sound or "a record of an unknown kind"
-        if kind is Chunk and (wrong := self._refuse_chunk(body)):
+        if kind is Chunk and (wrong := self._refuse_chunk(head, size)):
             return wrong
-        if len(body) > MAX_CHUNK_BYTES:
-            return f"a {kind.__name__.lower()} of {len(body)} bytes (at most {MAX_CHUNK_BYTES} are read)"
+        if size > MAX_CHUNK_BYTES:
+            return f"a {kind.__name__.lower()} of {size} bytes (at most {MAX_CHUNK_BYTES} are read)"
+        body = memoryview(self._data[start:end])
         result = _read_chunk(body, offset) if kind is Chunk else _read_record(kind, body, offset)
         if isinstance(result, str):
-            self._left -= len(body)
+            self._left -= size
         return result
 
-    def _refuse_chunk(self, body: memoryview) -> str:
+    def _refuse_chunk(self, head: bytes, length: int) -> str:
         """Return why a chunk cannot be unpacked, without unpacking it; "" if it can."""
-        if len(body) < _CHUNK_HEAD.size:
+        if length < _CHUNK_HEAD.size:
             return "a chunk of a wrong length"
-        _, _, size, _, name_size, name, packed_size = _CHUNK_HEAD.unpack_from(body)
+        _, _, size, _, name_size, name, packed_size = _CHUNK_HEAD.unpack_from(head)
         # A wrong, larger length would include the chunks after it.
-        if (name_size, name) != (4, b"zstd") or len(body) != _CHUNK_HEAD.size + packed_size:
+        if (name_size, name) != (4, b"zstd") or length != _CHUNK_HEAD.size + packed_size:
             return "a chunk of a wrong length"
         if size > min(MAX_CHUNK_BYTES, self._room):
             return f"a chunk that announces {size} bytes in {packed_size}"
         try:
             # The decompressor allocates the size in the frame's head, not the size in the chunk's head.
-            announced = zstandard.get_frame_parameters(body[_CHUNK_HEAD.size :]).content_size
+            announced = zstandard.get_frame_parameters(head[_CHUNK_HEAD.size :]).content_size
         except zstandard.ZstdError as error:
             return _damaged(Chunk, error)
         if announced not in (size, zstandard.CONTENTSIZE_UNKNOWN):
@@ -231,10 +243,10 @@ class _Scanner:
         while mark >= 0 and self._left > 0:
             offset = mark - _CHUNK_MARK_OFFSET
             self._searched = offset + 1
-            opcode, size = _PREFIX.unpack_from(self._data, offset)
+            opcode, size = self._prefix(offset)
             end = offset + _PREFIX.size + size
             if opcode == Opcode.CHUNK and end <= len(self._data):
-                found = self._parse(offset, end)
+                found = self._parse(opcode, offset, end)
                 if isinstance(found, FoundRecord):
                     self._chunk = found
                     return offset
@@ -281,8 +293,8 @@ def _damaged(kind: type[McapRecord], error: Exception | None = None) -> str:
     return f"a damaged {kind.__name__.lower()}{why}"
 
 
-def _is_message_index(body: memoryview) -> bool:
-    return len(body) >= 6 and len(body) == 6 + int.from_bytes(body[2:6], "little")
+def _is_message_index(head: bytes, length: int) -> bool:
+    return length >= 6 and length == 6 + int.from_bytes(head[2:6], "little")
 
 
 def messages(found: FoundRecord) -> Iterator[Message]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
 
-from deal_hw.data.files import read_episode_bytes
+from deal_hw.data.files import opened_episode
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
 from deal_hw.data.recording.schemas import BODY, OLD_TOPICS, RosMessageType, message_type
@@ -150,14 +150,15 @@ def _unreadable(path: Path, error: Exception) -> DatasetError:
 
 
 def _records(path: Path) -> Iterator[FoundRecord]:
-    for item in scan(read_episode_bytes(path)):
-        if isinstance(item, Lost):
-            state = "is torn" if item.torn else "is damaged"
-            raise TornRecordingError(
-                f"{path} {state} at byte {item.offset} ({item.reason}); "
-                f"repair it with: deal-hw data repair {path}"
-            )
-        yield item
+    with opened_episode(path) as data:
+        for item in scan(data):
+            if isinstance(item, Lost):
+                state = "is torn" if item.torn else "is damaged"
+                raise TornRecordingError(
+                    f"{path} {state} at byte {item.offset} ({item.reason}); "
+                    f"repair it with: deal-hw data repair {path}"
+                )
+            yield item
 
 
 def _wire_rows(path: Path) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -210,7 +211,9 @@ class _Table:
         self._kind = kind
         self._waiting: list[bytes] = []
         self._layout: np.dtype[np.void] | None = None
-        self._blocks: dict[str, list[npt.NDArray[Any]]] = {name: [] for _, name in kind.fields}
+        self._count = 0
+        # Not lists of blocks: joining these takes the memory twice, and the heap keeps the second one.
+        self._columns = {name: bytearray() for _, name in kind.fields}
 
     def append(self, data: bytes) -> None:
         """Take the next message."""
@@ -224,17 +227,20 @@ class _Table:
             self._decode()
         if self._layout is None:
             return {}
-        # One field after the other, so that there is never a second copy of all of them.
-        return {name: np.concatenate(self._blocks.pop(name)) for name in list(self._blocks)}
+        kinds = {name: self._layout[name] for name in self._columns}
+        return {
+            name: np.frombuffer(column, kinds[name].base).reshape(self._count, *kinds[name].shape)
+            for name, column in self._columns.items()
+        }
 
     def _decode(self) -> None:
         block = self._kind.decode_all(self._waiting)
         self._waiting = []
         if self._layout not in (None, block.dtype):
             raise ProtocolError(f"{self._kind.name}: the messages have different lengths")
-        self._layout = block.dtype
-        for name, values in self._blocks.items():
-            values.append(block[name].copy())
+        self._layout, self._count = block.dtype, self._count + len(block)
+        for name, column in self._columns.items():
+            column += block[name].tobytes()
 
 
 def _collect(path: Path) -> _Content:
@@ -320,19 +326,16 @@ def _episode(path: Path, content: _Content) -> Episode:
 
 def _body(table: _Fields, state: _Fields) -> BodyTrajectory:
     """Return the body's sensor values at each state sample, by stamp and number; empties the table."""
-    if all(np.array_equal(table[name], state[name]) for name in ("receive_ns", "sequence")):
-        row = np.arange(len(state["sequence"]))
-    else:
-        row_of = {key: row for row, key in enumerate(_keys(table))}
+    row: IntArray | None = None
+    if any(not np.array_equal(table[name], state[name]) for name in ("receive_ns", "sequence")):
+        row_of = {key: number for number, key in enumerate(_keys(table))}
         row = np.array([row_of.get(key, -1) for key in _keys(state)])
     columns = {}
     for field, (_, name) in zip(dataclasses.fields(BodyTrajectory), BODY.fields[2:], strict=True):
-        values = table.pop(name)[row]
-        if name == "buttons":
-            values[row < 0] = -1
-        else:
-            values = values.astype(np.float64, copy=False)
-            values[row < 0] = np.nan
+        values = table.pop(name)
+        if row is not None:
+            values = values[row]
+            values[row < 0] = -1 if name == "buttons" else np.nan
         columns[field.name] = values
     return BodyTrajectory(**columns)
 

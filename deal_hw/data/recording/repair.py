@@ -1,6 +1,6 @@
 """Repairs an episode that was cut off by a kill or damaged on disk, and checks complete ones.
 
-Both need time in proportion to the file's size, and memory for the file and one of its chunks.
+Both need time in proportion to the file's size, and memory for one of its chunks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import IO
 from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from deal_hw.data.files import read_episode_bytes
+from deal_hw.data.files import EpisodeFile, opened_episode
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
 from deal_hw.data.recording.schemas import CHANNELS, FIRST_CHANNELS
@@ -25,6 +25,7 @@ from deal_hw.errors import DatasetError
 REPAIR_NAME = "deal-hw.repair"
 _SHOWN = 3
 """Number of damaged places that a message names; it counts the others."""
+_PART_BYTES = 1 << 20
 _KEPT = 100
 """Number of damaged places and holes that a report lists; it counts the others."""
 
@@ -99,7 +100,8 @@ def verify(path: Path) -> RepairReport:
         EmptyRecordingError: It has 0 bytes.
         DatasetError: It cannot be read, is too large, or is not an MCAP file of deal-hw.
     """
-    return _inspect(Path(path), read_episode_bytes(Path(path))).report
+    with opened_episode(path) as data:
+        return _inspect(Path(path), data).report
 
 
 def repair(path: Path) -> RepairReport:
@@ -112,8 +114,11 @@ def repair(path: Path) -> RepairReport:
         EmptyRecordingError: It has 0 bytes.
         DatasetError: It cannot be read or written, is not an MCAP file of deal-hw, or has nothing readable.
     """
-    path = Path(path)
-    data = read_episode_bytes(path)
+    with opened_episode(path) as data:
+        return _repaired(Path(path), data)
+
+
+def _repaired(path: Path, data: EpisodeFile) -> RepairReport:
     found = _inspect(path, data)
     report = found.report
     if report.sound:
@@ -155,7 +160,7 @@ class _Findings:
     channels: dict[int, Channel]
 
 
-def _inspect(path: Path, data: bytes) -> _Findings:
+def _inspect(path: Path, data: EpisodeFile) -> _Findings:
     schemas, known = _known()
     # Recorders of version 1 gave later numbers to other channels.
     channels = {number: channel for number, channel in known.items() if number <= FIRST_CHANNELS}
@@ -177,7 +182,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
         if isinstance(item.record, Header):
             header = item.record
         elif isinstance(item.record, DataEnd):
-            if item.record.data_section_crc not in (0, zlib.crc32(memoryview(data)[: item.offset])):
+            if item.record.data_section_crc not in (0, _crc(data, 0, item.offset)):
                 mismatches.append("the checksum over the whole recording does not match")
         elif isinstance(item.record, Footer) and _is_index_damaged(data, item.offset, item.record):
             mismatches.append("the checksum of the index does not match")
@@ -224,10 +229,17 @@ def _inspect(path: Path, data: bytes) -> _Findings:
     return _Findings(report, header, schemas, channels)
 
 
-def _is_index_damaged(data: bytes, offset: int, footer: Footer) -> bool:
+def _is_index_damaged(data: EpisodeFile, offset: int, footer: Footer) -> bool:
     # The checksum covers the summary and the footer up to the checksum itself: prefix and two offsets.
-    covered = memoryview(data)[footer.summary_start or offset : offset + 9 + 16]
-    return footer.summary_crc not in (0, zlib.crc32(covered))
+    return footer.summary_crc not in (0, _crc(data, footer.summary_start or offset, offset + 9 + 16))
+
+
+def _crc(data: EpisodeFile, start: int, stop: int) -> int:
+    """Return the checksum of a part of a file, which may be long."""
+    value = 0
+    for at in range(start, stop, _PART_BYTES):
+        value = zlib.crc32(data[at : min(at + _PART_BYTES, stop)], value)
+    return value
 
 
 def _known() -> tuple[dict[int, Schema], dict[int, Channel]]:
@@ -246,7 +258,7 @@ def _known() -> tuple[dict[int, Schema], dict[int, Channel]]:
     return {schema.id: schema for schema in schemas.values()}, channels
 
 
-def _rewrite(data: bytes, findings: _Findings, file: IO[bytes]) -> None:
+def _rewrite(data: EpisodeFile, findings: _Findings, file: IO[bytes]) -> None:
     """Write the readable parts, chunk by chunk, and a note on the lost ones."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile=findings.header.profile, library=LIBRARY)
