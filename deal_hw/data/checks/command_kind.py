@@ -108,13 +108,10 @@ def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> CheckResult
 
 def _on_grid(table: Table) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return uniform times, (N,), measured positions, (N, J), and the active commands, (N, A)."""
-    sound = np.isfinite(table.position).all(axis=1)
-    time = table.time_s[sound]
+    time = table.time_s[np.isfinite(table.position).all(axis=1)]
     steps = np.diff(time)
     grid = np.arange(time[0], time[-1], max(float(np.median(steps[steps > 0])), 2e-3))
-    position = np.stack([np.interp(grid, time, column) for column in table.position[sound].T], axis=1)
-    rows = np.maximum(np.searchsorted(table.command_s, grid + 1e-9, side="right") - 1, 0)
-    return grid, position, table.target[rows]
+    return grid, table.position_at(grid), table.target_at(grid)
 
 
 def _is_position(position: FloatArray, command: FloatArray, period_s: float) -> bool:

@@ -69,12 +69,7 @@ def _correlate(table: Table) -> _Match | None:
     coarse_s = min(float(table.time_s[-1]) / MAX_SAMPLES, 0.02)
     period = max(float(np.median(steps[steps > 0])), 2e-3, coarse_s)
     grid = np.arange(0.0, table.time_s[-1], period)
-    sound = np.isfinite(table.position).all(axis=1)
-    measured = np.stack(
-        [np.interp(grid, table.time_s[sound], table.position[sound, i]) for i in table.actuated_index], axis=1
-    )
-    rows = np.maximum(np.searchsorted(table.command_s, grid + 1e-9, side="right") - 1, 0)
-    target = table.target[rows]
+    measured, target = table.position_at(grid)[:, list(table.actuated_index)], table.target_at(grid)
     width = max(round(WINDOW_S / period), 1)
     lags = np.arange(-round(MAX_LAG_S / period), round(MAX_LAG_S / period) + 1)
     if grid.size < 4 * (width + lags[-1]):

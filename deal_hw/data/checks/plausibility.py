@@ -254,7 +254,7 @@ def _frozen(table: Table) -> CheckResult:
 def _longest_still(table: Table, joint: int) -> float:
     """Return the longest time that a position stays exactly the same while its command moves visibly [s]."""
     column = table.actuated.index(table.joint_names[joint])
-    target, moved = held_target(table)[:, column], MOVES[table.units[joint]]
+    target, moved = table.target_at(table.time_s)[:, column], MOVES[table.units[joint]]
     changes = np.flatnonzero(np.diff(table.position[:, joint]) != 0) + 1
     edges = np.concatenate(([0], changes, [table.time_s.size - 1]))
     longest = 0.0
@@ -263,12 +263,6 @@ def _longest_still(table: Table, joint: int) -> float:
         if spans_s[at] > longest and np.ptp(target[edges[at] : edges[at + 1] + 1]) > 5 * moved:
             longest = float(spans_s[at])
     return longest
-
-
-def held_target(table: Table) -> FloatArray:
-    """Return the active command at each sample, (T, A); before the first command, that one."""
-    rows = np.searchsorted(table.command_s, table.time_s + 1e-9, side="right") - 1
-    return np.asarray(table.target[np.maximum(rows, 0)])
 
 
 def _commands(table: Table) -> CheckResult:
@@ -293,7 +287,7 @@ def _commands(table: Table) -> CheckResult:
 
 
 def _copy(table: Table) -> CheckResult:
-    held, measured = held_target(table), table.position[:, list(table.actuated_index)]
+    held, measured = table.target_at(table.time_s), table.position[:, list(table.actuated_index)]
     copied = []
     for column, name in enumerate(table.actuated):
         for lag in range(6):
@@ -325,7 +319,7 @@ _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
 
 def _units(table: Table, limits: FloatArray | None) -> CheckResult:
     """Compare the spans of command and measurement, and both with the model's limits."""
-    held, found = held_target(table), []
+    held, found = table.target_at(table.time_s), []
     for column, index in enumerate(table.actuated_index):
         target, measured, name = held[:, column], table.position[:, index], table.joint_names[index]
         spans = _span(target), _span(measured)
@@ -366,7 +360,7 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
 
 
 def _levels(table: Table) -> CheckResult:
-    held, found = held_target(table), []
+    held, found = table.target_at(table.time_s), []
     for column, index in enumerate(table.actuated_index):
         off = float(np.nanmedian(table.position[:, index] - held[:, column]))
         span = max(_span(table.position[:, index]), _span(held[:, column]))
@@ -428,7 +422,7 @@ def _inside_limits(table: Table, limits: FloatArray | None) -> CheckResult:
             span = f"{np.nanmin(table.position[:, index]):.3g}..{np.nanmax(table.position[:, index]):.3g}"
             found.append(f"{name} {outside:.0%} of the time ({span}, the model has {low:.3g}..{high:.3g})")
             severe |= outside > 0.5
-    held = held_target(table)
+    held = table.target_at(table.time_s)
     far = [
         f"{name} {reach:.3g} rad"
         for column, (name, index) in enumerate(zip(table.actuated, table.actuated_index, strict=True))
@@ -462,7 +456,7 @@ def _at_extreme(values: FloatArray) -> float:
 
 
 def _clipped_commands(table: Table, limits: FloatArray | None) -> CheckResult:
-    held, found = held_target(table), []
+    held, found = table.target_at(table.time_s), []
     for column, (index, name) in enumerate(zip(table.actuated_index, table.actuated, strict=True)):
         share = _at_extreme(held[:, column])
         if limits is not None and np.isfinite(limits[index]).all():

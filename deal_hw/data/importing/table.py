@@ -62,6 +62,17 @@ class Table:
         """Name in messages."""
         return f"{self.source['file']} {self.source['part']}".strip()
 
+    def target_at(self, time_s: FloatArray) -> FloatArray:
+        """Return the active command at N times, (N, A); before the first command, that one."""
+        rows = np.searchsorted(self.command_s, time_s + 1e-9, side="right") - 1
+        return np.asarray(self.target[np.maximum(rows, 0)])
+
+    def position_at(self, time_s: FloatArray) -> FloatArray:
+        """Return the positions at N times, (N, J), linear between samples whose positions are all finite."""
+        sound = np.isfinite(self.position).all(axis=1)
+        columns = self.position[sound].T
+        return np.stack([np.interp(time_s, self.time_s[sound], column) for column in columns], axis=1)
+
     def rows(self, kept: npt.NDArray[np.bool_]) -> Table:
         """Return the recording with these samples only, (T,); commands stay."""
         optional: dict[str, Any] = {

@@ -26,7 +26,8 @@ SECONDS: Final = 60.0
 """Processor time limit of the same [s]."""
 STEPS: Final = 10
 """Number of test steps before a model is used."""
-_DIVERGED: Final = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+DIVERGED: Final = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+"""Warnings after which MuJoCo starts again from the reference pose."""
 _ROOM: Final = "keep bodies apart (contype, exclude), or write a larger <size memory=.../>"
 _OVERFULL: Final = ("mjWARN_CONTACTFULL", "mjWARN_CNSTRFULL")
 
@@ -112,7 +113,7 @@ def problem_of(path: str) -> str:
     except (MemoryError, mujoco.FatalError) as err:
         return f"compiles, but cannot be simulated: {short(str(err))}; {_ROOM}"
     warned = {
-        name for name in (*_DIVERGED, *_OVERFULL) if data.warning[getattr(mujoco.mjtWarning, name)].number
+        name for name in (*DIVERGED, *_OVERFULL) if data.warning[getattr(mujoco.mjtWarning, name)].number
     }
     if warned & set(_OVERFULL):
         return f"has more contacts than its memory holds; {_ROOM}"

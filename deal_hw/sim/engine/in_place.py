@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Final
+from typing import Any
 
 import mujoco
-import numpy as np
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import KINDS, apply_parameters, check_space
-from deal_hw.sim.parameters.fields import ModelFields, element_id
+from deal_hw.sim.parameters.fields import ModelFields
 from deal_hw.types import FloatArray
-
-_SERVO: Final = ("servo_stiffness", "servo_damping", "servo_effort_limit")
-"""Gains and limits that the model holds if no host sends others."""
 
 
 class ModelInPlace:
@@ -31,7 +27,7 @@ class ModelInPlace:
     """
 
     def __init__(self, model: Any, space: ParameterSpace) -> None:
-        outside = [p.name for p in space.parameters if p.kind not in KINDS and p.kind not in _SERVO]
+        outside = [p.name for p in space.parameters if p.kind not in KINDS]
         if outside:
             raise ConfigurationError(
                 f"parameters {', '.join(outside)} act on commands and measurements, not in the model of an "
@@ -44,16 +40,5 @@ class ModelInPlace:
     def apply(self, theta: FloatArray) -> None:
         """Write free parameters, (K,), and the known ones; simulation states stay."""
         apply_parameters(self._fields, self._space, theta[None])
-        values = {**self._space.known, **dict(zip(self._space.names, map(float, theta), strict=True))}
-        model = self._model
-        for p in self._space.parameters:
-            for name in p.elements if p.kind in _SERVO else ():
-                index, value = element_id(model, "actuator", name), values[p.name]
-                if p.kind == "servo_stiffness":
-                    model.actuator_gainprm[index, 0], model.actuator_biasprm[index, 1] = value, -value
-                elif p.kind == "servo_damping":
-                    model.actuator_biasprm[index, 2] = -value
-                else:
-                    model.actuator_forcerange[index] = np.array([-value, value])
         # Derives constants that depend on masses; the environment's own data stay.
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))

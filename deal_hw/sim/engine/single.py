@@ -7,7 +7,8 @@ from pathlib import Path
 
 import mujoco
 
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError
+from deal_hw.sim.parameters.fields import element_id
 
 
 class SingleSimulation:
@@ -38,7 +39,7 @@ class SingleSimulation:
 
     def set_body_mass(self, body: str, mass: float) -> None:
         """Set a body's mass [kg]; its inertia scales along, as for the same shape of another density."""
-        index = self._id(mujoco.mjtObj.mjOBJ_BODY, "body", body)
+        index = element_id(self._model, "body", body)
         self._model.body_inertia[index] *= mass / self._model.body_mass[index]
         self._model.body_mass[index] = mass
         self._refresh()
@@ -52,7 +53,7 @@ class SingleSimulation:
         armature: float | None = None,
     ) -> None:
         """Set damping, dry friction and armature of a joint; SI units of sliding or turning joints."""
-        index = self._id(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint)
+        index = element_id(self._model, "joint", joint)
         if damping is not None:
             self._model.dof_damping[index] = damping
         if frictionloss is not None:
@@ -85,15 +86,6 @@ class SingleSimulation:
         """Hold these joint efforts, (J,) [N or N*m], for one step."""
         self._applied[:] = effort
         mujoco.mj_step(self._model, self._data)
-
-    def _id(self, kind: mujoco.mjtObj, what: str, name: str) -> int:
-        index = int(mujoco.mj_name2id(self._model, kind, name))
-        if index < 0:
-            count = self._model.nbody if kind == mujoco.mjtObj.mjOBJ_BODY else self._model.njnt
-            raise UnknownNameError(
-                what, name, (mujoco.mj_id2name(self._model, kind, i) or "" for i in range(count))
-            )
-        return index
 
     def _refresh(self) -> None:
         # Constraint regularisation depends on inverse weights that only mj_setConst derives; it overwrites

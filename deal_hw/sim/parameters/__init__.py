@@ -6,18 +6,17 @@ N simulations. The table :data:`KIND_TABLE` is explicit; new kinds go into the t
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters.actuator import ACTUATOR_KINDS
 from deal_hw.sim.parameters.body import BODY_KINDS
-from deal_hw.sim.parameters.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.fields import Array, Fields, element_id, unknown_name
 from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
 from deal_hw.sim.parameters.joint import JOINT_KINDS
 from deal_hw.sim.parameters.kind import Apply, Kind
@@ -53,13 +52,9 @@ def find_kind(name: str) -> Kind:
     Raises:
         UnknownNameError: There is none; the message lists the kinds, and the nearest one if any is near.
     """
-    if name in KIND_TABLE:
-        return KIND_TABLE[name]
-    error = UnknownNameError("parameter kind", name, KIND_TABLE)
-    near = difflib.get_close_matches(name, KIND_TABLE, n=1)
-    if near:
-        error.args = (f"{error}; did you mean {near[0]!r}?",)
-    raise error
+    if name not in KIND_TABLE:
+        raise unknown_name("parameter kind", name, KIND_TABLE)
+    return KIND_TABLE[name]
 
 
 def check_kinds(space: ParameterSpace) -> None:

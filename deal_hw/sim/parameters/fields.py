@@ -6,6 +6,8 @@ the emulator's hidden model and the model written for the user.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import mujoco
@@ -65,6 +67,15 @@ _TYPES = {
     "tendon": mujoco.mjtObj.mjOBJ_TENDON,
 }
 _COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "geom": "ngeom", "tendon": "ntendon"}
+
+
+def unknown_name(what: str, given: str, allowed: Iterable[str]) -> UnknownNameError:
+    """Return the error for a name that is not known; it also says the nearest one, if any is near."""
+    error = UnknownNameError(what, given, allowed)
+    near = difflib.get_close_matches(given, error.allowed, n=1)
+    if near:
+        error.args = (f"{error}; did you mean {near[0]!r}?",)
+    return error
 
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:

@@ -6,20 +6,19 @@ holds only the user's changes.
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import yaml
 
-from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
+from deal_hw.errors import QUOTED, ConfigurationError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
 from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
 from deal_hw.sim.parameters import check_space, find_kind
-from deal_hw.sim.parameters.fields import element_id, element_names
+from deal_hw.sim.parameters.fields import element_id, element_names, unknown_name
 from deal_hw.sim.parameters.kind import Kind
 
 _KEYS: Final = (
@@ -119,7 +118,7 @@ def _parameters(entry: Any, model: Any) -> list[Parameter]:
         raise ConfigurationError(f"an entry must have keys ({', '.join(_KEYS)}), got {shown(entry)}")
     for key in entry:
         if key not in _KEYS:
-            raise _unknown("key", str(key), _KEYS)
+            raise unknown_name("key", str(key), _KEYS)
     kind = find_kind(_text(entry, "kind"))
     elements = _elements(entry.get("elements"), kind, model)
     group = _choice(entry, "group", _GROUPS, "each")
@@ -148,7 +147,7 @@ def _elements(value: Any, kind: Kind, model: Any) -> list[str]:
         literal = pattern in names
         found = [pattern] if literal else [name for name in names if fnmatch.fnmatchcase(name, pattern)]
         if not found:
-            raise _unknown(f"MuJoCo {kind.element}", pattern, names)
+            raise unknown_name(f"MuJoCo {kind.element}", pattern, names)
         if not literal:
             found = _usable_ones(found, kind, model, pattern)
         chosen += [name for name in found if name not in chosen]
@@ -291,13 +290,5 @@ def _text(entry: Mapping[str, Any], key: str) -> str:
 def _choice(entry: Mapping[str, Any], key: str, allowed: Sequence[str], default: str) -> str:
     value = entry.get(key, default)
     if value not in allowed:
-        raise _unknown(key, str(value), allowed)
+        raise unknown_name(key, str(value), allowed)
     return str(value)
-
-
-def _unknown(what: str, given: str, allowed: Iterable[str]) -> UnknownNameError:
-    error = UnknownNameError(what, given, allowed)
-    near = difflib.get_close_matches(given, error.allowed, n=1)
-    if near:
-        error.args = (f"{error}; did you mean {near[0]!r}?",)
-    return error

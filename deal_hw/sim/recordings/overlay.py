@@ -20,7 +20,7 @@ from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.sim.recordings.standing import tangent_base, with_sensed_base
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
-from deal_hw.types import FloatArray, IntArray, Status, Trajectory
+from deal_hw.types import FloatArray, IntArray, Trajectory
 
 DEFAULT_WINDOW_S = 0.2
 DEFAULT_SMOOTHING_S = 0.04
@@ -143,7 +143,7 @@ def compute_overlay(
             )
         episode = with_sensed_base(episode, robot, trajectory)
     windows = cut_windows(episode, length)
-    row = _first_row(trajectory) + np.concatenate([windows.start[:, None], windows.samples()], axis=1)
+    row = episode.first_row + np.concatenate([windows.start[:, None], windows.samples()], axis=1)
     smooth = _smoothed_starts(trajectory, row[:, 0], smoothing_s)
     velocity_window_s = reported_velocity_window(trajectory, description)
 
@@ -235,14 +235,6 @@ def _check(
     for what, value in (("latency", latency_s), ("smoothing time", smoothing_s)):
         if not (np.isfinite(value) and value >= 0):
             raise ConfigurationError(f"the {what} must be 0 s or more, got {value:g} s")
-
-
-def _first_row(trajectory: Trajectory) -> int:
-    # The start of `align`: the first armed sample with a recorded command in force.
-    known = (trajectory.status & int(Status.ARMED)) != 0
-    known &= trajectory.command_sequence >= 0
-    known &= np.isin(trajectory.command_sequence, trajectory.sent_sequence)
-    return int(np.argmax(known))
 
 
 def _smoothed_starts(trajectory: Trajectory, rows: IntArray, half_width_s: float) -> FloatArray:

@@ -15,7 +15,7 @@ normalised over the whole recording.
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import importlib
 import io
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ import numpy as np
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
-from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.parameters import KINDS, apply_parameters
-from deal_hw.sim.parameters.fields import BatchFields, ModelFields
+from deal_hw.sim.engine.model import RobotModel, model_with
+from deal_hw.sim.parameters import KINDS
+from deal_hw.sim.parameters.fields import BatchFields
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import Windows, setpoints
 from deal_hw.types import FloatArray
@@ -351,9 +351,7 @@ class _Bridge:
             # One iteration needs the same few models window after window.
             if len(self._models) > 4 * (len(self.space) + 1) * len(self._sent):
                 self._models.clear()
-            model = copy.copy(self._nominal)
-            apply_parameters(ModelFields(model, self._nominal), self.space, theta[None])
-            mujoco.mj_setConst(model, mujoco.MjData(model))
+            model = model_with(dataclasses.replace(self.robot, model=self._nominal), self.space, theta)
             if self.robot.description.actuation == "position":
                 self._batch.set_parameters(theta[None])
                 self._batch.set_sent(*self._sent[id(spec)])

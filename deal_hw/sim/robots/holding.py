@@ -8,10 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from deal_hw.sim.engine.compiling import DIVERGED
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.types import FloatArray
-
-_DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +65,7 @@ def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
         mujoco.mj_step(model, data)
         speed[step] = data.qvel[moving]
     # After a divergence MuJoCo restarts from the reference pose: only the warning remains.
-    diverged = any(data.warning[getattr(mujoco.mjtWarning, name)].number for name in _DIVERGED)
+    diverged = any(data.warning[getattr(mujoco.mjtWarning, name)].number for name in DIVERGED)
     quarter = steps // 4
     second, last = (
         np.sqrt(np.mean(np.square(speed[a : a + quarter]), axis=0)) for a in (quarter, steps - quarter)

@@ -18,7 +18,6 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.reading import NAMES, read_yaml, reading
 from deal_hw.schema import FINITE, from_values, refusal
 
-SUFFIXES: Final = (".yaml", ".yml")
 FILE_NAME: Final = "robot.yaml"
 ADVICE: Final = "`deal-hw robot new robot.xml` writes one"
 _LONGEST_NAME: Final = 100

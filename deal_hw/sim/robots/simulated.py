@@ -14,6 +14,7 @@ from deal_hw.errors import CalibrationError, ConfigurationError, TransportTimeou
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
 from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import reported
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.transport import Message
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
@@ -122,12 +123,9 @@ class SimulatedRobot(Robot):
         self._clock.sleep_until_ns(due_ns)
         self._samples += 1
         self._advance_to(self._samples * self._stride)
-        sensor, position = self.description.sensor, self._batch.position[0].copy()
-        position += self._rng.standard_normal(position.shape) * sensor.noise
-        step = np.array(sensor.resolution)
-        position = np.where(step > 0, np.round(position / np.where(step > 0, step, 1.0)) * step, position)
+        sensor = self.description.sensor
         return RobotState(
-            position=position,
+            position=reported(self._batch.position[0], sensor.noise, sensor.resolution, self._rng),
             velocity=self._batch.velocity[0].copy(),
             effort=self._effort[0, list(self._robot.qvel)].copy(),
             receive_ns=due_ns,
