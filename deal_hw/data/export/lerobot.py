@@ -13,11 +13,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.data.files import write_json
 from deal_hw.data.importing.grid import common_period, to_trajectories
@@ -32,12 +32,8 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Episode:
-    """Frames of one episode: by feature name, (F,) or (F, K)."""
-
-    frames: Mapping[str, FloatArray]
-    length: int
+_Frames = dict[str, npt.NDArray[Any]]
+"""Values of one episode's F frames, by feature, (F,) or (F, K)."""
 
 
 def export_lerobot(
@@ -89,15 +85,16 @@ def export_lerobot(
         (whole,) = to_trajectories(table, period_s=period, gap_periods=math.inf)
         episodes.append(_frames(table.name, whole.trajectory, period, most_filled))
     features = _features(first, tables[0].units, episodes)
-    episodes = [_Episode({name: e.frames[name] for name in features}, e.length) for e in episodes]
+    episodes = [{name: frames[name] for name in features} for frames in episodes]
     try:
         _write(folder, episodes, features, 1 / period, robot_type, task)
     except OSError as error:
         raise DatasetError(f"{folder} cannot be written: {error.strerror}") from error
-    return sum(e.length for e in episodes), int(sum(e.frames["filled"].sum() for e in episodes))
+    filled = np.concatenate([frames["filled"] for frames in episodes])
+    return filled.size, int(filled.sum())
 
 
-def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float) -> _Episode:
+def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float) -> _Frames:
     """Return the frames from the first command on, lost ones filled and flagged."""
     begin = int(np.argmax(trajectory.command_sequence >= 0))
     time_s = trajectory.device_s[begin:] - trajectory.device_s[begin]
@@ -120,21 +117,18 @@ def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float
     # A command is active until the next one, even if no sample shows it.
     sent_s = trajectory.sent_s - trajectory.device_s[begin]
     in_force = np.searchsorted(sent_s, grid * period + 1e-9, side="right") - 1
-    return _Episode(
-        {
-            "observation.state": on_grid(trajectory.position),
-            "observation.velocity": on_grid(trajectory.velocity),
-            "observation.effort": on_grid(trajectory.effort),
-            "action": trajectory.position_target[in_force],
-            "command_age": np.maximum(grid * period - sent_s[in_force], 0.0),
-            "filled": filled,
-        },
-        length,
-    )
+    return {
+        "observation.state": on_grid(trajectory.position),
+        "observation.velocity": on_grid(trajectory.velocity),
+        "observation.effort": on_grid(trajectory.effort),
+        "action": trajectory.position_target[in_force],
+        "command_age": np.maximum(grid * period - sent_s[in_force], 0.0),
+        "filled": filled,
+    }
 
 
 def _features(
-    first: Trajectory, units: Sequence[str], episodes: Sequence[_Episode]
+    first: Trajectory, units: Sequence[str], episodes: Sequence[_Frames]
 ) -> dict[str, dict[str, Any]]:
     """Return the features that every frame has, as ``info.json`` lists them."""
     unit = dict(zip(first.joint_names, units, strict=True))
@@ -145,7 +139,7 @@ def _features(
         ("observation.effort", "effort", first.joint_names),
         ("action", "pos", first.actuated),
     ):
-        if all(np.isfinite(episode.frames[name]).all() for episode in episodes):
+        if all(np.isfinite(frames[name]).all() for frames in episodes):
             features[name] = {
                 "dtype": "float32",
                 "shape": [len(joints)],
@@ -164,17 +158,14 @@ _UNITS: Mapping[str, Mapping[str, str]] = {
 """Unit of each quantity of a joint, by the unit of its position."""
 
 _INDEX_FEATURES = {
-    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    "frame_index": {"dtype": "int64", "shape": [1], "names": None},
-    "episode_index": {"dtype": "int64", "shape": [1], "names": None},
-    "index": {"dtype": "int64", "shape": [1], "names": None},
-    "task_index": {"dtype": "int64", "shape": [1], "names": None},
+    name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
+    for name in ("timestamp", "frame_index", "episode_index", "index", "task_index")
 }
 
 
 def _write(
     folder: Path,
-    episodes: Sequence[_Episode],
+    episodes: Sequence[_Frames],
     features: Mapping[str, dict[str, Any]],
     fps: float,
     robot_type: str,
@@ -186,7 +177,8 @@ def _write(
     rows: list[dict[str, Any]] = []
     writer, written, file, begin = None, 0, 0, 0
     for number, episode in enumerate(episodes):
-        frames = {**episode.frames, **_indices(number, episode.length, begin, fps)}
+        length = len(episode["filled"])
+        frames = {**episode, **_indices(number, length, begin, fps)}
         table = _arrow({**features, **_INDEX_FEATURES}, frames)
         if writer is not None and written + table.nbytes > FILE_MIB * 2**20:
             writer.close()
@@ -198,13 +190,13 @@ def _write(
             writer = pq.ParquetWriter(path, table.schema, compression="snappy")
         writer.write_table(table)
         written += table.nbytes
-        rows.append(_episode_row(number, episode.length, begin, place, task, frames))
-        begin += episode.length
+        rows.append(_episode_row(number, length, begin, place, task, frames))
+        begin += length
     if writer is not None:
         writer.close()
     _write_episodes(folder, rows)
     _write_tasks(folder, task)
-    whole = {name: np.concatenate([episode.frames[name] for episode in episodes]) for name in features}
+    whole = {name: np.concatenate([episode[name] for episode in episodes]) for name in features}
     write_json(folder / "meta" / "stats.json", {name: _statistics(values) for name, values in whole.items()})
     # Last of all, since a folder with info.json counts as a complete dataset.
     write_json(folder / "meta" / "info.json", _info(features, fps, len(episodes), begin, robot_type))

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -205,23 +205,8 @@ def read_column_map(path: Path) -> ColumnMap:
 
 def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
     """Return the column map in plain YAML values; errors as :func:`read_column_map`."""
-    top = _mapping(
-        "column map",
-        values,
-        {
-            "time",
-            "command_time",
-            "position",
-            "target",
-            "velocity",
-            "effort",
-            "joints",
-            "unit",
-            "target_unit",
-            "orientation",
-            "gyro",
-        },
-    )
+    entries = {field.name for field in fields(ColumnMap)} - {"source"}
+    top = _mapping("column map", values, entries | {"unit", "target_unit"})
     for name in ("time", "joints"):
         if name not in top:
             raise ConfigurationError(
@@ -231,7 +216,7 @@ def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
         raise ConfigurationError("column map: joints is a list of names or of mappings with a name")
     defaults = {name: str(top[name]) for name in ("unit", "target_unit") if top.get(name) is not None}
     command_time = top.get("command_time")
-    patterns = {name: _text(name, top.get(name)) for name in ("position", "target", "velocity", "effort")}
+    patterns = {name: _text(name, top.get(name)) for name in _CHANNELS}
     return ColumnMap(
         time=_time("time", top["time"]),
         command_time=None if command_time is None else _time("command_time", command_time),
@@ -270,25 +255,12 @@ def _time(what: str, value: Any) -> TimeColumn:
 
 
 _CHANNELS = ("position", "target", "velocity", "effort")
-_JOINT_KEYS = {
-    "name",
-    "column",
-    "index",
-    *_CHANNELS,
-    "unit",
-    "target_unit",
-    "normalised",
-    "target_normalised",
-    "sign",
-    "offset",
-    "slides",
-}
 
 
 def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
     if isinstance(entry, (str, int)):
         entry = {"name": str(entry)}
-    values = _mapping("joint", entry, _JOINT_KEYS)
+    values = _mapping("joint", entry, {field.name for field in fields(JointColumns)})
     if "name" not in values:
         raise ConfigurationError(f"joint {shown(values)} has no name; give its name in the model")
     name = str(_text("name of a joint", values["name"]))

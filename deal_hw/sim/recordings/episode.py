@@ -17,6 +17,17 @@ from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 SENT = ("target", "stiffness", "damping", "effort_limit", "speed_limit")
 """Arrays of an episode with one row per period."""
 
+SAMPLED = {
+    "sample": 1,
+    "position": 2,
+    "velocity": 2,
+    "usable": 1,
+    "reported": 1,
+    "reference": 2,
+    "estimate_std": 2,
+}
+"""Number of axes of an episode's values per sample; values for all samples have fewer."""
+
 
 @dataclass(frozen=True, slots=True)
 class SampledEpisode:
@@ -95,12 +106,9 @@ class SampledEpisode:
 
     def cut(self, rows: slice, periods: slice) -> SampledEpisode:
         """Return the episode with these samples and periods only; indices and the start stay."""
-        each = {name: getattr(self, name)[rows] for name in ("sample", "position", "velocity", "usable")}
-        # Values that are equal for all samples have no axis of samples.
-        axes = {"reported": 1, "reference": 2, "estimate_std": 2}
-        some = {n: v[rows] for n, d in axes.items() if (v := getattr(self, n)) is not None and v.ndim == d}
+        samples = {n: v[rows] for n, axes in SAMPLED.items() if np.ndim(v := getattr(self, n)) == axes}
         sent = {name: getattr(self, name)[periods] for name in SENT}
-        return dataclasses.replace(self, **each, **some, **sent)
+        return dataclasses.replace(self, **samples, **sent)
 
 
 def align(trajectory: Trajectory, description: RobotDescription, name: str = "") -> SampledEpisode:

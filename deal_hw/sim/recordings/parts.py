@@ -10,22 +10,10 @@ from typing import Any
 import numpy as np
 
 from deal_hw.parameters import LONGEST_LATENCY_S
-from deal_hw.sim.recordings.episode import SENT, SampledEpisode
+from deal_hw.sim.recordings.episode import SAMPLED, SENT, SampledEpisode
 
 LEAD_S = LONGEST_LATENCY_S
 """Length of commands kept before a part's first sample [s]: the longest latency."""
-
-
-SAMPLED = {
-    "sample": 1,
-    "position": 2,
-    "velocity": 2,
-    "usable": 1,
-    "reported": 1,
-    "reference": 2,
-    "estimate_std": 2,
-}
-"""Number of axes of an episode's values per sample; values for all samples have fewer."""
 
 
 def part(episode: SampledEpisode, first: int, last: int) -> SampledEpisode:
