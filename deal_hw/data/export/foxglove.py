@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
@@ -18,8 +19,10 @@ from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
 from deal_hw.data.recording.schemas import TRANSFORM, RosMessageType
 from deal_hw.errors import DatasetError
-from deal_hw.sim.engine.scene import Shape
 from deal_hw.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.scene import Shape
 
 _SECTION = "=" * 80 + "\nMSG: "
 _POSE = "geometry_msgs/Pose pose\n"
