@@ -326,8 +326,8 @@ def output_error_method() -> CalibrationPipeline:
 def local() -> CalibrationPipeline:
     """Return `local`: only the fits over short and then long windows, from the nominal values.
 
-    It suits a robust, damped motion and a model within a factor of about two. It costs a twentieth of a
-    search.
+    It suits a robust, damped motion and a model within a factor of about two. The fits take a twentieth of a
+    search's time, the checks of the model about twice the fits'.
     """
     return CalibrationPipeline(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
 
