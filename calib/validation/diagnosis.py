@@ -142,13 +142,15 @@ class PlayFit:
         of: The recordings, without play among the parameters.
         plays: The plays.
         fit: The fit.
-        rest: Samples that were not fitted, per recording.
-        prediction: The fitted values on these samples.
+        seen: Samples that were fitted, per recording.
+        rest: The others.
+        prediction: The fitted values on the others.
     """
 
     of: Problem
     plays: Sequence[Parameter]
     fit: Refined
+    seen: Sequence[npt.NDArray[np.bool_]]
     rest: Sequence[npt.NDArray[np.bool_]]
     prediction: Refined
 
@@ -268,7 +270,7 @@ def fit_play(problem: Problem) -> PlayFit | None:
         prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
-    return PlayFit(problem, plays, fit, rest, prediction)
+    return PlayFit(problem, plays, fit, seen, rest, prediction)
 
 
 def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> Play | None:
@@ -281,19 +283,29 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
     if wide is None:
         return None
     plays, fit, with_play = wide.plays, wide.fit, wide.prediction
-    # The wider fit may have left another minimum; then its parameters predict as well without their play.
     own, found = np.split(fit.theta, [len(problem.space)])
-    starts = (refined.theta, refined.latency_s), (own, fit.latency_s)
     unseen, length = problem.part(wide.rest), with_play.shooting.length
+
+    def decides(without: Refined) -> tuple[float, float] | None:
+        share = 1 - with_play.chi2 / without.chi2
+        deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
+        enough = deviance > MISMATCH.evidence and share > SETTINGS.noticed
+        return (share, deviance) if enough else None
+
     try:
-        bare = [at_parameters(unseen, *start, length) for start in starts]
-    except CalibrationError:
+        without = at_parameters(unseen, refined.theta, refined.latency_s, length)
+        if decides(without) is None:
+            return None
+        # The wider fit may have left another minimum; a fit from there without play then predicts as well.
+        bare = refine(problem.part(wide.seen), own, fit.latency_s, (SETTINGS.play_s,))
+        again = at_parameters(unseen, bare.theta, bare.latency_s, length)
+    except (InsufficientDataError, CalibrationError):
         return None
-    without = min(bare, key=lambda fit: fit.chi2 if np.isfinite(fit.chi2) else np.inf)
-    share = 1 - with_play.chi2 / without.chi2
-    deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
-    if not (deviance > MISMATCH.evidence and share > SETTINGS.noticed):
+    without = again if again.chi2 < without.chi2 else without
+    decided = decides(without)
+    if decided is None:
         return None
+    share, deviance = decided
     order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
     named = [plays[k] for k in order]
     joints = [play.elements[0] for play in named]

@@ -270,7 +270,7 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
 def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Problem, Refined]:
     """Return a simulated robot's recordings, and what a fit from its own values makes of them."""
     robot = make_robot(kind, 3, fault)
-    model, paths, held_out = write(robot, folder, seconds=5.0)
+    model, paths, held_out = write(robot, folder, seconds=3.0)
     config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
     work = prepare(config)
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
