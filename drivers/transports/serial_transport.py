@@ -101,12 +101,8 @@ class SerialTransport(Transport):
         if self._fd >= 0 and not _hung_up(self._fd):
             return
         fresh = self._open_port()
-        lost, self._serial = self._serial, None
         self.close()
         self._fd, self._serial = fresh.fileno(), fresh
-        if lost is not None:
-            with contextlib.suppress(OSError):
-                lost.close()
         if self._adopted is not None:
             self._ahead = ReadAhead(self._fd, self._clock)
 

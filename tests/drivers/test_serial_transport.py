@@ -96,7 +96,11 @@ class TestReadingAhead(TransportSuite):
 
 @pytest.mark.parametrize("adopted", [False, True])
 def test_a_cable_that_is_put_back_is_found_under_the_same_path(adopted: bool, tmp_path: Path) -> None:
-    """As a USB adapter under /dev/serial/by-id: gone, refused while gone, back with another number, works."""
+    """As a USB adapter under /dev/serial/by-id: gone, refused while gone, back with another number, works.
+
+    No descriptor is left open, nor one closed twice, which may be another's by then.
+    """
+    before = len(os.listdir("/proc/self/fd"))
     link = tmp_path / "by-id"
     first, second = Pty(), Pty()
     link.symlink_to(first.port)
@@ -120,6 +124,7 @@ def test_a_cable_that_is_put_back_is_found_under_the_same_path(adopted: bool, tm
             second.write(b"state")
             assert receive_bytes(near, 5) == b"state"
     second.close()
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_a_missing_port_lists_the_ports_at_hand() -> None:
