@@ -75,12 +75,14 @@ class PythonCanTransport(CanTransport):
         super().__init__(port, clock, accept)
         self._wall_ns, self._oldest_ns = wall_ns, round(oldest_stamp_s * 1e9)
         self._bus: can.BusABC | None = None
+        self._lost = False
         self._last_ns = 0
 
     def open(self) -> None:
         """Open the bus."""
         if self._bus is None:
-            self._bus, self._off = self._open_bus(), False
+            self._bus = self._open_bus()
+            self._off, self._lost, self.trouble = False, False, ""
 
     def close(self) -> None:
         """Close the bus."""
@@ -90,12 +92,14 @@ class PythonCanTransport(CanTransport):
                 bus.shutdown()
 
     def reopen(self) -> None:
-        """Open the bus again if it was lost or went bus-off; do nothing if it works."""
-        if self._bus is not None and not self._off:
-            return
-        fresh = self._open_bus()
-        self.close()
-        self._bus, self._off = fresh, False
+        """Open the bus again if it was lost or went bus-off; do nothing if it works.
+
+        A socket of an adapter that was pulled out stays dead when the adapter is back. The old bus is closed
+        first, because many adapters can be opened only once.
+        """
+        if self._off or self._lost:
+            self.close()
+        self.open()
 
     def fileno(self) -> int:
         """Return -1: python-can cannot use an inherited descriptor."""
@@ -190,6 +194,7 @@ class PythonCanTransport(CanTransport):
         if code == errno.ENOBUFS or "buffer full" in str(error):
             why = f" (the adapter reports: {self.trouble})" if self.trouble else f"; {NO_ACKNOWLEDGE}"
             return TransportTimeoutError(f"{self.port}: the transmit buffer is full{why}")
+        self._lost = True
         return TransportLostError(
             f"{self.port}: the bus is lost ({error}); check that the adapter is plugged in, and that `ip "
             "link` shows it up"
