@@ -154,7 +154,8 @@ class PythonCanTransport(CanTransport):
             self._report(f"the adapter's {side} buffer overflowed: frames are lost")
         elif kind & 0x004 and controller & 0x30:
             self._report("the controller is error-passive: many frames fail; check wiring and termination")
-        elif kind & 0x100:
+        elif kind & 0x100 or (kind & 0x004 and controller & 0x40):
+            # The controller was restarted, or works without errors again.
             self.trouble = ""
         else:
             self._report(f"bus error (class 0x{kind:03x}); check wiring, termination and bit rate")

@@ -225,3 +225,14 @@ def test_a_bus_that_works_stays_open(fake: Callable[..., tuple[PythonCanTranspor
     transport.reopen()
     assert not bus._is_shutdown
     assert transport.receive(0.0).payload == b"kept"
+
+
+@pytest.mark.parametrize(("kind", "controller"), [(0x004, 0x40), (0x204, 0x40), (0x100, 0)])
+def test_a_controller_without_errors_again_is_no_trouble(
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]], kind: int, controller: int
+) -> None:
+    """SocketCAN reports error-active (and restarted) after error-passive: the trouble is over."""
+    transport, _ = fake(error_frame(0x004, 0x20), error_frame(kind, controller))
+    with pytest.raises(TransportTimeoutError, match=r"within 0 s$"):
+        transport.receive(0.0)
+    assert transport.error_frames == 1
