@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol
 
 import numpy as np
@@ -94,6 +95,7 @@ class PolicyBehaviour:
         self._observations = ObservationBuilder(spec)
         self._scale = np.array(spec.action_scale)
         self._centre = centre(description)
+        self._template = position_command(spec, self._centre)
         self.action: FloatArray | None = None
 
     def reset(self) -> None:
@@ -115,7 +117,7 @@ class PolicyBehaviour:
             )
         self.action = np.clip(action, -1.0, 1.0)
         self._observations.record_action(self.action)
-        return position_command(self._policy.spec, self._centre + self._scale * self.action)
+        return dataclasses.replace(self._template, position_target=self._centre + self._scale * self.action)
 
     def _coordinates(self, state: RobotState) -> tuple[FloatArray, FloatArray]:
         """Return positions and velocities in the policy's layout, with the base's first if it needs them."""
