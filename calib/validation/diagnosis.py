@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
@@ -142,16 +141,12 @@ class PlayFit:
         of: The recordings, without play among the parameters.
         plays: The plays.
         fit: The fit.
-        seen: Samples that were fitted, per recording.
-        rest: The others.
-        prediction: The fitted values on the others.
+        prediction: The fitted values on the samples that were not fitted.
     """
 
     of: Problem
     plays: Sequence[Parameter]
     fit: Refined
-    seen: Sequence[npt.NDArray[np.bool_]]
-    rest: Sequence[npt.NDArray[np.bool_]]
     prediction: Refined
 
 
@@ -270,7 +265,7 @@ def fit_play(problem: Problem) -> PlayFit | None:
         prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
-    return PlayFit(problem, plays, fit, seen, rest, prediction)
+    return PlayFit(problem, plays, fit, prediction)
 
 
 def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> Play | None:
@@ -284,7 +279,10 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
         return None
     plays, fit, with_play = wide.plays, wide.fit, wide.prediction
     own, found = np.split(fit.theta, [len(problem.space)])
-    unseen, length = problem.part(wide.rest), with_play.shooting.length
+    seen, unseen = (
+        problem.part([e.usable for e in part.shooting.problem.episodes]) for part in (fit, with_play)
+    )
+    length = with_play.shooting.length
 
     def decides(without: Refined) -> tuple[float, float] | None:
         share = 1 - with_play.chi2 / without.chi2
@@ -297,7 +295,7 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
         if decides(without) is None:
             return None
         # The wider fit may have left another minimum; a fit from there without play then predicts as well.
-        bare = refine(problem.part(wide.seen), own, fit.latency_s, (SETTINGS.play_s,))
+        bare = refine(seen, own, fit.latency_s, (SETTINGS.play_s,))
         again = at_parameters(unseen, bare.theta, bare.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None

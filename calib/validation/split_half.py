@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2 as chi2_law
+from scipy.stats import norm
 
 from deal_hw.calib.data.problem import Problem, taken
 from deal_hw.calib.fit.refinement import Refined, refine_windows
@@ -183,7 +184,7 @@ def agreement(
     flagged = tuple(r.name for k, r in enumerate(rows) if z[k] > least and identified[k] and r.agree is False)
     compared = z[identified & [r.agree is not None for r in rows]]
     power, count = float(np.sum(compared**2)), len(compared)
-    by_chance = not count or power <= chi2.ppf(1 - SETTINGS.false_alarms, count)
+    by_chance = not count or power <= chi2_law.ppf(1 - SETTINGS.false_alarms, count)
     scale = 1.0 if by_chance else float(np.sqrt(power / count))
     reach = np.max(np.abs(scaled - space.to_scale(theta)), axis=0)
     return SplitHalf(rows, flagged, reach, scale, steps)
