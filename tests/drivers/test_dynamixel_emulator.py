@@ -187,6 +187,11 @@ def test_doctor_lists_servos(tmp_path: Path) -> None:
             "id 1 at 1000000 baud answers pings",
             "two servos may have the same id",
         ),
+        (
+            ServoFaults(servo_protocol=1),
+            "id 2 at 1000000 baud speaks Dynamixel protocol 1.0",
+            "Protocol Type",
+        ),
     ],
 )
 def test_doctor_tells_what_is_wrong(faults: ServoFaults, says: str, remedy: str, tmp_path: Path) -> None:

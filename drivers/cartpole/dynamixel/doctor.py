@@ -60,11 +60,12 @@ def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Fi
             continue
         with transport:
             bus = Bus(transport, clock, rate, settings.answer_s)
-            for servo, answer in sorted(bus.broadcast_ping(_LISTEN_S + settings.answer_s).items()):
+            answers = bus.broadcast_ping(_LISTEN_S + settings.answer_s)
+            for servo, answer in sorted(answers.items()):
                 found += 1
                 yield from _servo(bus, servo, answer, rate, settings)
             for servo in (settings.cart_id, settings.pole_id):
-                if rate != settings.baud_rate and bus.ping_protocol_1(servo):
+                if servo not in answers and bus.ping_protocol_1(servo):
                     found += 1
                     yield _old(servo, rate)
     if not found:
