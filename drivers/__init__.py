@@ -149,10 +149,15 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
         from deal_hw.drivers.transports.interfaces import find_interface
 
         port = f"{find_interface(port).name}, domain {options.domain}"
+    elif transport_name in CAN_BUSES:
+        from deal_hw.drivers.transports.can_bus import CanAddress
+
+        # Two devices on one bus are one claim: a bus has one commander.
+        address = CanAddress.parse(port.partition("?")[0])
+        port = f"{address.interface}:{_resolved(address.channel)}"
     else:
         # Settings after the path of a port do not make it another port.
-        prefix, colon, path = port.partition("?")[0].rpartition(":")
-        port = prefix + colon + (os.path.realpath(path) if "/" in path else path)
+        port = _resolved(port.partition("?")[0])
     return f"{transport_name} on {port}"
 
 
@@ -324,6 +329,10 @@ def default_transport(name: str) -> str:
     """
     _driver(name)
     return REACHED_BY[name][0]
+
+
+def _resolved(path: str) -> str:
+    return os.path.realpath(path) if "/" in path else path
 
 
 def _simulated(name: str, simulator: str) -> Any:

@@ -81,6 +81,7 @@ _SIGNALS: Final[dict[type[CanMessage], dict[str, str]]] = {
     )
 }
 """Signal of each field; an info is laid out by hand."""
+_COMMANDS: Final = ("Target", "Arm", "Home")
 _FIRMWARE: Final = ("Major", "Minor", "Patch")
 
 
@@ -113,13 +114,21 @@ def check_node(node: int) -> int:
     return node
 
 
+def second_host(device: str, frame: str) -> str:
+    """Return the fault of a device that this program commands, and another one too."""
+    return (
+        f"another program or computer commands {device} (it sent {frame}); end it, or take its adapter off "
+        "the bus"
+    )
+
+
 class CanLink:
     """One side of a CAN wire; bytes are whole frames in the layout of :data:`FRAME`.
 
     Attributes:
         errors: Number of corrupt or unknown messages so far.
         torn: Number of messages so far that lost a frame; hosts detect a missing state by its number.
-        fault: Two devices with one number; "" for none.
+        fault: Two devices with one number, or another host that commands this one; "" for none.
 
     Args:
         node: The device's number.
@@ -146,6 +155,7 @@ class CanLink:
         self._names = {frame_id(name, node): name for name in database()}
         self._parts: dict[str, list[bytes] | None] = {}
         self._heard: int | None = None
+        self._commands = False
 
     @property
     def hint(self) -> str:
@@ -161,6 +171,7 @@ class CanLink:
         Raises:
             FrameError: A value does not fit its field.
         """
+        self._commands = isinstance(message, protocol.Target | protocol.Arm | protocol.Home)
         group = type(message).__name__
         values = _to_values(message, self._version)
         names = _frames_of(group)
@@ -201,6 +212,8 @@ class CanLink:
 
     def _take(self, name: str, part: bytes) -> CanMessage | None:
         group = name.rstrip("0123456789")
+        if self._commands and group in _COMMANDS:
+            self.fault = second_host(f"node {self._node}", group)
         names = _frames_of(group)
         index = names.index(name)
         parts = self._parts.get(group)

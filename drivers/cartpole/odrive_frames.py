@@ -30,6 +30,8 @@ class Command(enum.IntEnum):
     ENCODER_ESTIMATES = 0x09
     SET_CONTROLLER_MODE = 0x0B
     SET_INPUT_POS = 0x0C
+    SET_INPUT_VEL = 0x0D
+    SET_INPUT_TORQUE = 0x0E
     SET_LIMITS = 0x0F
     CLEAR_ERRORS = 0x18
     SET_POS_GAIN = 0x1A
@@ -37,6 +39,17 @@ class Command(enum.IntEnum):
     TORQUES = 0x1C
 
 
+MOVING: Final = (
+    Command.SET_AXIS_STATE,
+    Command.SET_CONTROLLER_MODE,
+    Command.SET_INPUT_POS,
+    Command.SET_INPUT_VEL,
+    Command.SET_INPUT_TORQUE,
+    Command.SET_LIMITS,
+    Command.SET_POS_GAIN,
+    Command.SET_VEL_GAINS,
+)
+"""Frames to a drive that arm it or change what its motor does."""
 LAYOUT: Final = {
     Command.HEARTBEAT: struct.Struct("<IBBBx"),
     Command.ESTOP: struct.Struct(""),
@@ -52,7 +65,7 @@ LAYOUT: Final = {
     Command.SET_VEL_GAINS: struct.Struct("<ff"),
     Command.TORQUES: struct.Struct("<ff"),
 }
-"""Data of each frame; rev, rev/s, N*m, A."""
+"""Data of each frame that this module sends or reads; rev, rev/s, N*m, A."""
 
 
 class AxisError(enum.IntFlag):

@@ -14,12 +14,13 @@ from typing import ClassVar, Final
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, check_node
+from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, check_node, second_host
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.odrive_frames import (
     CLOSED_LOOP,
     IDLE,
     LAYOUT,
+    MOVING,
     NODE_SHIFT,
     PASSTHROUGH,
     POSITION_CONTROL,
@@ -172,13 +173,14 @@ class OdriveLink:
         self._written: dict[int, bytes] = {}
         self._answers: list[protocol.Ack] = []
         self._arming: int | None = None
-        self._armed = False
+        self._armed = self._commands = False
+        self._second_host = ""
 
     @property
     def fault(self) -> str:
         """Fault after which the host must not continue; "" for none."""
-        if self._encoder.fault:
-            return self._encoder.fault
+        if self._second_host or self._encoder.fault:
+            return self._second_host or self._encoder.fault
         if self._armed and self._axis_errors:
             names = ", ".join(flag.name or "" for flag in AxisError if flag in self._axis_errors)
             return (
@@ -227,6 +229,7 @@ class OdriveLink:
             FrameError: A value does not fit its field.
         """
         idle = self._pack(Command.SET_AXIS_STATE, IDLE)
+        self._commands = isinstance(message, protocol.Target | protocol.Arm | protocol.Home)
         match message:
             case protocol.Hello():
                 self._info, self._heartbeat_us, self._written = None, None, {}
@@ -325,6 +328,9 @@ class OdriveLink:
     # Messages of drive and encoder.
 
     def _take_drive(self, number: int, data: bytes) -> None:
+        # A drive that somebody else switches off reports it by itself.
+        if self._commands and number in MOVING and data != LAYOUT[Command.SET_AXIS_STATE].pack(IDLE):
+            self._second_host = second_host(f"the ODrive at node {self._s.drive}", Command(number).name)
         if number not in (Command.HEARTBEAT, Command.ENCODER_ESTIMATES, Command.TORQUES, Command.TX_SDO):
             return
         layout = LAYOUT[Command(number)]

@@ -131,6 +131,8 @@ class PythonCanTransport(CanTransport):
                 raise self._timeout(timeout_s)
             if frame.is_error_frame:
                 self._take_error(frame)
+            elif not frame.is_rx and self.address.interface != "socketcan":
+                continue  # An adapter's echo of our own frame; with socketcan, another program here.
             elif not (frame.is_extended_id or frame.is_remote_frame or frame.is_fd):
                 return Message(f"{frame.arbitration_id:03X}", bytes(frame.data), self._stamp(frame.timestamp))
 

@@ -172,6 +172,31 @@ class TestInheritedSlcan(TransportSuite):
             pair.near.send(Message("123", b"a", 0))
 
 
+@pytest.mark.parametrize(("port", "heard"), [("gs_usb:0", False), ("socketcan:can0", True)])
+def test_an_adapters_echo_of_our_own_frame_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, port: str, heard: bool
+) -> None:
+    """Of socketcan the same mark says that another program of this computer sent the frame."""
+    make_bus, channel = can.Bus, next(CHANNELS)
+    monkeypatch.setattr(
+        can,
+        "Bus",
+        lambda **_: make_bus(
+            interface="virtual", channel=channel, ignore_config=True, receive_own_messages=True
+        ),
+    )
+    monkeypatch.setattr(can_transport, "check_link", lambda channel: None)
+    near = PythonCanTransport(port)
+    near.open()
+    near.send(Message("321", b"a", 0))
+    if heard:
+        assert near.receive(0.1).payload == b"a"
+    else:
+        with pytest.raises(TransportTimeoutError):
+            near.receive(0.0)
+    near.close()
+
+
 # Ports.
 
 

@@ -105,6 +105,44 @@ def test_two_devices_under_one_number_end_a_run() -> None:
     assert "two devices use node 1" in robot.fault
 
 
+@pytest.mark.parametrize(
+    "message",
+    [protocol.Target(9, 0, 0, 0, 0, 0), protocol.Arm(9), protocol.Home(9)],
+    ids=lambda m: type(m).__name__,
+)
+def test_a_second_host_that_commands_the_device_ends_a_run(message: protocol.AnyMessage) -> None:
+    """A program that only listens sees any host's frames; one that commands the device has no rival."""
+    clock = VirtualClock()
+    wire = VirtualTransport(can_device(nominal_truth("ideal")), clock)
+    robot = CartpoleRobot(wire, clock, link=CanLink)
+    robot.connect()
+    other = Message("", CanLink().encode(message), clock.now_ns())
+    wire._queue.append(other)
+    robot.read_state(1.0)
+    assert robot.fault == ""
+    robot.home(5.0)
+    robot.arm(2.0)
+    assert robot.fault == ""
+    wire._queue.append(other)
+    for _ in range(robot._states.maxlen or 0):
+        robot.read_state(1.0)
+        if robot.fault:
+            break
+    assert "another program or computer commands node 1" in robot.fault
+
+
+def test_a_host_that_stopped_has_no_rival() -> None:
+    """After its own stop another program may take the device."""
+    link, other = CanLink(), CanLink()
+    link.encode(protocol.Arm(1))
+    link.encode(protocol.Stop(2))
+    list(link.decode(other.encode(protocol.Arm(3))))
+    assert link.fault == ""
+    link.encode(protocol.Arm(4))
+    list(link.decode(other.encode(protocol.Stop(5))))
+    assert link.fault == ""
+
+
 def test_the_wire_changes_no_sample() -> None:
     """The same commands at the same times give the same numbers on serial frames and on CAN."""
     truth = nominal_truth("sensor", seed=3)
@@ -354,6 +392,16 @@ def test_settings_of_a_port_do_not_make_it_another_robot(tmp_path: Path) -> None
         for port in ("slcan:/dev/null", "slcan:/dev/null?node=3", f"slcan:{tmp_path}/link")
     }
     assert claims == {"can on slcan:/dev/null"}
+
+
+@pytest.mark.parametrize("transport", ["can", "odrive"])
+@pytest.mark.parametrize(
+    ("short", "whole"),
+    [("can0", "socketcan:can0"), ("/dev/null", "slcan:/dev/null"), ("can0?node=3", "can0")],
+)
+def test_two_ways_to_write_a_port_are_one_robot(transport: str, short: str, whole: str) -> None:
+    """Otherwise two programs could command it at once."""
+    assert claim_name(transport, short, WireOptions()) == claim_name(transport, whole, WireOptions())
 
 
 def test_options_of_a_bus_need_one() -> None:

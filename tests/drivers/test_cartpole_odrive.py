@@ -37,6 +37,7 @@ from deal_hw.errors import (
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.transport import Message
 from deal_hw.types import RobotState, Status
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
@@ -408,6 +409,42 @@ def test_an_error_of_the_drive_is_decoded() -> None:
     assert Status.ARMED not in wire.newest().status
     assert Status.FAULT in wire.newest().status
     assert "ESTOP_REQUESTED" in robot.fault
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        pack(PARTS.drive, Command.SET_INPUT_POS, 1.0, 0, 0),
+        pack(PARTS.drive, Command.SET_AXIS_STATE, CLOSED_LOOP),
+        FRAME.pack(PARTS.drive << 5 | 0x0D, 8, bytes(8)),
+    ],
+    ids=["Set_Input_Pos", "closed loop", "Set_Input_Vel"],
+)
+def test_a_second_host_that_commands_the_drive_ends_a_run(frame: bytes) -> None:
+    """Two hosts would take turns at the motor; a rival's frame before our own commands is none."""
+    wire = Wire()
+    wire.robot.connect()
+    other = Message("", frame, wire.clock.now_ns())
+    wire.virtual._queue.append(other)
+    wire.newest()
+    assert wire.robot.fault == ""
+    robot = wire.armed()
+    wire.newest()
+    assert robot.fault == ""
+    wire.virtual._queue.append(other)
+    wire.clock.advance_ns(10 * MS)
+    wire.newest()
+    assert "another program or computer commands the ODrive at node 0" in robot.fault
+
+
+def test_a_second_host_that_switches_the_drive_off_is_no_rival() -> None:
+    """Anybody may stop the motor; the drive itself reports that it is idle."""
+    wire = Wire()
+    robot = wire.armed()
+    wire.virtual._queue.append(Message("", pack(PARTS.drive, Command.SET_AXIS_STATE, IDLE), 0))
+    wire.clock.advance_ns(10 * MS)
+    wire.newest()
+    assert robot.fault == ""
 
 
 def test_a_wrong_node_is_named() -> None:
