@@ -22,7 +22,7 @@ import numpy.typing as npt
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError, shown
 from deal_hw.schema import SHOWN, STRICT, check_members, check_numbers, either, read_json, refusal
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
 
 Quantity = Literal[
     "position",
@@ -346,8 +346,6 @@ class ObservationBuilder:
 
     def __init__(self, spec: PolicySpec, batch_shape: tuple[int, ...] = ()) -> None:
         self.spec = spec
-        self._joint = {name: i for i, name in enumerate(spec.joint_names)}
-        self._actuator = {name: i for i, name in enumerate(spec.actuated)}
         self._default = np.asarray(spec.default_position)
         depth = spec.history + 1
         J, A = len(spec.joint_names), len(spec.actuated)
@@ -358,6 +356,7 @@ class ObservationBuilder:
         self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.clock: FloatArray = np.zeros(batch_shape)
         self._fresh = np.ones(batch_shape, dtype=bool)
+        self._reads = _reads(spec)
 
     @property
     def size(self) -> int:
@@ -373,7 +372,7 @@ class ObservationBuilder:
 
     def record_action(self, action: FloatArray) -> None:
         """Note the action that was taken after the last observation, (..., A)."""
-        self._action = np.roll(self._action, 1, axis=0)
+        self._shift(self._action)
         self._action[1] = action
 
     def build(self, position: FloatArray, velocity: FloatArray) -> Observation:
@@ -389,8 +388,9 @@ class ObservationBuilder:
             ConfigurationError: The policy observes the base, which is not given.
         """
         J = len(self._default)
-        self._position = np.roll(self._position, 1, axis=0)
-        self._velocity = np.roll(self._velocity, 1, axis=0)
+        past = [self._position, self._velocity]
+        self._shift(self._position)
+        self._shift(self._velocity)
         self._position[0] = position[..., -J:] - self._default
         self._velocity[0] = velocity[..., -J:]
         if self.spec.observes_base:
@@ -400,38 +400,81 @@ class ObservationBuilder:
                     f"coordinates, got {position.shape[-1]}; this robot's states do not contain the base: "
                     "use another policy"
                 )
-            self._base = np.roll(self._base, 1, axis=0)
+            past.append(self._base)
+            self._shift(self._base)
             self._base[0] = base_features(position[..., :BASE_SIZE], velocity[..., :BASE_SIZE])
-            self._base = np.where(self._fresh[..., None], self._base[:1], self._base)
-        # The history of a new member is filled with its present state, because it has no past.
-        fresh = self._fresh[..., None]
-        self._position = np.where(fresh, self._position[:1], self._position)
-        self._velocity = np.where(fresh, self._velocity[:1], self._velocity)
-        self._fresh = np.zeros_like(self._fresh)
-        columns = [np.asarray(term.scale * self._read(term)) for term in self.spec.observation]
+        if self._fresh.any():
+            # The history of a new member is filled with its present state, because it has no past.
+            for memory in past:
+                np.copyto(memory, memory[:1], where=self._fresh[..., None])
+            self._fresh = np.zeros_like(self._fresh)
+        found = np.empty((*self._fresh.shape, self.size), dtype=np.float32)
+        for read in self._reads:
+            values = self._memory(read.quantity)[read.delay, ..., read.column]
+            found[..., read.entry] = read.scale * np.moveaxis(values, 0, -1)
         self.clock = (self.clock + self.spec.clock_hz / self.spec.control_rate_hz) % 1.0
-        return np.stack(columns, axis=-1).astype(np.float32)
+        return found
 
-    def _read(self, term: ObservationTerm) -> FloatArray:
+    @staticmethod
+    def _shift(memory: FloatArray) -> None:
+        memory[1:] = memory[:-1]
+
+    def _memory(self, quantity: Quantity) -> FloatArray:
+        """Return what a quantity is read from, (delays, ..., columns)."""
         # There is no default: a quantity without a case cannot be observed.
-        match term.quantity:
-            case "position" | "sin_position" | "cos_position":
-                position = self._position[term.delay][..., self._joint[term.joint]]
-                if term.quantity == "position":
-                    return np.asarray(position)
-                return np.asarray(np.sin(position) if term.quantity == "sin_position" else np.cos(position))
+        match quantity:
+            case "position":
+                return self._position
+            case "sin_position":
+                return np.asarray(np.sin(self._position))
+            case "cos_position":
+                return np.asarray(np.cos(self._position))
             case "velocity":
-                return np.asarray(self._velocity[term.delay][..., self._joint[term.joint]])
+                return self._velocity
             case "action":
-                return np.asarray(self._action[term.delay][..., self._actuator[term.joint]])
+                return self._action
             case "command":
-                return np.asarray(self.command[..., AXES.index(term.joint)])
+                return self.command[None]
             case "clock":
                 angle = 2.0 * np.pi * self.clock
-                return np.asarray(np.sin(angle) if term.joint == "sin" else np.cos(angle))
+                return np.stack([np.sin(angle), np.cos(angle)], axis=-1)[None]
             case "gravity" | "heading" | "angular_velocity" | "linear_velocity" | "height":
-                first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
-                return np.asarray(self._base[term.delay][..., first + term.axes.index(term.joint)])
+                return self._base
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """The terms of one quantity: indices of their delays, columns and entries of the observation, (n,)."""
+
+    quantity: Quantity
+    delay: IntArray
+    column: IntArray
+    entry: IntArray
+    scale: FloatArray
+
+
+def _reads(spec: PolicySpec) -> list[_Read]:
+    entries: dict[Quantity, list[int]] = {}
+    for entry, term in enumerate(spec.observation):
+        entries.setdefault(term.quantity, []).append(entry)
+    return [
+        _Read(
+            quantity,
+            # Command and clock are the same at all delays.
+            np.array([0 if quantity in ("command", "clock") else spec.observation[i].delay for i in found]),
+            np.array([_column(spec, spec.observation[i]) for i in found]),
+            np.array(found),
+            np.array([spec.observation[i].scale for i in found]),
+        )
+        for quantity, found in entries.items()
+    ]
+
+
+def _column(spec: PolicySpec, term: ObservationTerm) -> int:
+    if not term.axes:
+        return (spec.actuated if term.quantity == "action" else spec.joint_names).index(term.joint)
+    first = len(AXES) * BASE_QUANTITIES.index(term.quantity) if term.quantity in BASE_QUANTITIES else 0
+    return first + term.axes.index(term.joint)
 
 
 def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray:
@@ -464,13 +507,9 @@ def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:
     """
     turn = position[..., 3:]
     down, ahead = (np.broadcast_to(v, turn.shape) for v in (np.array([0.0, 0, -1]), np.array([1.0, 0, 0])))
+    vectors = np.stack([down, ahead, velocity[..., :3]], axis=-2)
+    seen = in_base_frame(turn[..., None, :], vectors)
     return np.concatenate(
-        [
-            in_base_frame(turn, down),
-            in_base_frame(turn, ahead),
-            velocity[..., 3:],
-            in_base_frame(turn, velocity[..., :3]),
-            position[..., 2:3],
-        ],
+        [seen[..., 0, :], seen[..., 1, :], velocity[..., 3:], seen[..., 2, :], position[..., 2:3]],
         axis=-1,
     )
