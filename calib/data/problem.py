@@ -79,7 +79,10 @@ class MemberPrediction:
 
 
 class PopulationPolicy(Protocol):
-    """pi_0, the policy that produced all commands of the recordings, for N simulators at once."""
+    """pi_0, the policy that produced all commands of the recordings, for N simulators at once.
+
+    A shallow copy that was started again is independent: each thread has its own.
+    """
 
     @property
     def history(self) -> int:
@@ -142,8 +145,7 @@ class Problem:
     _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:
-        robot, space, threads = self.robot, self.space, self.threads
-        self._batches = BatchPool(lambda count: ServoBatch(robot, space, count, threads))
+        self._batches = BatchPool(self.robot, self.space, self.threads)
         given = () if self.fixed_latency_s is None else (self.fixed_latency_s,)
         (low, high), longest = self.latency_range_s, LONGEST_LATENCY_S
         if not (0 <= low < high <= longest and all(0 <= latency_s <= longest for latency_s in given)):
@@ -242,14 +244,14 @@ class Problem:
         """Return the problem with more parameters after its own; recordings and noise are shared."""
         other = copy.copy(self)
         space = other.space = ParameterSpace((*self.space.parameters, *parameters))
-        other._batches = BatchPool(lambda count: ServoBatch(self.robot, space, count, self.threads))
+        other._batches = BatchPool(self.robot, space, self.threads)
         return other
 
     def with_robot(self, robot: RobotModel) -> Problem:
         """Return the problem with another model of the same robot; the rest is shared."""
         other = copy.copy(self)
         other.robot = robot
-        other._batches = BatchPool(lambda count: ServoBatch(robot, self.space, count, self.threads))
+        other._batches = BatchPool(robot, self.space, self.threads)
         return other
 
     @property
@@ -284,6 +286,10 @@ class Problem:
     def batch(self, count: int) -> ServoBatch:
         """Return the simulator of ``count`` members; the last used sizes are kept."""
         return self._batches.get(count)
+
+    def batches(self, count: int) -> list[ServoBatch]:
+        """Return simulators with ``count`` members in all, one for each thread."""
+        return self._batches.parts(count)
 
     def measured(self, index: int) -> FloatArray:
         """Return the measured channels of an episode, (T, M)."""

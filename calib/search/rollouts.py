@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,8 +128,26 @@ def rollout_population(
     Raises:
         InsufficientDataError: As :func:`policy_of`.
     """
+    batches = problem.batches(len(members.theta))
+    ends = np.cumsum([batch.count for batch in batches])
+
+    def roll(batch: ServoBatch, end: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        mine = slice(end - batch.count, end)
+        part = Members(members.theta[mine], members.latency_s[mine])
+        return _roll(problem, batch, part, index, ticks, replay=replay)
+
+    if len(batches) == 1:
+        return roll(batches[0], len(members.theta))
+    with ThreadPoolExecutor(len(batches)) as pool:
+        parts = list(pool.map(roll, batches, ends))
+    position, velocity, action = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return position, velocity, action
+
+
+def _roll(
+    problem: Problem, batch: ServoBatch, members: Members, index: int, ticks: Ticks, *, replay: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     episode = problem.episodes[index]
-    batch = problem.batch(len(members.theta))
     batch.set_parameters(members.theta)
     starts, first = problem.starts[index], int(ticks.sample[0])
     batch.set_state(
@@ -137,7 +157,7 @@ def rollout_population(
     )
     if replay:
         return _replay(batch, episode, members, ticks)
-    policy = policy_of(problem)
+    policy = copy.copy(policy_of(problem))
     seen = recorded_states(problem, index, ticks.past)
     policy.restart(batch.count, *seen, episode.target[ticks.past_action], ticks.number)
     return _closed_loop(batch, episode, members, ticks, policy)

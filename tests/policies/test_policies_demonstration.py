@@ -116,6 +116,22 @@ def test_the_truth_in_closed_loop_repeats_the_target(robot: str) -> None:
     assert np.abs(position[1, :short, model.joints] - joints[:short]).max() > 1e-3
 
 
+@pytest.mark.parametrize("replay", [False, True])
+def test_rollouts_do_not_depend_on_the_number_of_threads(replay: bool) -> None:
+    """To the last bit, with five members on one, two and three threads."""
+    model, space, _, made = recorded("ant", 2, 0.6)
+    theta, latency_s = space.sample(np.random.default_rng(0), 5), np.array([0.0, 0.004, 0.0, 0.02, 0.001])
+    found = []
+    for threads in (1, 2, 3):
+        population = PopulationDemonstration(demonstration_policy("ant"), model.description, WALK)
+        problem = Problem(model, space, [made.episode], threads=threads, policy=population)
+        ticks = control_ticks(problem, 0, history=population.history)
+        found.append(rollout_population(problem, Members(theta, latency_s), 0, ticks, replay=replay))
+    for other in found[1:]:
+        for array, same in zip(found[0], other, strict=True):
+            np.testing.assert_array_equal(array, same)
+
+
 @pytest.mark.parametrize("robot", FLOATING)
 def test_the_paper_takes_pi_0_in_the_loop(robot: str) -> None:
     """`deal-paper` with the policy instead of its recorded actions runs to the end, inside the ranges."""

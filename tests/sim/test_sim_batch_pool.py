@@ -23,8 +23,7 @@ def robot() -> RobotModel:
 @pytest.fixture
 def pool(robot: RobotModel) -> BatchPool:
     """Two simulators are kept."""
-    space = k9_space()
-    return BatchPool(lambda count: ServoBatch(robot, space, count, threads=1), most=2)
+    return BatchPool(robot, k9_space(), threads=1, most=2)
 
 
 def moved(batch: ServoBatch) -> FloatArray:
@@ -52,6 +51,19 @@ def test_steps_of_those_given_up_count(pool: BatchPool) -> None:
         moved(pool.get(count))
     assert len(pool) == 2
     assert pool.steps == 100
+
+
+@pytest.mark.parametrize(("threads", "count", "sizes"), [(1, 5, [5]), (3, 7, [3, 2, 2]), (4, 2, [1, 1])])
+def test_parts_are_one_for_each_thread(robot: RobotModel, threads: int, count: int, sizes: list[int]) -> None:
+    """Their members add up, their steps count, and they are not the whole simulator of as many members."""
+    pool = BatchPool(robot, k9_space(), threads=threads)
+    parts = pool.parts(count)
+    assert [part.count for part in parts] == sizes
+    assert all(a is b for a, b in zip(parts, pool.parts(count), strict=True))
+    for part in parts:
+        moved(part)
+    assert pool.steps == 10 * count
+    assert pool.get(count).count == count
 
 
 def test_a_simulator_made_anew_gives_the_same(pool: BatchPool) -> None:

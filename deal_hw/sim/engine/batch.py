@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -291,13 +290,18 @@ class BatchPool:
     Without a limit, searches with stages of different sizes would keep one for every size.
 
     Args:
-        make: Makes a simulator with a given number of members.
-        most: Most simulators that are kept.
+        robot: The robot's model.
+        space: The parameters in which members differ.
+        threads: Threads of all simulators; None for all CPUs.
+        most: Most sizes that are kept.
     """
 
-    def __init__(self, make: Callable[[int], ServoBatch], most: int = SIZES_KEPT) -> None:
-        self._make, self._most = make, most
-        self._kept: dict[int, ServoBatch] = {}
+    def __init__(
+        self, robot: RobotModel, space: ParameterSpace, threads: int | None = None, most: int = SIZES_KEPT
+    ) -> None:
+        self._robot, self._space, self._most = robot, space, most
+        self._threads = threads or default_threads()
+        self._kept: dict[tuple[int, int], list[ServoBatch]] = {}
         self._steps = 0
 
     def __len__(self) -> int:
@@ -306,13 +310,27 @@ class BatchPool:
     @property
     def steps(self) -> int:
         """Physics steps of all simulators so far, including dropped ones."""
-        return self._steps + sum(batch.steps for batch in self._kept.values())
+        return self._steps + sum(batch.steps for kept in self._kept.values() for batch in kept)
 
     def get(self, count: int) -> ServoBatch:
         """Return the simulator of ``count`` members; parameters and state are those of its last user."""
-        batch = self._kept.pop(count, None) or self._make(count)
+        return self._take(count, 1)[0]
+
+    def parts(self, count: int) -> list[ServoBatch]:
+        """Return simulators with ``count`` members in all: one of one thread for each thread.
+
+        So the work between two steps of a closed loop is divided among the threads, too. The result does not
+        depend on their number.
+        """
+        return self._take(count, min(self._threads, count))
+
+    def _take(self, count: int, parts: int) -> list[ServoBatch]:
+        key = count, parts
+        sizes = [count // parts + (i < count % parts) for i in range(parts)]
+        threads = max(self._threads // parts, 1)
+        kept = self._kept.pop(key, None) or [ServoBatch(self._robot, self._space, n, threads) for n in sizes]
         # Last in order is last used.
-        self._kept[count] = batch
+        self._kept[key] = kept
         if len(self._kept) > self._most:
-            self._steps += self._kept.pop(next(iter(self._kept))).steps
-        return batch
+            self._steps += sum(batch.steps for batch in self._kept.pop(next(iter(self._kept))))
+        return kept
