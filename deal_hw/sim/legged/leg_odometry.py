@@ -6,11 +6,19 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
-from deal_hw.sim.legged.velocity_filter import filtered_velocity, rotated, standing_feet
+from deal_hw.sim.legged.velocity_filter import (
+    FILTER,
+    GRAVITY,
+    FilterSettings,
+    filtered_velocity,
+    rotated,
+    standing_feet,
+)
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
@@ -110,9 +118,49 @@ def leg_odometry(
     else:
         weight = float(np.sum(model.body_mass) * np.linalg.norm(model.opt.gravity))
         stands = standing_feet(load, weight)
-        velocity = filtered_velocity(felt.time_s, rotated(orientation, felt.acceleration), answers, stands)
+        pushed = rotated(orientation, felt.acceleration)
+        velocity = filtered_velocity(felt.time_s, pushed, answers, stands)
+        height = np.full(T, np.nan)
+        some = stands.any(axis=1)
+        height[some] = -np.nanmedian(np.where(stands, lowest, np.nan)[some], axis=1)
+        if some.any():
+            height, velocity[:, 2] = smoothed_height(felt.time_s, pushed[:, 2], height)
+            return Odometry(velocity, height)
     bears = np.where(stands.any(axis=1, keepdims=True), stands, lowest == lowest.min(axis=1, keepdims=True))
     return Odometry(velocity, -np.nanmedian(np.where(bears, lowest, np.nan), axis=1))
+
+
+def smoothed_height(
+    time_s: FloatArray, acceleration: FloatArray, height: FloatArray, settings: FilterSettings = FILTER
+) -> tuple[FloatArray, FloatArray]:
+    """Return height and vertical velocity of a base, (T,) each [m, m/s], by one fit over the recording.
+
+    Upwards the feet's velocities mislead: the smoothed motion of a joint mixes a foot that lands with one
+    that stands. The fit weighs the heights over standing feet against the accelerations, which are the second
+    differences of the result.
+
+    Args:
+        time_s: (T,) [s], increasing; at least three samples.
+        acceleration: Vertical specific force in the world, (T,) [m/s²].
+        height: Over the standing feet, (T,) [m]; NaN where none stands.
+        settings: Weights.
+    """
+    before, after = np.diff(time_s)[:-1], np.diff(time_s)[1:]
+    width = 0.5 * (before + after)
+    weight = np.sqrt(width) / settings.lift_drift
+    curve = np.stack([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after]) * (weight / width)
+    seen = np.isfinite(height) / settings.height_m
+    # The normal equations' lower diagonals; a curvature acts on three neighbours.
+    normal = np.zeros((3, len(time_s)))
+    normal[0], right = seen**2, seen**2 * np.nan_to_num(height)
+    pushed = weight * (acceleration[1:-1] - GRAVITY[2])
+    end = len(time_s) - 2
+    for i in range(3):
+        right[i : i + end] += curve[i] * pushed
+        for k in range(3 - i):
+            normal[k, i : i + end] += curve[i] * curve[i + k]
+    found = np.asarray(solveh_banded(normal, right, lower=True))
+    return found, np.gradient(found, time_s)
 
 
 def smooth_orientation(orientation: FloatArray, weights: FloatArray) -> FloatArray:

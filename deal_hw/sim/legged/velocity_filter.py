@@ -30,6 +30,10 @@ class FilterSettings:
         share: Load below which a foot swings, as a share of the largest load.
         borne: Total load below which no foot stands, as a share of the weight: the swing of legs looks like a
             third of it.
+        lift_drift: The same as ``drift``, upwards, where the height corrects it
+            (:func:`deal_hw.sim.legged.leg_odometry.smoothed_height`) [m/s].
+        height_m: Standard deviation of the height over the standing feet in one sample [m]. It is larger than
+            the error, because the errors of one stance are alike.
     """
 
     drift: float = 0.5
@@ -38,6 +42,8 @@ class FilterSettings:
     start_m_s: float = 1.0
     share: float = 0.5
     borne: float = 0.5
+    lift_drift: float = 0.1
+    height_m: float = 0.03
 
 
 FILTER: Final = FilterSettings()
