@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 from collections import Counter
 from typing import Any
 
@@ -11,6 +12,10 @@ from hypothesis import HealthCheck, settings
 # How fast an example is found or runs is the machine's matter: a busy one must fail no test.
 settings.register_profile("deal_hw", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("deal_hw")
+
+# A shell starts background jobs with SIGINT ignored; children inherit this, and tests of Ctrl-C would wait.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REAL_TIME = (
     "cli/",
