@@ -342,11 +342,12 @@ class Go2Env(LocomotionEnv):
         fast = np.square(np.maximum(share - task.calm_share, 0.0)).sum(axis=1)
         reward -= task.speed_weight * fast
         self._note(
-            velocity_error_m_s=np.sqrt(error).mean(),
-            yaw_error_rad_s=np.sqrt(turn).mean(),
+            # Without the members that diverged in this tick.
+            velocity_error_m_s=np.nanmean(np.sqrt(error)),
+            yaw_error_rad_s=np.nanmean(np.sqrt(turn)),
             clipped=np.any(np.abs(self._cut) > 1e-9, axis=1).mean(),
-            height_m=seen[:, HEIGHT].mean(),
-            gait=gait.mean(),
+            height_m=np.nanmean(seen[:, HEIGHT]),
+            gait=np.nanmean(gait),
             slip=slip.mean(),
         )
         return np.asarray(reward)
@@ -380,7 +381,8 @@ class Go2Env(LocomotionEnv):
             return {}
         found = {name: total / ticks for name, total in sums.items()}
         minutes = self.num_envs / (60.0 * self.description.control_rate_hz)
-        return {**found, "falls_a_minute": found.pop("falls") / minutes}
+        falls = found.pop("falls")
+        return {**found, "falls_a_minute": falls / minutes}
 
     def _note(self, **values: Any) -> None:
         if "falls" in values:

@@ -163,6 +163,22 @@ def test_go2_feet_are_paid_for_following_the_clock() -> None:
         assert env.measures()["gait"] == pytest.approx(wanted, abs=0.12)
 
 
+def test_go2_measures_leave_out_a_member_whose_physics_diverged() -> None:
+    """Its state is NaN in that tick; the means are those of the others, and it counts as a fall."""
+    env = make("go2", 4, push_ticks=NEVER, payload_kg=(0.0, 0.0))
+    env.reset(seed=1)
+    env.step(np.zeros((4, 12)))
+    env.measures()
+    position, velocity = env.loop.position, env.loop.velocity
+    velocity[0] = 1e12
+    env.loop.batch.set_state(position, velocity)
+    assert env.step(np.zeros((4, 12)))[2].tolist() == [True, False, False, False]
+    found = env.measures()
+    assert all(np.isfinite(value) for value in found.values())
+    assert found["falls_a_minute"] == pytest.approx(60 * 50 / 4)
+    assert "falls" not in found
+
+
 def test_go2_ends_when_it_tilts_or_sinks() -> None:
     """The limits are a cosine of 0.7, 45.6 degrees, and 0.15 m."""
     env = make("go2", 4)
