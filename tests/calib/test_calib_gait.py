@@ -59,7 +59,7 @@ def known_at(theta: np.ndarray) -> Uncertainty:
 def test_forces_that_may_be_off_together_widen_what_scales_with_them(problem: Problem) -> None:
     """Gains by the root of both squares, and they move together; the floor's friction stays."""
     space, theta = problem.space, problem.space.nominal
-    wider = _scaled_together(problem, known_at(theta), theta, 0.05)
+    wider = _scaled_together(problem, known_at(theta), theta, FORCES, 0.05)
     half = np.log(wider.interval[:, 1] / theta)
     for k, p in enumerate(space):
         wanted = np.hypot(SHARE, np.log(1.05)) if p.kind in FORCES else SHARE
@@ -68,6 +68,13 @@ def test_forces_that_may_be_off_together_widen_what_scales_with_them(problem: Pr
     assert wider.covariance[gains[0], gains[1]] == pytest.approx(np.log(1.05) ** 2)
     floor = space.names.index("floor.friction")
     assert wider.covariance[floor, gains[0]] == 0.0
+
+
+def test_a_walk_may_be_wrong_about_the_floor(problem: Problem) -> None:
+    """Its kinds name parameters of the walk's space, and the floor's friction is one of them."""
+    kinds = [kind for kinds, _ in GAIT.common_std for kind in kinds]
+    assert {p.kind for p in problem.space} >= set(kinds)
+    assert problem.space["floor.friction"].kind in kinds
 
 
 def test_intervals_hold_what_other_windows_found(problem: Problem) -> None:
