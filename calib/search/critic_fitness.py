@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.critic import ClippedCritic, CriticSettings, torch_threads
+from deal_hw.calib.search.critic import ClippedCritic, CriticSettings
 from deal_hw.calib.search.fitness import Fitness, RolloutView, Samples
+from deal_hw.sim.engine.batch import default_threads
 from deal_hw.types import FloatArray
 
 
@@ -18,7 +19,12 @@ class CriticFitness(Fitness):
     def _prepare(self, rng: np.random.Generator) -> None:
         settings = self._settings
         self._view = RolloutView(self._problem, settings)
-        self._critic = ClippedCritic(self._view.real.shape[1], settings.critic or CriticSettings(), rng)
+        self._critic = ClippedCritic(
+            self._view.real.shape[1],
+            settings.critic or CriticSettings(),
+            rng,
+            self._problem.threads or default_threads(),
+        )
         self._replay: list[Samples] = []
 
     def score(self, members: Members) -> FloatArray:
@@ -26,9 +32,8 @@ class CriticFitness(Fitness):
         rollouts, usable = self._view.rollouts(members)
         N, _, width = rollouts.shape
         self._replay.append(rollouts[usable].reshape(-1, width))
-        with torch_threads(self._settings.torch_threads):
-            gap = self._critic.train(self._view.real, *self._replay)
-            score = self._critic.score(rollouts.reshape(-1, width))
+        gap = self._critic.train(self._view.real, *self._replay)
+        score = self._critic.score(rollouts.reshape(-1, width))
         keep = self._settings.replay_generations
         if keep is not None:
             # Old rollouts are dropped before the checkpoint is saved.

@@ -65,7 +65,6 @@ class FitnessSettings:
             Algorithm 1 stores rollouts and does not say whether it forgets. A critic that is still trained
             against old populations pushes the present one away with them (measured: no better than the
             centre), so the default forgets.
-        torch_threads: Threads of the critic's arithmetic.
     """
 
     window_ticks: int = 10
@@ -76,10 +75,9 @@ class FitnessSettings:
     bandwidth: float | None = None
     critic: CriticSettings | None = None
     replay_generations: int | None = 1
-    torch_threads: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("window_ticks", "ticks", "torch_threads"):
+        for name in ("window_ticks", "ticks"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.replay_generations is not None and self.replay_generations < 1:

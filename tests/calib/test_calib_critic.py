@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -66,6 +68,32 @@ def test_same_seed_same_critic() -> None:
         critic.train(cloud(1, 0.7), cloud(2, -0.7))
         scores.append(critic.score(cloud(3, 0.1)))
     np.testing.assert_array_equal(scores[0], scores[1])
+
+
+@pytest.mark.parametrize("kind", [ClippedCritic, PenaltyCritic])
+def test_threads_change_no_result(kind: type[Critic]) -> None:
+    """Work is divided alike for any number of threads, so a critic is the same to the last bit."""
+    found = []
+    for threads in (1, 2, 3):
+        critic = kind(2, SMALL, np.random.default_rng(7), threads)
+        gap = critic.train(cloud(1, 0.7), cloud(2, -0.7))
+        found.append(np.append(critic.score(cloud(3, 0.1, 5000)), np.float32(gap)))
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
+def test_clipped_update_follows_the_gradient_of_eq_5() -> None:
+    """One plain step moves each weight by the rate times the difference of the two sides' mean gradients."""
+    critic = ClippedCritic(2, dataclasses.replace(SMALL, updates=1, clip=10.0), np.random.default_rng(7))
+    critic.optimiser = torch.optim.SGD(critic._parameters, lr=0.5)
+    before = [p.detach().clone() for p in critic._parameters]
+    real, fake = torch.from_numpy(cloud(1, 0.7, 50)), torch.from_numpy(cloud(2, -0.7, 50))
+    gap = critic.hidden(real)[2].mean() - critic.hidden(fake)[2].mean()
+    slopes = torch.autograd.grad(gap, critic._parameters)
+    with critic._pool() as pool:
+        assert critic._update(real, fake, pool) == pytest.approx(float(gap.detach()), abs=1e-6)
+    for old, slope, new in zip(before, slopes, critic._parameters, strict=True):
+        torch.testing.assert_close(new.detach(), old + 0.5 * slope, rtol=1e-5, atol=1e-7)
 
 
 def test_blocks_are_as_good_as_one_array() -> None:
