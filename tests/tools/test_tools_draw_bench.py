@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from draw_bench import main
 
-ROWS = Path(__file__).resolve().parents[2] / "docs" / "measured" / "searches_sensor.json"
+ROWS = Path(__file__).resolve().parents[2] / "docs" / "measured" / "paper_cartpole_ideal.json"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
@@ -27,19 +27,10 @@ def test_a_figure_is_drawn_beside_its_rows(
     document = json.loads(ROWS.read_text(encoding="utf-8"))
     document["rows"] = [row | {"error": "refused"} for row in document["rows"]]
     failed.write_text(json.dumps(document), encoding="utf-8")
-    run(monkeypatch, rows, failed, "--name", "deal-paper=deal-paper-replay")
+    run(monkeypatch, rows, failed)
     assert (
         rows.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
         and rows.read_bytes() == ROWS.read_bytes()
     )
     assert not failed.with_suffix(".png").exists()
     assert f"{failed}: every cell failed" in capsys.readouterr().out
-
-
-def test_half_a_name_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It says what a pair looks like."""
-    with pytest.raises(SystemExit):
-        run(monkeypatch, tmp_path / "a.json", "--name", "deal-paper")
-    assert "such as deal-paper=deal-paper-replay" in capsys.readouterr().err
