@@ -78,7 +78,8 @@ def options(parser: argparse.ArgumentParser) -> Sections:
             text = action.help or ""
             match = re.search(r"\s*\((required|on by default|default: .*)\)\s*$", text, flags=re.S)
             default = match[1].removeprefix("default: ") if match else ""
-            name = max(action.option_strings, key=len, default=action.dest.upper())
+            long = [option for option in action.option_strings if option.startswith("--")]
+            name = ", ".join(long) or action.dest.upper()
             name = f"{name} {action.metavar or ''}".strip() if action.option_strings else name
             title = "" if group.title in {"positional arguments", "options"} else str(group.title)
             sections.setdefault(title.removesuffix(" options"), []).append(
@@ -100,12 +101,12 @@ def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
     """Return the parser of a dataclass of settings, as the command line builds it."""
     import tyro
 
-    from deal_hw.cli.parsing import Rules
+    from deal_hw.cli.parsing import CONFIG, Rules
 
     with warnings.catch_warnings():
         # tyro warns that this function will go; constraints.txt pins the version that has it.
         warnings.simplefilter("ignore", DeprecationWarning)
-        found: Any = tyro.extras.get_parser(settings, prog=prog, registry=Rules().registry)
+        found: Any = tyro.extras.get_parser(settings, prog=prog, config=CONFIG, registry=Rules().registry)
     return cast(argparse.ArgumentParser, found)
 
 
@@ -144,8 +145,9 @@ def cli_page() -> str:
     ]
     lines += [
         "",
-        "The extra is what `pip install 'deal-hw[EXTRA]'` must have installed. With each verb, `--traceback` "
-        "shows where an error came from.",
+        "[Install](../how-to/install.md#only-what-a-computer-needs) has the extras. If one is missing, "
+        "the verb prints the line that installs it. With each verb, `--traceback` shows where an error came "
+        "from.",
         "",
         f"Exit status: {main.EXIT_OK} done; {main.EXIT_ERROR} refused, and one line says why; "
         f"{main.EXIT_INTERRUPTED} stopped by Ctrl-C; {main.EXIT_PIPE} the reader of the output closed it.",

@@ -226,7 +226,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
     import tyro
 
-    from deal_hw.cli.parsing import Rules, unparsed
+    from deal_hw.cli.parsing import CONFIG, Rules, unparsed
 
     module = importlib.import_module(verb.module)
     rules = Rules(arguments)
@@ -237,7 +237,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
             prog=f"deal-hw {name}",
             description=_description(verb, getattr(module, verb.config), rules.hidden),
             args=list(arguments),
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed),
+            config=CONFIG,
             registry=rules.registry,
         )
 

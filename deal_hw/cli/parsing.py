@@ -22,6 +22,9 @@ from tyro.constructors import (
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.options import OWN_ROBOT, Only
 
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
+"""Options are named without their group, and what only Python can give is no option."""
+
 
 class Rules:
     """Parser rules for settings, beyond their types.

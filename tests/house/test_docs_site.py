@@ -45,6 +45,8 @@ def test_each_verb_is_in_the_reference() -> None:
     assert "| `--latency FLOAT` | Total latency [s] if it is known" in page.replace("&#91;", "[")
     assert "\n### deal-hw data verify\n" in page
     assert "None}" not in page and "--help" not in page.partition("## deal-hw collect")[2]
+    assert "| `--transport STR` |" in page and "| `--record-wire, --no-record-wire` |" in page
+    assert not re.search(r"`--[\w-]+\.|\{fixed\}|<function", page)
 
 
 def test_each_refusal_is_on_the_page_of_errors() -> None:
