@@ -101,3 +101,20 @@ def test_name_in_docs_exists(document: str, name: str) -> None:
         return
     for word in name.split("."):
         assert re.search(rf"\b{word}\b", SOURCES), f"{document} names {name}"
+
+
+def test_the_paper_is_mapped_line_by_line() -> None:
+    """The page maps all lines of Algorithm 1 and all equations, to functions and files that exist."""
+    page = (ROOT / "docs" / "explanation" / "deal-paper.md").read_text(encoding="utf-8")
+    algorithm, _, rest = page.partition("## Algorithm 1")[2].partition("## Equations")
+    equations = rest.partition("\n## ")[0]
+    for table, last in ((algorithm, 17), (equations, 23)):
+        cells = re.findall(r"^\| ([\d, ]+) \|", table, flags=re.M)
+        assert sorted(int(n) for cell in cells for n in cell.split(",")) == list(range(1, last + 1))
+    named = set(re.findall(r"`([\w./]+)`", algorithm + equations))
+    files = {name for name in named if name.endswith((".py", "/"))}
+    assert {
+        name for name in files if not ((ROOT / name).exists() or (ROOT / "calib" / "search" / name).exists())
+    } == set()
+    words = {part for name in named - files for part in name.split(".")}
+    assert {word for word in words if not re.search(rf"\b{re.escape(word)}\b", SOURCES)} == set()
