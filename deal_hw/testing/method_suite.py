@@ -105,6 +105,15 @@ class _StopRunError(Exception):
     """Raised by a callback to stop a run."""
 
 
+@dataclass(frozen=True, slots=True)
+class WatchedRun:
+    """A short run with the seed of ``short``, what it reported, and its checkpoint (None without a file)."""
+
+    result: CalibrationResult
+    reports: tuple[Progress, ...]
+    checkpoint: bytes | None
+
+
 class MethodSuite:
     """Contract of a calibration method; inherit it and override ``case``, with class scope."""
 
@@ -120,6 +129,18 @@ class MethodSuite:
         """Return the result of a short run."""
         return case.run(case.short_budget)
 
+    @pytest.fixture(scope="class")
+    @classmethod
+    def watched(cls, case: MethodCase, tmp_path_factory: pytest.TempPathFactory) -> WatchedRun:
+        """Return a second short run, with reports and a checkpoint."""
+        reports: list[Progress] = []
+        if case.open_store is None:
+            return WatchedRun(case.run(case.short_budget, progress=reports.append), tuple(reports), None)
+        path = tmp_path_factory.mktemp("watched") / "checkpoint.npz"
+        store = case.open_store(path, "mine")
+        result = case.run(case.short_budget, progress=reports.append, checkpoint=store)
+        return WatchedRun(result, tuple(reports), path.read_bytes())
+
     def test_recovers_a_known_cartpole(self, case: MethodCase) -> None:
         """The truth is found within the stated tolerance, from a range whose midpoint is further off."""
         if case.tolerance is None:
@@ -128,23 +149,18 @@ class MethodSuite:
         assert case.log_error(result.space.center) > 2 * case.tolerance
         assert case.log_error(result.estimate) <= case.tolerance
 
-    def test_same_seed_same_result(self, case: MethodCase, short: CalibrationResult) -> None:
-        """The generator decides everything, to the last bit."""
-        again = case.run(case.short_budget)
+    def test_same_seed_same_result(self, short: CalibrationResult, watched: WatchedRun) -> None:
+        """The generator decides everything, to the last bit; reports and a checkpoint change nothing."""
+        again = watched.result
         np.testing.assert_array_equal(again.estimate, short.estimate)
         np.testing.assert_array_equal(again.interval, short.interval)
         assert again.latency_s == short.latency_s
         assert again.trace == short.trace
 
-    def test_stays_in_bounds(self, case: MethodCase) -> None:
+    def test_stays_in_bounds(self, watched: WatchedRun) -> None:
         """No estimate, interval, member or latency leaves its range, at any generation."""
-        seen: list[FloatArray] = []
-
-        def watch(progress: Progress) -> None:
-            if progress.population is not None:
-                seen.append(progress.population)
-
-        result = case.run(case.short_budget, progress=watch)
+        result = watched.result
+        seen = [report.population for report in watched.reports if report.population is not None]
         low, high = result.space.low, result.space.high
         for values in (*seen, result.estimate[None], result.interval.T):
             assert np.all(values >= low * (1 - 1e-9))
@@ -153,10 +169,9 @@ class MethodSuite:
         assert np.all(result.interval[:, 1] >= result.estimate * (1 - 1e-9))
         assert result.latency_interval_s[0] <= result.latency_s <= result.latency_interval_s[1]
 
-    def test_progress_is_reported(self, case: MethodCase) -> None:
+    def test_progress_is_reported(self, watched: WatchedRun) -> None:
         """Each generation is reported once, in order, and the trace has as many rows."""
-        calls: list[tuple[int, int]] = []
-        result = case.run(case.short_budget, progress=lambda p: calls.append((p.done, p.total)))
+        result, calls = watched.result, [(report.done, report.total) for report in watched.reports]
         assert [done for done, _ in calls] == list(range(1, len(calls) + 1))
         assert all(done <= total for done, total in calls)
         assert len(result.trace) == len(calls) >= 1
@@ -201,24 +216,25 @@ class MethodSuite:
         assert result.latency_interval_s == short.latency_interval_s
         assert result.alarms == short.alarms
 
-    def test_checkpoint_of_another_run_is_refused(self, case: MethodCase, tmp_path: Path) -> None:
+    def test_checkpoint_of_another_run_is_refused(
+        self, case: MethodCase, watched: WatchedRun, tmp_path: Path
+    ) -> None:
         """A file with another identity is neither continued nor overwritten."""
-        if case.open_store is None:
+        if case.open_store is None or watched.checkpoint is None:
             pytest.skip("this method's states are kept in memory")
-        path = tmp_path / "checkpoint.npz"
-        case.run(case.short_budget, checkpoint=case.open_store(path, "mine"))
-        before = path.read_bytes()
+        path, before = tmp_path / "checkpoint.npz", watched.checkpoint
+        path.write_bytes(before)
         with pytest.raises(ConfigurationError, match="cannot be resumed"):
             case.run(case.short_budget, checkpoint=case.open_store(path, "yours"))
         assert path.read_bytes() == before
 
-    def test_damaged_checkpoint_is_refused(self, case: MethodCase, tmp_path: Path) -> None:
+    def test_damaged_checkpoint_is_refused(
+        self, case: MethodCase, watched: WatchedRun, tmp_path: Path
+    ) -> None:
         """An incomplete file, or one that is no checkpoint, gives an error that names the file."""
-        if case.open_store is None:
+        if case.open_store is None or watched.checkpoint is None:
             pytest.skip("this method's states are kept in memory")
-        path = tmp_path / "checkpoint.npz"
-        case.run(case.short_budget, checkpoint=case.open_store(path, "mine"))
-        whole = path.read_bytes()
+        path, whole = tmp_path / "checkpoint.npz", watched.checkpoint
         for damaged in (whole[: len(whole) // 2], b"", b"not a checkpoint"):
             path.write_bytes(damaged)
             with pytest.raises(DatasetError, match=r"checkpoint\.npz"):
