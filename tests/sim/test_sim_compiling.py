@@ -10,6 +10,7 @@ import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError
+from deal_hw.sim.engine import compiling
 from deal_hw.sim.engine.compiling import compile_mjcf, load_mjcf, problem_of
 from deal_hw.sim.mjcf.joint_facts import joint_facts
 
@@ -85,3 +86,30 @@ def test_good_models_compile_and_leave_nothing(tmp_path: Path, monkeypatch: pyte
     monkeypatch.chdir(tmp_path)
     assert compile_mjcf(DESCRIPTION.mjcf).nq == load_mjcf(DESCRIPTION.mjcf).nq == 2
     assert not list(tmp_path.iterdir())
+
+
+def test_a_sound_text_is_tried_once_and_what_names_other_files_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under any name; a changed text is another one, and an included file may have changed."""
+    tried: list[str] = []
+    monkeypatch.setattr(compiling, "_sound", set())
+    monkeypatch.setattr(compiling, "_try", lambda path: tried.append(path.name))
+    (tmp_path / "part.xml").write_text(f"<mujoco><worldbody>{JOINT}</worldbody></mujoco>", encoding="utf-8")
+    path = write(tmp_path, f"<worldbody>{JOINT}</worldbody>")
+    (tmp_path / "copy.xml").write_bytes(path.read_bytes())
+    for name in ("robot.xml", "robot.xml", "copy.xml"):
+        assert compile_mjcf(tmp_path / name).njnt == 1
+    assert tried == ["robot.xml"]
+    for inside in ("<worldbody/>", "<include file='part.xml'/>", "<include file='part.xml'/>"):
+        compile_mjcf(write(tmp_path, inside))
+    assert tried == ["robot.xml"] * 4
+
+
+def test_a_text_that_failed_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what was sound is remembered: a second call does not compile a bad model in this process."""
+    monkeypatch.setattr(compiling, "_sound", set())
+    path = write(tmp_path, HOSTILE["timestep"][0])
+    for _ in range(2):
+        with pytest.raises(ConfigurationError, match=HOSTILE["timestep"][1]):
+            compile_mjcf(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import resource
@@ -30,13 +31,16 @@ DIVERGED: Final = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 """Warnings after which MuJoCo starts again from the reference pose."""
 _ROOM: Final = "keep bodies apart (contype, exclude), or write a larger <size memory=.../>"
 _OVERFULL: Final = ("mjWARN_CONTACTFULL", "mjWARN_CNSTRFULL")
+_sound: set[bytes] = set()
+"""Digests of models that consist of one file and were found sound: these are tried once in a process."""
 
 
 def compile_mjcf(mjcf: Path) -> mujoco.MjModel:
     """Compile a user's MJCF.
 
     A separate process tries it first, with limited memory and time. A texture of a million pixels per side, a
-    body replicated a billion times or an error in MuJoCo's own code would otherwise end this process.
+    body replicated a billion times or an error in MuJoCo's own code would otherwise end this process. A text
+    that was sound before is not tried again, unless it names other files: these may have changed.
 
     Raises:
         ConfigurationError: It does not exist, does not compile, takes too much, or fails in the test steps.
@@ -46,8 +50,14 @@ def compile_mjcf(mjcf: Path) -> mujoco.MjModel:
         raise ConfigurationError(f"model {path} does not exist")
     with reading(f"model {path}", "MJCF", error=ConfigurationError):
         check_size(path, MJCF_BYTES)
-        _try(path)
-        return load_mjcf(path)
+        text = path.read_bytes()
+        digest, whole = hashlib.sha256(text).digest(), b"file" not in text.lower()
+        if not (whole and digest in _sound):
+            _try(path)
+        model = load_mjcf(path)
+        if whole:
+            _sound.add(digest)
+        return model
 
 
 def load_mjcf(mjcf: Path) -> mujoco.MjModel:
