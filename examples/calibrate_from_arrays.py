@@ -11,9 +11,9 @@ import numpy as np
 import deal_hw
 from deal_hw.testing.plain_robots import make_robot, write
 
-# A robot in plain MuJoCo, recorded for 10 s. The calibration does not know its parameters.
+# A robot in plain MuJoCo, recorded for 6 s. The calibration does not know its parameters.
 folder = Path(tempfile.mkdtemp())
-model, (recording, *_), other = write(make_robot("double-pendulum", seed=0), folder, seconds=10.0)
+model, (recording, *_), other = write(make_robot("double-pendulum", seed=0), folder, seconds=6.0)
 columns = np.genfromtxt(recording, delimiter=",", names=True, deletechars="")
 arrays = {name: columns[name] for name in columns.dtype.names or ()}
 

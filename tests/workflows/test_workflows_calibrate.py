@@ -40,7 +40,7 @@ def arrays_of(path: Path) -> Arrays:
 @pytest.fixture(scope="module")
 def pendulum(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     """A pendulum in plain MuJoCo: model, a recording to fit, one to judge by."""
-    model, fit, other = write(make_robot("pendulum", 0), tmp_path_factory.mktemp("p"), seconds=4.0)
+    model, fit, other = write(make_robot("pendulum", 0), tmp_path_factory.mktemp("p"), seconds=2.5)
     return model, fit[0], other
 
 
