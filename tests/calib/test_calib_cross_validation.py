@@ -79,13 +79,13 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
-def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(noisy: Case) -> None:
+def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(
+    small_problem: Callable[..., Problem],
+) -> None:
     """With residuals taken to be 50 times the noise chi2 says nothing: the folds are run all the same."""
-    chosen = 50 * Problem(noisy.robot, noisy.space, [noisy.fit], threads=1).noise_std
-    problem = Problem(
-        noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=noisy.latency_s, known_std=chosen
-    )
-    search = FixedSearch(noisy.theta * 1.05, noisy.latency_s)
+    plain = small_problem()
+    problem = dataclasses.replace(plain, known_std=50 * plain.noise_std)
+    search = FixedSearch(plain.space.nominal, 0.0)
     result = CalibrationPipeline(search, settings=Validation(split_half=False, diagnosis=False)).run(
         problem, Budget(generations=15), np.random.default_rng(0)
     )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,37 +267,46 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
     assert found.std_s == pytest.approx(0.5, rel=0.2)
 
 
-def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Problem, Refined]:
-    """Return a simulated robot's recordings, and what a fit from its own values makes of them."""
-    robot = make_robot(kind, 3, fault)
-    model, paths, held_out = write(robot, folder, seconds=3.0)
-    config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
-    work = prepare(config)
-    problem = Problem(work.robot, work.space, work.episodes, threads=1)
-    theta = np.array([robot.truth[name] for name in work.space.names])
-    return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
+Truth = tuple[PlainRobot, Problem, Refined]
 
 
-def test_a_right_model_has_no_cause(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | None], Truth]:
+    """Return what makes a simulated robot's recordings, and a fit from its own values; each pair once."""
+
+    @functools.cache
+    def make(kind: str, fault: Fault | None) -> Truth:
+        robot = make_robot(kind, 3, fault)
+        model, paths, held_out = write(robot, tmp_path_factory.mktemp("robot"), seconds=3.0)
+        recordings = Recordings(model=model, data=tuple(paths))
+        work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+        problem = Problem(work.robot, work.space, work.episodes, threads=1)
+        theta = np.array([robot.truth[name] for name in work.space.names])
+        return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
+
+    return make
+
+
+def test_a_right_model_has_no_cause(truth: Callable[[str, Fault | None], Truth]) -> None:
     """Neither a signature, nor a delay, nor play predicts left-out windows better."""
-    _, problem, fit = _truth("pendulum", None, tmp_path)
+    _, problem, fit = truth("pendulum", None)
     assert name_causes(evidence(problem, fit)) == []
     assert find_play(problem, fit) is None
 
 
-def test_faults_of_a_simulated_robot_are_named(tmp_path: Path) -> None:
+def test_faults_of_a_simulated_robot_are_named(truth: Callable[[str, Fault | None], Truth]) -> None:
     """Stribeck friction, and commands that are late by up to twice the mean delay."""
-    _, problem, fit = _truth("pendulum", "friction", tmp_path / "friction")
+    _, problem, fit = truth("pendulum", "friction")
     friction = name_causes(evidence(problem, fit))
     assert friction[0].cause == "friction" and friction[0].joints == ("pivot",)
-    _, problem, fit = _truth("pendulum", "jitter", tmp_path / "jitter")
+    _, problem, fit = truth("pendulum", "jitter")
     jitter = name_causes(evidence(problem, fit))
     assert jitter[0].cause == "delay" and "its own delay" in jitter[0].alarm.seen
 
 
-def test_a_mass_is_named_with_its_size(tmp_path: Path) -> None:
+def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Truth]) -> None:
     """The last link weighs 50 % more."""
-    _, problem, fit = _truth("double-pendulum", "mass", tmp_path)
+    _, problem, fit = truth("double-pendulum", "mass")
     found = name_causes(evidence(problem, fit))
     assert found[0].cause == "mass" and "fore" in found[0].joints
     assert "Weigh" in found[0].alarm.do and "heavier" in found[0].alarm.seen
@@ -305,9 +314,9 @@ def test_a_mass_is_named_with_its_size(tmp_path: Path) -> None:
     assert known.alarms and with_causes(problem, fit, known)[0].alarms[0] == found[0].alarm
 
 
-def test_another_minimum_is_no_play(tmp_path: Path) -> None:
+def test_another_minimum_is_no_play(truth: Callable[[str, Fault | None], Truth]) -> None:
     """A right model, and a local fit that ended elsewhere: the wider fit finds the truth, without play."""
-    _, problem, fit = _truth("pendulum", None, tmp_path)
+    _, problem, fit = truth("pendulum", None)
     elsewhere = at_parameters(problem, 1.5 * fit.theta, fit.latency_s + 0.008, fit.shooting.length)
     assert elsewhere.chi2 > 10 * fit.chi2
     assert find_play(problem, elsewhere) is None
@@ -326,12 +335,14 @@ def test_half_of_two_recordings_is_a_part(small_problem: Callable[..., Problem])
     assert sum(map(np.count_nonzero, left_out)) >= 200
 
 
-def test_play_is_found_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_play_is_found_and_measured(
+    truth: Callable[[str, Fault | None], Truth], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A gear with 0.06 rad of play: refitted with play in it the model predicts the rest to the noise.
 
     The fit with play is the expensive part: one that is there is taken.
     """
-    _, problem, fit = _truth("pendulum", "backlash", tmp_path)
+    _, problem, fit = truth("pendulum", "backlash")
     fitted = fit_play(problem)
     monkeypatch.setattr(diagnosis, "fit_play", lambda _: None)
     assert find_play(problem, fit) is None
@@ -344,9 +355,9 @@ def test_play_is_found_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert cause.share > diagnosis.SETTINGS.decisive
 
 
-def test_play_that_explains_all_becomes_a_parameter(tmp_path: Path) -> None:
+def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault | None], Truth]) -> None:
     """No search follows; the result has the play, the true values, and one alarm."""
-    robot, problem, _ = _truth("pendulum", "backlash", tmp_path)
+    robot, problem, _ = truth("pendulum", "backlash")
     result = calibrate_episodes(
         problem.robot,
         problem.space,
