@@ -22,7 +22,7 @@ from deal_hw.workflows.running.supervised import InterruptedRunError
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a pendulum's robot.xml, robot.yaml, recordings, and a dataset of them."""
     folder = tmp_path_factory.mktemp("pendulum")
-    write(make_robot("pendulum", seed=1), folder, seconds=6.0)
+    write(make_robot("pendulum", seed=1), folder, seconds=4.0)
     assert main(["robot", "new", str(folder / "robot.xml"), "--name", "swing"]) == EXIT_OK
     files = [str(folder / name) for name in ("fit1.csv", "held-out.csv")]
     robot = ["--robot", str(folder / "robot.yaml")]
