@@ -15,7 +15,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-import cantools
 from fastcrc import crc16
 
 from deal_hw.drivers.cartpole import protocol
@@ -88,6 +87,9 @@ _FIRMWARE: Final = ("Major", "Minor", "Patch")
 @functools.cache
 def database() -> dict[str, DbcMessage]:
     """Return the frames of assets/cartpole.dbc by name."""
+    # Half of a serial emulator's start would be this import.
+    import cantools
+
     loaded = cantools.database.load_file(Path(__file__).parent / "assets" / "cartpole.dbc")
     assert isinstance(loaded, cantools.database.can.Database)
     return {message.name: message for message in loaded.messages}
@@ -175,9 +177,11 @@ class CanLink:
         group = type(message).__name__
         values = _to_values(message, self._version)
         names = _frames_of(group)
+        from cantools.database import EncodeError  # Loaded with the table of frames.
+
         try:
             parts = [_pack(name, values) for name in names]
-        except (cantools.database.EncodeError, KeyError, UnicodeEncodeError) as error:
+        except (EncodeError, KeyError, UnicodeEncodeError) as error:
             raise FrameError(f"{message} does not fit its frames: {error}") from error
         if len(parts) > 1:
             parts[-1] = parts[-1][:-2] + self._crc(group, parts).to_bytes(2, "little")
