@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 import mujoco
 import pytest
 
-from deal_hw.cli import demo_go2
+from deal_hw.cli import demo_cartpole, demo_go2
+from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.demo import Demo, demo
 from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
@@ -21,17 +23,24 @@ from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LinkOptions
 
 
+def beside_in_short(config: Calibrate) -> CalibrateReport:
+    """Calibrate; the search beside it, whose estimates are only noted, gets 20 members and 4 generations."""
+    beside = config.method == "deal"
+    return calibrate(dataclasses.replace(config, population=20, generations=4) if beside else config)
+
+
 @pytest.mark.slow
 def test_demo_runs_all_five_jobs_and_leaves_a_summary(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every stage leaves its file, parameters are found within 5 % on average, the table is printed."""
+    monkeypatch.setattr(demo_cartpole, "calibrate", beside_in_short)
     folder = tmp_path / "demo"
     report = demo(Demo(out=folder, profile="sensor", seed=1, episodes=1, steps=2000))
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == json.loads(json.dumps(report.summary))
     rows = summary["parameters"].values()
-    assert len(rows) == 9
+    assert len(rows) == 9 and all(r["deal"] > 0.0 for r in rows)
     assert sum(abs(r["estimate"] / r["truth"] - 1) for r in rows) / 9 < 0.05
     assert sum(r["low"] <= r["truth"] <= r["high"] for r in rows) >= 6
     assert summary["latency_s"]["found"] == pytest.approx(summary["latency_s"]["true"], abs=2.1e-3)
