@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 
 from fakes.faulty_proxy import FaultyProxy, State
 from fault_rig import (
@@ -135,9 +136,20 @@ def second_run(elsewhere: bool = False) -> Callable[[Rig], None]:
         time.sleep(float(rig.rng.uniform(0.1, 0.5)))
         rig.signal(rig.run.pid, signal.SIGINT)
         rig.run.wait(PATIENCE_S)
-        time.sleep(3.0)
+        left = writers(rig.folder / "out" / "second")
+        rig.notes += [f"{len(left)} processes of the second run are left to take over"] if left else []
 
     return act
+
+
+def writers(output: Path) -> list[int]:
+    """Return the processes with this file as output: of a run and all that it started."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if entry.name.isdigit() and os.readlink(entry / "fd" / "2") == str(output.resolve()):
+                found.append(int(entry.name))
+    return found
 
 
 def after(option: str) -> tuple[str, ...]:
