@@ -42,12 +42,13 @@ demo: $(STAMP) ## the whole loop on an emulated cart-pole
 
 # Tests that need the DDS peer or a chip's tools are skipped without them, and say what to install. One thread of
 # OpenMP a process: with more, the workers' threads wait for each other on two cores. Three workers: the one with the
-# tests in real time (tests/conftest.py) mostly waits, and the two that compute give way to it.
+# tests in real time (tests/conftest.py) mostly waits, and the two that compute give way to it. Bytecode is written even
+# where the environment forbids it: else each worker compiles all tests, and each of some hundred processes the package.
 test: $(STAMP) ## all tests that need no robot
 	@tools/build_dds_peer.sh || true
 	@tools/install_avr_tools.sh || true
 	@tools/install_arm_tools.sh || true
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 $(PYTEST_ARGS)
+	env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 $(PYTEST_ARGS)
 
 dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 	@tools/build_dds_peer.sh
