@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +72,30 @@ def check_same(a: CalibrationResult, b: CalibrationResult) -> None:
     )
 
 
+STAGED: dict[str, tuple[CalibrationMethod[Any], Budget]] = {
+    "eki": (
+        Eki(EkiSettings(noisy_ticks=(5, 10), stage_generations=3, restart_chi2=1e-6)),
+        Budget(population=10, generations=12),
+    ),
+    "deal": (
+        Deal(DealSettings(noise_draws=20, noisy_ticks=(5, 10))),
+        Budget(population=8, generations=6),
+    ),
+}
+
+
+@functools.cache
+def whole_of(name: str) -> CalibrationResult:
+    """Return the result of a run that nobody stopped."""
+    method, budget = STAGED[name]
+    return run(method, make_problem(1e-3), budget, None, 0)
+
+
 @pytest.mark.parametrize("stop", [2, 5, 9])
 def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
     """Whatever it was about: the first stage, a later one with moved start states, or a restart."""
-    method = Eki(EkiSettings(noisy_ticks=(5, 10), stage_generations=3, restart_chi2=1e-6))
-    budget, path = Budget(population=10, generations=12), tmp_path / "checkpoint.npz"
-    whole = run(method, make_problem(1e-3), budget, None, 0)
+    (method, budget), path = STAGED["eki"], tmp_path / "checkpoint.npz"
+    whole = whole_of("eki")
     assert whole.provenance["restarts"] >= 1
     with pytest.raises(StoppedError):
         run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), stop)
@@ -90,9 +109,8 @@ def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
 @pytest.mark.parametrize("stop", [2, 4])
 def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> None:
     """Critic, its optimiser and generator, and the moved start states come back."""
-    method = Deal(DealSettings(noise_draws=20, noisy_ticks=(5, 10)))
-    budget, path = Budget(population=8, generations=6), tmp_path / "checkpoint.npz"
-    whole = run(method, make_problem(1e-3), budget, None, 0)
+    (method, budget), path = STAGED["deal"], tmp_path / "checkpoint.npz"
+    whole = whole_of("deal")
     with pytest.raises(StoppedError):
         run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), stop)
     check_same(run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), 0), whole)
