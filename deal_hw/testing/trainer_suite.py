@@ -57,6 +57,15 @@ class TrainerCase:
         return self.trainer.train(self.make_env(), config, np.random.default_rng(seed), progress, files)
 
 
+@dataclass(frozen=True, slots=True)
+class KeptTraining:
+    """A short training with the seed of ``short``: its policy, its reports, and its checkpoint as bytes."""
+
+    policy: Policy
+    reports: tuple[tuple[int, int], ...]
+    checkpoint: bytes
+
+
 class TrainerSuite:
     """Contract of a trainer; inherit it and override ``case``, in class scope: training takes seconds."""
 
@@ -71,6 +80,19 @@ class TrainerSuite:
     def short(cls, case: TrainerCase) -> Policy:
         """Return a policy after a few updates."""
         return case.train(case.short_config)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def second(cls, case: TrainerCase, tmp_path_factory: pytest.TempPathFactory) -> KeptTraining:
+        """Return a second short training, with reports and a checkpoint."""
+        file = tmp_path_factory.mktemp("second") / "checkpoint.safetensors"
+        reports: list[tuple[int, int]] = []
+        policy = case.train(
+            case.short_config,
+            progress=lambda status: reports.append((status.steps, status.total)),
+            files=TrainingFiles(checkpoint=file),
+        )
+        return KeptTraining(policy, tuple(reports), file.read_bytes())
 
     def test_learns_the_toy_under_the_step_budget(self, case: TrainerCase) -> None:
         """A trained policy exceeds the score `learned`; a hardly trained one does not."""
@@ -107,21 +129,18 @@ class TrainerSuite:
             assert action.shape == (len(short.spec.actuated),)
             assert np.all(np.abs(action) <= 1.0)
 
-    def test_same_seed_same_policy(self, case: TrainerCase, short: Policy) -> None:
+    def test_same_seed_same_policy(self, case: TrainerCase, short: Policy, second: KeptTraining) -> None:
         """The generator decides everything: the same one gives the same actions, another one others."""
         observation = np.linspace(-1.0, 1.0, len(short.spec.observation), dtype=np.float32)
-        again = case.train(case.short_config)
         other = case.train(case.short_config, seed=_SEED + 1)
-        np.testing.assert_array_equal(again.act(observation), short.act(observation))
+        np.testing.assert_array_equal(second.policy.act(observation), short.act(observation))
         assert not np.array_equal(other.act(observation), short.act(observation))
 
-    def test_progress_counts_up_to_the_budget(self, case: TrainerCase) -> None:
+    def test_progress_counts_up_to_the_budget(self, case: TrainerCase, second: KeptTraining) -> None:
         """Progress rises and ends at the requested number of steps."""
-        calls: list[tuple[int, int]] = []
-        case.train(case.short_config, progress=lambda status: calls.append((status.steps, status.total)))
-        done = [d for d, _ in calls]
+        done = [steps for steps, _ in second.reports]
         assert done == sorted(done)
-        assert calls[-1] == (case.short_config.steps, case.short_config.steps)
+        assert second.reports[-1] == (case.short_config.steps, case.short_config.steps)
 
     def test_a_stopped_training_goes_on_where_it_was(self, case: TrainerCase, tmp_path: Path) -> None:
         """Stopped after its first report it leaves a checkpoint; resumed, it does the remaining steps."""
@@ -144,21 +163,24 @@ class TrainerSuite:
         assert stopped < first[0] and first[-1] == config.steps
 
     def test_a_fine_tune_starts_from_the_networks_of_a_checkpoint(
-        self, case: TrainerCase, tmp_path: Path
+        self, case: TrainerCase, second: KeptTraining, tmp_path: Path
     ) -> None:
         """Stopped at once, it acts as the policy of its start checkpoint."""
         file = tmp_path / "checkpoint.safetensors"
-        kept = case.train(case.short_config, files=TrainingFiles(checkpoint=file))
+        file.write_bytes(second.checkpoint)
         started = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(start=file, stop=lambda: True))
         observation = np.linspace(-1.0, 1.0, len(case.layout.observation), dtype=np.float32)
         fresh = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(stop=lambda: True))
-        gap = np.abs(started.act(observation) - kept.act(observation)).max()
-        assert gap < np.abs(fresh.act(observation) - kept.act(observation)).max()
+        first = second.policy.act(observation)
+        gap = np.abs(started.act(observation) - first).max()
+        assert gap < np.abs(fresh.act(observation) - first).max()
 
-    def test_checkpoints_that_do_not_fit_are_refused(self, case: TrainerCase, tmp_path: Path) -> None:
+    def test_checkpoints_that_do_not_fit_are_refused(
+        self, case: TrainerCase, second: KeptTraining, tmp_path: Path
+    ) -> None:
         """Damaged, or of networks of another size: the message names the file."""
         file = tmp_path / "checkpoint.safetensors"
-        case.train(case.short_config, files=TrainingFiles(checkpoint=file))
+        file.write_bytes(second.checkpoint)
         other = dataclasses.replace(case.short_config, hidden=(8,))
         with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors: hidden is"):
             case.train(other, files=TrainingFiles(start=file))
