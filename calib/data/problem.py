@@ -262,7 +262,7 @@ class Problem:
     @property
     def noise_free(self) -> bool:
         """Whether all states are known without error, so that start states need no fit."""
-        return all(e.exact for e in self.episodes)
+        return all(e.noise_free for e in self.episodes)
 
     @property
     def coordinates(self) -> int:

@@ -82,7 +82,7 @@ def test_exact_motion_need_not_stand_out_of_a_sensor_that_was_not_there(seen: Se
     position[:, -1] = position[0, -1] + 0.01 * swing / np.ptp(swing)
     little = dataclasses.replace(seen.episode, position=position)
     check_excitation(Problem(seen.robot, seen.space, [little], threads=1))
-    fine = dataclasses.replace(little, exact=False)
+    fine = dataclasses.replace(little, noise_free=False)
     check_excitation(Problem(seen.robot, seen.space, [fine], threads=1))
     position[:, -1] = np.round(position[:, -1] / 2e-3) * 2e-3
     sensed = dataclasses.replace(fine, position=position)

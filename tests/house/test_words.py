@@ -38,6 +38,7 @@ GONE = {
     r"link[_ ]errors?\b": "transport errors",
     r"asked_position|/command/asked": "requested",
     r"\bheed(ed|s)?\b": "use, wait for",
+    r"\bexact: bool|\bexact=(True|False|self)|\b(e|episode|problem|profile|self)\.exact\b": "noise_free",
 }
 """Pattern of an old word -> its replacement."""
 

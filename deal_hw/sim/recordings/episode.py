@@ -54,7 +54,7 @@ class SampledEpisode:
             the positions.
         estimate_std: Standard deviation of the unmeasured entries, (2 C,) or, sample by sample, (T, 2 C);
             None if all positions were measured.
-        exact: Whether the whole state is reported without any error, as only a simulated target does.
+        noise_free: Whether the whole state is reported without any error, as only a simulated target does.
         name: Name of its source for messages, mostly a file's.
     """
 
@@ -75,7 +75,7 @@ class SampledEpisode:
     reference: FloatArray | None = None
     measured: npt.NDArray[np.bool_] | None = None
     estimate_std: FloatArray | None = None
-    exact: bool = False
+    noise_free: bool = False
     name: str = ""
 
     @property

@@ -190,7 +190,7 @@ class _Sensor:
             reference=reference,
             measured=measured,
             estimate_std=estimate,
-            exact=self._sensing.joint_std is None,
+            noise_free=self._sensing.joint_std is None,
         )
         return TargetRecording(episode, truth, true_v)
 
