@@ -22,6 +22,8 @@ SHORTEST_S = 1.0
 """Shortest recording that can be calibrated [s]."""
 Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
+EXPLAINED_CHI2 = 1.3
+"""Mean squared residual over its expected variance up to which a model explains its recordings [-]."""
 RESULT_FILE = "result.json"
 RESULT_FORMAT = "deal_hw.calibration_result/1"
 Identifiability = Literal["identifiable", "weak", "not identifiable"]

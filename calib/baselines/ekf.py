@@ -17,9 +17,9 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import WindowData, taken
+from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.validation.intervals import intervals
 from deal_hw.calibration import Z90, Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 

@@ -23,10 +23,10 @@ from deal_hw.calib.data.innovations import (
     whitened_residual,
 )
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import uncertainty
 from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.validation.intervals import uncertainty
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

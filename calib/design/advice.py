@@ -17,7 +17,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior, information
-from deal_hw.calib.validation.intervals import SETTINGS as INTERVALS
+from deal_hw.calib.fit.intervals import SETTINGS as INTERVALS
 from deal_hw.calibration import CalibrationResult, std_words
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (

@@ -1,1 +1,1 @@
-"""Fits that follow derivatives."""
+"""Fits that follow derivatives, and the uncertainty of what they find."""

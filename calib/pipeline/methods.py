@@ -86,7 +86,7 @@ def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem
     if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
         return search
     from deal_hw.calib.pipeline.stages import CalibrationPipeline
-    from deal_hw.calib.validation.verdict import Validation
+    from deal_hw.calib.validation.checks import Validation
 
     # A user who names a search wants it to run, even where refining the nominal values would be enough.
     return CalibrationPipeline(search, name, Validation(local_first=name == "default"))

@@ -25,21 +25,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
-from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.no_data import Nominal
-from deal_hw.calib.validation.cross_validation import (
-    Choice,
-    Member,
-    fold_masks,
-    motion_numbers,
-    on_folds,
-    time_masks,
-)
-from deal_hw.calib.validation.intervals import (
+from deal_hw.calib.fit.intervals import (
     MISMATCH,
     Uncertainty,
     kinks_of,
@@ -48,9 +34,23 @@ from deal_hw.calib.validation.intervals import (
     uncertainty,
     with_rows,
 )
-from deal_hw.calib.validation.null_space import confounded
+from deal_hw.calib.fit.null_space import confounded
+from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
+from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
+from deal_hw.calib.fit.refinement import at_parameters
+from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.no_data import Nominal
+from deal_hw.calib.validation.checks import Validation, unexplained, with_causes, with_step
+from deal_hw.calib.validation.cross_validation import (
+    Choice,
+    Member,
+    fold_masks,
+    motion_numbers,
+    on_folds,
+    time_masks,
+)
 from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_split_half
-from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Z90, Alarm, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode

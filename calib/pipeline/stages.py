@@ -22,6 +22,13 @@ import numpy as np
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
+from deal_hw.calib.fit.intervals import (
+    MISMATCH,
+    Uncertainty,
+    mismatch,
+    uncertainty_at,
+    with_rows,
+)
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import (
     Refined,
@@ -34,18 +41,11 @@ from deal_hw.calib.fit.refinement import (
 )
 from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation.checks import Validation, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calib.validation.diagnosis import PlayFit, find_play, fit_play
-from deal_hw.calib.validation.intervals import (
-    MISMATCH,
-    Uncertainty,
-    mismatch,
-    uncertainty_at,
-    with_rows,
-)
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import averaged, scan_latency
-from deal_hw.calib.validation.verdict import Validation, judge, unexplained
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     Budget,

@@ -1,1 +1,1 @@
-"""The report of a calibration: one HTML page that needs nothing beside it."""
+"""The verdict on a result, and its report: one HTML page that needs nothing beside it."""

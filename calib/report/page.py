@@ -17,8 +17,7 @@ from markupsafe import Markup
 
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
-from deal_hw.calib.report.story import make_story
-from deal_hw.calib.validation.verdict import trust
+from deal_hw.calib.report.verdict import make_story, trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError

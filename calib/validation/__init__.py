@@ -1,1 +1,1 @@
-"""What a fit is worth: its uncertainty, the causes of its residual, and the verdict on its use."""
+"""Checks of a fit on parts of the data, on other models, and on motion that it has not seen."""

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.fit.cluster_robust import eliminated, without_starts
+from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
-from deal_hw.calib.validation.cluster_robust import eliminated, without_starts
-from deal_hw.calib.validation.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
 from deal_hw.calibration import Alarm, listed, percent

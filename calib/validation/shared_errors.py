@@ -21,8 +21,8 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import measurements
 from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.fit.intervals import MISMATCH
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
-from deal_hw.calib.validation.intervals import MISMATCH
 from deal_hw.calibration import Alarm
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode

@@ -16,9 +16,9 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
 from deal_hw.calib.data.problem import Problem, taken
+from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, widened_to, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.intervals import Uncertainty, uncertainty_at, widened_to, with_rows
 from deal_hw.calibration import Z90, Alarm, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.cluster_robust import eliminated, without_starts
+from deal_hw.calib.fit.intervals import Uncertainty, intervals, widened_to
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
-from deal_hw.calib.validation.cluster_robust import eliminated, without_starts
-from deal_hw.calib.validation.intervals import Uncertainty, intervals, widened_to
 from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
 from deal_hw.types import FloatArray
 

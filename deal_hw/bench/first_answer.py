@@ -277,8 +277,8 @@ def _compared(
     from deal_hw.calib.baselines.sysid import with_delay
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.pipeline.methods import make_method
+    from deal_hw.calib.report.verdict import trust
     from deal_hw.calib.validation.metrics import HeldOut
-    from deal_hw.calib.validation.verdict import trust
     from deal_hw.sim.recordings.parts import joined
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import Cells
-from deal_hw.calib.validation.verdict import SETTINGS, trust
+from deal_hw.calib.report.verdict import trust
+from deal_hw.calib.validation.checks import SETTINGS
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import (

@@ -156,7 +156,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
 
 def _print_next(report: CalibrateReport, robot: str, folder: Path) -> None:
     """Print the line that trains with the result, where there is a task and the result can be used."""
-    from deal_hw.calib.validation.verdict import trust
+    from deal_hw.calib.report.verdict import trust
     from deal_hw.policies.tasks import TASKS
 
     file = report.files.get("distribution.json")

@@ -86,8 +86,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     from rich.text import Text
 
     from deal_hw.calib.design.advice import next_step
-    from deal_hw.calib.validation.intervals import MISMATCH
-    from deal_hw.calib.validation.verdict import trust
+    from deal_hw.calib.fit.intervals import MISMATCH
+    from deal_hw.calib.report.verdict import trust
 
     table = Table(
         title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}",

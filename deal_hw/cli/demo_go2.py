@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.calib.validation.verdict import trust
+from deal_hw.calib.report.verdict import trust
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, first_episode, read_truth, show_episode

@@ -46,7 +46,7 @@ class Calibration:
     @property
     def colour(self) -> str:
         """Whether the result can be used: green, amber or red."""
-        from deal_hw.calib.validation.verdict import trust
+        from deal_hw.calib.report.verdict import trust
 
         return trust(self.result).colour
 
@@ -121,7 +121,7 @@ class Calibration:
         return write_result(Path(folder), self.inputs.robot, self.result)
 
     def _words(self) -> list[str]:
-        from deal_hw.calib.validation.verdict import trust
+        from deal_hw.calib.report.verdict import trust
 
         found = trust(self.result)
         told = [f"the data do not determine: {words}" for words in self.result.null_directions]

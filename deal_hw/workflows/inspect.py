@@ -99,7 +99,7 @@ class Inspection:
         """Return the calibration's verdict as markdown; empty without a calibration."""
         if self.result is None:
             return ""
-        from deal_hw.calib.validation.verdict import trust
+        from deal_hw.calib.report.verdict import trust
 
         found = trust(self.result)
         return f"**{found.colour}:** {found.seen} {found.means} **{found.do}**"

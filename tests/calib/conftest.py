@@ -13,8 +13,8 @@ from fakes.simulated_episode import simulated_episode
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
-from deal_hw.calib.validation.intervals import with_rows
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deal_hw.calib.fit.cluster_robust import clustered, eliminated
+from deal_hw.calib.fit.intervals import uncertainty
 from deal_hw.calib.fit.residual import Normal, WindowRows
-from deal_hw.calib.validation.cluster_robust import clustered, eliminated
-from deal_hw.calib.validation.intervals import uncertainty
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
 

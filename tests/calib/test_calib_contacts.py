@@ -10,10 +10,10 @@ import pytest
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import Sticking, settle
+from deal_hw.calib.fit.intervals import MISMATCH, correlation_time
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.validation.intervals import MISMATCH, correlation_time
-from deal_hw.calib.validation.verdict import unexplained
+from deal_hw.calib.validation.checks import unexplained
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, parameter_space
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import ParameterSpace

@@ -15,8 +15,8 @@ from deal_hw.calib.fit.refinement import Refined, at_parameters, refine_robust, 
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
+from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
-from deal_hw.calib.validation.verdict import Validation, unexplained
 from deal_hw.calibration import Budget
 
 

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import MISMATCH, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
+from deal_hw.calib.validation.checks import with_causes
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
-from deal_hw.calib.validation.intervals import MISMATCH, uncertainty_at, with_rows
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
-from deal_hw.calib.validation.verdict import trust, with_causes
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import PosteriorShape, Uncertainty
 from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calib.pipeline.output_error_fits import FORCES, GAIT, _including, _scaled_together
-from deal_hw.calib.validation.intervals import PosteriorShape, Uncertainty
 from deal_hw.calibration import Z90
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deal_hw.calib.fit.intervals import Uncertainty, ended_at_bound, uncertainty
+from deal_hw.calib.fit.null_space import null_space, sparse_basis
 from deal_hw.calib.fit.residual import Normal
-from deal_hw.calib.validation.intervals import Uncertainty, ended_at_bound, uncertainty
-from deal_hw.calib.validation.null_space import null_space, sparse_basis
 from deal_hw.calibration import Z90
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray

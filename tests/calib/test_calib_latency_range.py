@@ -12,7 +12,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, fit_output_error
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.solver import SolverSettings, minimise
-from deal_hw.calib.validation.verdict import latency_alarms
+from deal_hw.calib.validation.checks import latency_alarms
 from deal_hw.errors import ConfigurationError
 
 MakeProblem = Callable[..., Problem]

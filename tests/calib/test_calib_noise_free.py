@@ -11,8 +11,8 @@ import pytest
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import MISMATCH
 from deal_hw.calib.fit.refinement import refine
-from deal_hw.calib.validation.intervals import MISMATCH
 from deal_hw.calib.validation.time_steps import scan_latency
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace

@@ -13,6 +13,7 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.null_space import confounded
 from deal_hw.calib.fit.output_error import SHORT, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.pipeline.output_error_fits import (
     OutputErrorFits,
@@ -23,9 +24,8 @@ from deal_hw.calib.pipeline.output_error_fits import (
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
-from deal_hw.calib.validation.null_space import confounded
-from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray

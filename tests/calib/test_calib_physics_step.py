@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
-from deal_hw.calib.validation.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.validation.time_steps import (
     StepCheck,
     StepSettings,

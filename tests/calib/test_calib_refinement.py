@@ -19,6 +19,8 @@ from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
+from deal_hw.calib.fit.null_space import null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.fit.solver import correlated_samples
@@ -33,11 +35,9 @@ from deal_hw.calib.pipeline.stages import (
     lower_minimum,
 )
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.validation.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
+from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import HeldOut
-from deal_hw.calib.validation.null_space import null_directions, null_space
 from deal_hw.calib.validation.time_steps import LatencyScan
-from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError

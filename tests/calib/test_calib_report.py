@@ -29,7 +29,7 @@ from deal_hw.calib.report.page import (
 )
 from deal_hw.calib.report.panels import envelope
 from deal_hw.calib.report.robot_drawing import Outline, RobotDrawing
-from deal_hw.calib.validation.verdict import trust
+from deal_hw.calib.report.verdict import trust
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.calib.report.story import compared, make_story, percent
+from deal_hw.calib.report.verdict import compared, make_story, percent
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import Parameter, ParameterSpace
 

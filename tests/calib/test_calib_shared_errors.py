@@ -15,16 +15,17 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import local_fit, refine
 from deal_hw.calib.pipeline import stages
 from deal_hw.calib.pipeline.stages import CalibrationRun, Refinement, with_shared_error
+from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation import shared_errors as shared_errors_module
+from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.shared_errors import (
     ChannelChange,
     FoundError,
     find_shared_error,
     shared_errors,
 )
-from deal_hw.calib.validation.verdict import Validation, trust, unexplained
 from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write

@@ -9,9 +9,10 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.stages import report_unidentifiable
-from deal_hw.calib.validation.intervals import uncertainty_at, with_rows
+from deal_hw.calib.validation.checks import Validation, judge
 from deal_hw.calib.validation.split_half import (
     SplitHalf,
     agreement,
@@ -19,7 +20,6 @@ from deal_hw.calib.validation.split_half import (
     half_of,
     widened_by_split_half,
 )
-from deal_hw.calib.validation.verdict import Validation, judge
 from deal_hw.calibration import BEFORE_SEARCH, Identifiability, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 from deal_hw.types import FloatArray

@@ -69,8 +69,8 @@ def test_each_alarm_is_on_its_page() -> None:
     """Alarms of all folders are found with their three parts, and causes beside them."""
     found = docs_pages.alarms()
     assert {path for path, *_ in found} >= {
-        "calib/validation/intervals.py",
-        "calib/validation/verdict.py",
+        "calib/fit/intervals.py",
+        "calib/validation/checks.py",
         "deal_hw/workflows/calibration/best_so_far.py",
     }
     assert all(part.strip("… ") for row in found for part in row)

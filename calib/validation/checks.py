@@ -1,42 +1,36 @@
-"""Checks after a fit, and the verdict on its use in one colour; the held-out error decides first."""
+"""Checks after a fit: which ones run, what they change of its uncertainty, and what they report."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.validation.diagnosis import PlayFit, diagnose
-from deal_hw.calib.validation.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
 from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
-from deal_hw.calibration import Alarm, CalibrationResult, percent
+from deal_hw.calibration import Alarm
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
 
-Colour = Literal["green", "amber", "red"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VerdictSettings:
-    """Settings of the checks and of :func:`trust`.
+class CheckSettings:
+    """Settings of the checks.
 
     Attributes:
-        worse: Ratio to the nominal model's held-out error above which a result is worse [-]: less is chance
-            where the nominal model was right.
         at_end: Distance to an end of the latency range, as a share of it, that counts as at the end [-].
         causes: Most causes of a residual that become alarms; all are in the provenance.
     """
 
-    worse: float = 1.02
     at_end: float = 0.01
     causes: int = 2
 
 
-SETTINGS = VerdictSettings()
+SETTINGS = CheckSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,103 +141,3 @@ def with_causes(
     found = diagnose(problem, refined, fitted)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
     return dataclasses.replace(known, alarms=(*alarms, *known.alarms)), [dataclasses.asdict(f) for f in found]
-
-
-@dataclass(frozen=True, slots=True)
-class Trust:
-    """The verdict on the use of a calibration.
-
-    Attributes:
-        colour: Green: use it. Amber: it has a known weakness. Red: do not use it.
-        seen: What was seen.
-        means: What it means.
-        do: What to do.
-    """
-
-    colour: Colour
-    seen: str
-    means: str
-    do: str
-
-    @property
-    def sentence(self) -> str:
-        """The verdict in one line."""
-        return f"{self.seen} {self.means} {self.do}"
-
-
-def trust(result: CalibrationResult) -> Trust:
-    """Return whether a result can be used."""
-    nominal, calibrated = (result.heldout_nrmse.get(name) for name in ("nominal", "calibrated"))
-    noise = (
-        f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise." if result.chi2 >= 0 else ""
-    )
-    mismatch = result.chi2 > MISMATCH.chi2
-    if "shared_error" in result.provenance:
-        first = result.alarms[0]
-        return Trust("red", first.seen, first.means, f"Do not use it. {first.do}")
-    if nominal is None or calibrated is None:
-        record = "Record one more motion and name it with --holdout."
-        if mismatch:
-            means = "The model does not explain them, and no held-out recording shows whether it is better."
-            return Trust("red", noise, means, f"Do not use it. {record}")
-        gain = "There is no held-out recording."
-    elif not calibrated <= SETTINGS.worse * nominal:
-        return Trust(
-            "red",
-            f"On held-out motion the calibrated model errs by {percent(calibrated)} of the signal's "
-            "range, your "
-            f"own model by {percent(nominal)}.",
-            "The calibrated model is worse.",
-            "Do not use it. Check units, signs and joint order of the recordings, then the alarms.",
-        )
-    else:
-        record = ""
-        smaller = nominal / max(calibrated, 1e-300)
-        gain = f"On held-out motion the error is {smaller:.1f} times smaller than your own model's."
-    if mismatch:
-        return Trust(
-            "amber",
-            f"{gain} {noise}",
-            "The model is better than yours, but it lacks something that the robot has.",
-            "Use it, but trust predictions more than single values."
-            + (" The first alarm names the likely cause." if result.provenance.get("diagnosis") else ""),
-        )
-    if result.alarms:
-        many = len(result.alarms)
-        count, read = (
-            (f"There are {many} alarms.", "Read them") if many > 1 else ("There is 1 alarm.", "Read it")
-        )
-        return Trust(
-            "amber",
-            f"{gain} {count}",
-            "The result has a known weakness.",
-            f"{read} before you use the result.",
-        )
-    if math.isnan(result.chi2):
-        return Trust(
-            "amber",
-            gain,
-            "The method does not test whether the model explains the recordings.",
-            f"Compare the held-out error with the error that your task allows. {record}".strip(),
-        )
-    unidentified = result.verdicts.count("not identifiable")
-    if result.null_directions or unidentified:
-        advised = " Or record the motion advised below." if result.advice else ""
-        if not unidentified:
-            return Trust(
-                "amber",
-                f"{gain} {noise}",
-                "The model explains the recordings, but they hardly tell some parameters apart.",
-                f"Use it. To narrow intervals, measure one of the parameters named together below.{advised}",
-            )
-        return Trust(
-            "amber",
-            f"{gain} {noise} {unidentified} of {len(result.space)} parameters have no value.",
-            "The model explains the recordings, but they do not identify all parameters.",
-            f"Use it: training draws these parameters from their whole range.{advised}",
-        )
-    if record:
-        return Trust(
-            "amber", f"{gain} {noise}", "No recording shows whether the model holds on other motion.", record
-        )
-    return Trust("green", f"{gain} {noise}", "The remaining error is the sensor's noise.", "Use it.")

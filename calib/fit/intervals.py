@@ -12,11 +12,11 @@ from scipy.stats import norm, truncnorm
 from scipy.stats import t as t_law
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.cluster_robust import Clustered, clustered
+from deal_hw.calib.fit.null_space import null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
-from deal_hw.calib.validation.cluster_robust import Clustered, clustered
-from deal_hw.calib.validation.null_space import null_directions, null_space
-from deal_hw.calibration import Z90, Alarm, Identifiability, listed
+from deal_hw.calibration import EXPLAINED_CHI2, Z90, Alarm, Identifiability, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import find_kind
 from deal_hw.types import FloatArray
@@ -41,7 +41,7 @@ class MismatchSettings:
             to 1.
     """
 
-    chi2: float = 1.3
+    chi2: float = EXPLAINED_CHI2
     correlation_samples: float = 2.0
     false_alarms: float = 0.05
     negligible_chi2: float = 0.5
