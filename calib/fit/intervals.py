@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from scipy.stats import t as t_law
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import null_directions, null_space
+from deal_hw.calib.fit.output_error import OutputErrorFit
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calibration import EXPLAINED_CHI2, Z90, Alarm, Identifiability, listed
@@ -99,7 +101,8 @@ class Uncertainty:
         null_directions: Combinations without effect on the recordings, in words.
         alarms: Signs that the model is wrong.
         inflation: Factor on the variance for model error.
-        shape: Properties of the intervals that the covariance does not hold.
+        blind: Parameters that the data do not determine: their interval is the range's own, (K,).
+        bound: -1 or 1 for parameters fixed at their lower or upper bound, (K,).
         clustered: Variances clustered by blocks of time over those of independent residuals; None if not
             computed or with too few blocks. Its last entry is the latency's.
         widened: Factor of clustering on each parameter's interval, (K,).
@@ -112,22 +115,10 @@ class Uncertainty:
     null_directions: tuple[str, ...]
     alarms: tuple[Alarm, ...]
     inflation: float
-    shape: PosteriorShape
-    clustered: Clustered | None
-    widened: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class PosteriorShape:
-    """Intervals that are not symmetric around the estimate.
-
-    Attributes:
-        blind: Parameters that the data do not determine: their interval is the range's own, (K,).
-        bound: -1 or 1 for parameters fixed at their lower or upper bound, (K,).
-    """
-
     blind: npt.NDArray[np.bool_]
     bound: npt.NDArray[np.int64]
+    clustered: Clustered | None
+    widened: FloatArray
 
 
 def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:
@@ -219,16 +210,16 @@ def uncertainty(
     if fixed_latency:
         latency = (latency_s, latency_s)
     blind |= std[:K] > SETTINGS.blind_share * np.sqrt(flat[:K])
-    shape = PosteriorShape(blind, bound)
     return Uncertainty(
         covariance=covariance[:K, :K],
-        interval=intervals(space, theta, covariance[:K, :K], shape),
+        interval=intervals(space, theta, covariance[:K, :K], blind, bound),
         latency_interval_s=latency,
         verdicts=_verdicts(space, std[:K], blind),
         null_directions=null_directions(space, unseen),
         alarms=_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
         inflation=inflation,
-        shape=shape,
+        blind=blind,
+        bound=bound,
         clustered=cluster,
         widened=factor[:K],
     )
@@ -290,23 +281,25 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
 
 
 def intervals(
-    space: ParameterSpace, theta: FloatArray, covariance: FloatArray, shape: PosteriorShape | None = None
+    space: ParameterSpace,
+    theta: FloatArray,
+    covariance: FloatArray,
+    blind: npt.NDArray[np.bool_] | Literal[False] = False,
+    bound: npt.NDArray[np.int64] | Literal[0] = 0,
 ) -> FloatArray:
-    """Return 90 % intervals, (K, 2), inside the range; the covariance is in each parameter's own scale."""
+    """Return 90 % intervals, (K, 2), inside the range; the covariance is in each parameter's own scale.
+
+    ``blind`` and ``bound`` are those of :class:`Uncertainty`.
+    """
     K = len(space)
     std, center = np.sqrt(np.diag(covariance)), space.to_scale(theta)
     low = np.maximum(space.from_scale(center - Z90 * std), space.low)
     high = np.minimum(space.from_scale(center + Z90 * std), space.high)
     # Without information the estimate is arbitrary: the interval is the range's own 90 %.
-    blind = std > SETTINGS.blind_share * space.width / np.sqrt(12.0)
-    if shape is not None:
-        blind = blind | shape.blind
-        # Nothing was searched beyond a bound; the interval lies on one side.
-        low = np.where(shape.bound < 0, space.low, low)
-        high = np.where(shape.bound > 0, space.high, high)
-        blind = blind & (shape.bound == 0)
-    low = np.where(blind, space.unnormalize(np.full(K, 0.05)), low)
-    high = np.where(blind, space.unnormalize(np.full(K, 0.95)), high)
+    whole = ((std > SETTINGS.blind_share * space.width / np.sqrt(12.0)) | blind) & (bound == 0)
+    # Nothing was searched beyond a bound; the interval lies on one side.
+    low = np.where(bound < 0, space.low, np.where(whole, space.unnormalize(np.full(K, 0.05)), low))
+    high = np.where(bound > 0, space.high, np.where(whole, space.unnormalize(np.full(K, 0.95)), high))
     return np.stack([low, high], axis=1)
 
 
@@ -417,24 +410,25 @@ def with_rows(refined: Refined) -> Refined:
     return dataclasses.replace(refined, normal=normal)
 
 
-def kinks_of(problem: Problem) -> float:
-    """Return the factor on standard deviations for nonlinearity: larger with feet on the floor."""
-    free = problem.robot.base is None or problem.noise_free
-    return SETTINGS.kinks if free else SETTINGS.contact_kinks
+def uncertainty_at(
+    problem: Problem, fit: Refined | OutputErrorFit, fixed_latency: bool | None = None
+) -> Uncertainty:
+    """Return the uncertainty of a fit; variances are clustered if it holds linearised residuals.
 
-
-def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> Uncertainty:
-    """Return the uncertainty of a refinement; variances are clustered if it holds linearised residuals."""
+    Residuals of an output-error fit count as noise. The latency is fixed where the problem gives it, unless
+    ``fixed_latency`` says otherwise.
+    """
+    smooth, noise = problem.robot.base is None or problem.noise_free, isinstance(fit, OutputErrorFit)
     return uncertainty(
         problem.space,
-        refined.theta,
-        refined.latency_s,
-        refined.normal,
-        refined.chi2,
+        fit.theta,
+        fit.latency_s,
+        fit.normal,
+        1.0 if noise else fit.chi2,
         problem.latency_range_s,
-        fixed_latency=fixed_latency,
-        timing_std_s=problem.noise.timing_std_s,
-        kinks=kinks_of(problem),
+        fixed_latency=problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency,
+        timing_std_s=0.0 if noise else problem.noise.timing_std_s,
+        kinks=SETTINGS.kinks if smooth else SETTINGS.contact_kinks,
     )
 
 
@@ -449,7 +443,7 @@ def widened_to(problem: Problem, known: Uncertainty, theta: FloatArray, std: Flo
     return dataclasses.replace(
         known,
         covariance=covariance,
-        interval=intervals(problem.space, theta, covariance, known.shape),
-        verdicts=_verdicts(problem.space, np.sqrt(np.diag(covariance)), known.shape.blind),
+        interval=intervals(problem.space, theta, covariance, known.blind, known.bound),
+        verdicts=_verdicts(problem.space, np.sqrt(np.diag(covariance)), known.blind),
         widened=known.widened * factor,
     )

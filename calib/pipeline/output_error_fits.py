@@ -28,10 +28,9 @@ from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.intervals import (
     MISMATCH,
     Uncertainty,
-    kinks_of,
     mismatch,
     names_at_bound,
-    uncertainty,
+    uncertainty_at,
     with_rows,
 )
 from deal_hw.calib.fit.null_space import confounded
@@ -163,7 +162,7 @@ class OutputErrorFits(Fits):
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
-        known = known_of(problem, fit)
+        known = uncertainty_at(problem, fit)
         split = self._split_half(problem, fit, recipe, known)
         known = widened_by_split_half(problem, known, theta, split)
         if settings.hold_first:
@@ -304,7 +303,7 @@ class OutputErrorFits(Fits):
             except InsufficientDataError as err:
                 return SplitHalf((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
             estimates.append(half.theta)
-            halves.append(known_of(problem, half))
+            halves.append(uncertainty_at(problem, half))
         return agreement(problem, fit.theta, known, estimates, halves, problem.steps - before)
 
     def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
@@ -402,17 +401,3 @@ def _error(problem: Problem, rmse: FloatArray) -> float:
 
 def _member(fit: OutputErrorFit) -> Member:
     return fit.theta, fit.latency_s
-
-
-def known_of(problem: Problem, fit: OutputErrorFit) -> Uncertainty:
-    """Return the uncertainty of a fit; residuals of its own scale count as noise."""
-    return uncertainty(
-        problem.space,
-        fit.theta,
-        fit.latency_s,
-        fit.normal,
-        1.0,
-        problem.latency_range_s,
-        fixed_latency=problem.fixed_latency_s is not None,
-        kinks=kinks_of(problem),
-    )

@@ -532,7 +532,7 @@ def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCa
     """
     # Model error does not reduce the information in the motion: only noise counts.
     noise_only = dataclasses.replace(local, chi2=1.0)
-    known = uncertainty_at(problem, noise_only, fixed_latency=problem.fixed_latency_s is not None)
+    known = uncertainty_at(problem, noise_only)
     blind = [n for n, v in zip(problem.space.names, known.verdicts, strict=True) if v == "not identifiable"]
     words = list(known.null_directions)
     if blind and not words:

@@ -176,7 +176,7 @@ def agreement(
     rows = tuple(
         SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
     )
-    identified = ~known.shape.blind
+    identified = ~known.blind
     least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
     expected = np.sqrt(sum(np.diag(h.covariance) for h in halves))

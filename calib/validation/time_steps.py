@@ -157,7 +157,7 @@ def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertai
     return dataclasses.replace(
         best,
         covariance=covariance,
-        interval=intervals(space, scan.refined[scan.best].theta, covariance, best.shape),
+        interval=intervals(space, scan.refined[scan.best].theta, covariance, best.blind, best.bound),
         latency_interval_s=(max(latency - half, low), min(latency + half, high)),
     )
 
@@ -259,7 +259,7 @@ def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[
         return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
     moved = np.abs(found.bias[:-1]) > half_width
-    names = [n for n, m, b in zip(problem.space.names, moved, known.shape.blind, strict=True) if m and not b]
+    names = [n for n, m, b in zip(problem.space.names, moved, known.blind, strict=True) if m and not b]
     if not names:
         return ()
     return (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import PosteriorShape, Uncertainty
+from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calib.pipeline.output_error_fits import FORCES, GAIT, _including, _scaled_together
 from deal_hw.calibration import Z90
@@ -50,7 +50,8 @@ def known_at(theta: np.ndarray) -> Uncertainty:
         null_directions=(),
         alarms=(),
         inflation=1.0,
-        shape=PosteriorShape(np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)),
+        blind=np.zeros(K, dtype=bool),
+        bound=np.zeros(K, dtype=np.int64),
         clustered=None,
         widened=np.ones(K),
     )

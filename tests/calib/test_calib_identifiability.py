@@ -45,7 +45,7 @@ def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
     hessian = 1e4 * np.array([[1.0, 0.9], [0.9, 1.0]])
     inside = _told(_space("a", "b"), [1.0, 2.0], hessian)
     at = _told(_space("a", "b"), [1.0, 5.0], hessian, gradient=np.array([0.0, -50.0, 0.0]))
-    assert list(at.shape.bound) == [0, 1]
+    assert list(at.bound) == [0, 1]
     assert at.covariance[0, 0] == pytest.approx(1.44 / 1e4, rel=1e-3)
     assert inside.covariance[0, 0] == pytest.approx(1.44 / 1e4 / 0.19, rel=1e-2)
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in at.alarms)
@@ -95,7 +95,7 @@ def test_the_interval_at_a_bound_lies_on_one_side() -> None:
 def test_a_bound_that_the_data_do_not_press_is_none() -> None:
     """At the bound, but the cost falls inwards: the parameter stays free."""
     told = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]), gradient=np.array([0.0, 5.0, 0.0]))
-    assert list(told.shape.bound) == [0, 0]
+    assert list(told.bound) == [0, 0]
     (alarm,) = [alarm for alarm in told.alarms if "bound" in alarm.seen]
     assert "b (5 kg)" in alarm.seen and "the data do not press" in alarm.means
 
@@ -110,7 +110,7 @@ def test_what_ended_at_a_bound_is_what_the_alarms_name() -> None:
     assert "b (0.2 kg), c (5 kg)" in other.seen and "do not press" in other.means
     ended = ended_at_bound(space, np.array(theta))
     assert ended.tolist() == [True, True, True, False]
-    assert list(told.shape.bound) == [1, 0, 0, 0]
+    assert list(told.bound) == [1, 0, 0, 0]
 
 
 def test_a_prior_resolves_a_common_factor() -> None:

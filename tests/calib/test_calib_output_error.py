@@ -13,12 +13,12 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.null_space import confounded
 from deal_hw.calib.fit.output_error import SHORT, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.pipeline.output_error_fits import (
     OutputErrorFits,
     OutputErrorSettings,
-    known_of,
     output_error_method,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
@@ -142,7 +142,7 @@ def test_intervals_count_the_correlation_of_residuals_once(problem: Problem) -> 
         spoilt.starts = problem.starts
         fit = fit_output_error(spoilt, TRUTH, LATE_S, Recipe(), central=True)
         assert fit.normal.cost == pytest.approx(fit.normal.count, rel=0.05)
-        known = known_of(problem, fit)
+        known = uncertainty_at(problem, fit)
         off = problem.space.to_scale(fit.theta) - problem.space.to_scale(TRUTH)
         errors.append(off / np.sqrt(np.diag(known.covariance)))
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 1.2

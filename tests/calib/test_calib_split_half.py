@@ -68,7 +68,7 @@ def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
     tight = dataclasses.replace(known, interval=np.stack([low, 1.01 * low], axis=1))
     split = agreement(problem, noisy_refined.theta, known, [low, noisy_refined.theta], [tight, known], 0)
     assert all(row.agree is False for row in split.rows)
-    told = np.array(problem.space.names)[~known.shape.blind]
+    told = np.array(problem.space.names)[~known.blind]
     assert set(split.flagged) <= set(told) and "servo.stiffness" in split.flagged
     assert "(" in split.alarms(problem.space)[0].seen
 
@@ -99,7 +99,7 @@ def test_halves_that_differ_more_than_intervals_expect_widen_all_of_them(
     problem, theta = noisy_problem, noisy_refined.theta
     known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
     std, at = np.sqrt(np.diag(known.covariance)), problem.space.to_scale(theta)
-    told = ~known.shape.blind
+    told = ~known.blind
 
     def halves(off: float) -> list[FloatArray]:
         return [problem.space.from_scale(at + side * off * std * told) for side in (-1, 1)]
