@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -119,6 +120,10 @@ class Uncertainty:
     bound: npt.NDArray[np.int64]
     clustered: Clustered | None
     widened: FloatArray
+
+    def with_alarms(self, *first: Alarm, last: Sequence[Alarm] = ()) -> Uncertainty:
+        """Return it with more alarms, before and after its own."""
+        return dataclasses.replace(self, alarms=(*first, *self.alarms, *last))
 
 
 def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -48,6 +48,7 @@ from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import averaged, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
+    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -115,6 +116,14 @@ class FitOutcome:
     known: Uncertainty
     facts: Mapping[str, Any] = field(default_factory=dict)
 
+    def but(
+        self, *first: Alarm, last: Sequence[Alarm] = (), chi2: float | None = None, **facts: Any
+    ) -> FitOutcome:
+        """Return it with more alarms, before and after its own, and with more facts."""
+        chi2 = self.chi2 if chi2 is None else chi2
+        known = self.known.with_alarms(*first, last=last)
+        return dataclasses.replace(self, chi2=chi2, known=known, facts={**self.facts, **facts})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationRun:
@@ -142,35 +151,16 @@ class CalibrationRun:
     play: PlayFit | None = None
     progress: ProgressCallback | None = None
 
-    def say(self, stage: str, message: str) -> None:
-        """Report the stage that begins."""
+    def say(self, stage: str, message: str = "", done: int = 0, total: int = 1, **candidate: Any) -> None:
+        """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""
         if self.progress is not None:
-            self.progress(Progress(stage, 0, 1, message))
-
-    def tell(self, stage: str) -> Callable[[int, int], None]:
-        """Return a function that reports how far a stage is: what is done, and of how much."""
-
-        def report(done: int, total: int) -> None:
-            if self.progress is not None:
-                self.progress(Progress(stage, done, total))
-
-        return report
+            self.progress(Progress(stage, done, total, message, **candidate))
 
     def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""
         theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
-        if self.progress is not None:
-            self.progress(
-                Progress(
-                    stage,
-                    1,
-                    1,
-                    f"chi2 {found.chi2:.3g}",
-                    estimate=theta,
-                    latency_s=found.latency_s,
-                    values={"chi2": found.chi2},
-                )
-            )
+        candidate = {"estimate": theta, "latency_s": found.latency_s, "values": {"chi2": found.chi2}}
+        self.say(stage, f"chi2 {found.chi2:.3g}", 1, 1, **candidate)
 
 
 class Fits(abc.ABC):
@@ -469,9 +459,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         f"(multiples of their noise): {words}",
     )
     found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit)
-    known = dataclasses.replace(found.known, alarms=(*found.known.alarms, mismatch(weighted.chi2)))
-    facts = {**found.facts, "channel_weights": scale}
-    return dataclasses.replace(found, chi2=weighted.chi2, known=known, facts=facts)
+    return found.but(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
 
 
 def with_play(run: CalibrationRun) -> FitOutcome | None:
@@ -492,10 +480,7 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
     alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    found = conclude_fit(wide, None, fit)
-    known = dataclasses.replace(found.known, alarms=(alarm, *found.known.alarms))
-    facts = {**found.facts, "diagnosis": [dataclasses.asdict(play.diagnosis)]}
-    return dataclasses.replace(found, known=known, facts=facts)
+    return conclude_fit(wide, None, fit).but(alarm, diagnosis=[dataclasses.asdict(play.diagnosis)])
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
@@ -509,7 +494,9 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     suspect = None
     asked = run.settings.diagnosis and run.settings.local_first
     if asked and (local is None or unexplained(local, MISMATCH.white_samples)):
-        suspect = find_shared_error(problem, local, run.tell("errors that commands and measurements share"))
+        suspect = find_shared_error(
+            problem, local, partial(run.say, "errors that commands and measurements share", "")
+        )
     if suspect is None:
         return fits.best(run)
     run.say(BEFORE_SEARCH, str(suspect.alarm))
@@ -521,8 +508,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         found = fits.best(run)
     if not suspect.confirmed(found.theta, found.latency_s):
         return fits.best(run) if brief else found
-    known = dataclasses.replace(found.known, alarms=(suspect.alarm, *found.known.alarms))
-    return dataclasses.replace(found, known=known, facts={**found.facts, "shared_error": suspect.to_json()})
+    return found.but(suspect.alarm, shared_error=suspect.to_json())
 
 
 def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:

@@ -130,8 +130,7 @@ def with_step(
     """
     step = check_step(problem, refined)
     alarms = step_alarm(problem, known, step)
-    known = counted(problem, known, theta, step)
-    return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), step.to_json()
+    return counted(problem, known, theta, step).with_alarms(last=alarms), step.to_json()
 
 
 def with_causes(
@@ -140,4 +139,4 @@ def with_causes(
     """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
     found = diagnose(problem, refined, fitted)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
-    return dataclasses.replace(known, alarms=(*alarms, *known.alarms)), [dataclasses.asdict(f) for f in found]
+    return known.with_alarms(*alarms), [dataclasses.asdict(f) for f in found]

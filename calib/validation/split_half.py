@@ -6,7 +6,6 @@ hold every phase of the motion. It costs less than one stage of the refinement.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -202,7 +201,7 @@ def widened_by_split_half(
     flagged = np.array([name in split.flagged for name in problem.space.names])
     std = split.scale * np.sqrt(np.diag(known.covariance))
     wider = widened_to(problem, known, theta, np.maximum(std, np.where(flagged, split.reach / Z90, 0.0)))
-    return dataclasses.replace(wider, alarms=(*wider.alarms, *split.alarms(problem.space)))
+    return wider.with_alarms(last=split.alarms(problem.space))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
