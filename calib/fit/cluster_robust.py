@@ -138,32 +138,10 @@ def _clustered(level: _Level, length: int) -> Clustered:
     return Clustered(np.where(seen, power / safe, 1.0), degrees, len(level.shift), length)
 
 
-def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
-    """Eliminate the start states.
-
-    Returns:
-        The rows' derivatives by the parameters with following start states, (W, R, P), and the start states'
-        normal matrices, (W, S, S).
-    """
-    js = rows.start
-    normal = np.einsum("wri,wrj->wij", js, js)
-    gain = np.linalg.solve(normal, np.einsum("wri,wrj->wij", js, rows.parameter))
-    return rows.parameter - np.einsum("wrs,wsp->wrp", js, gain), normal
-
-
-def without_starts(start: FloatArray, normal: FloatArray, x: FloatArray) -> FloatArray:
-    """Return columns ``x``, (W, R, n), without their projection on the start states.
-
-    ``start`` are derivatives by the start states, (W, R, S), ``normal`` their normal matrices, (W, S, S).
-    """
-    moved = np.linalg.solve(normal, np.einsum("wrs,wri->wsi", start, x))
-    return np.asarray(x - np.einsum("wrs,wsi->wri", start, moved))
-
-
 def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> _Level:
     shifts, expected, follows = [], [], []
     for of_episode in rows:
-        J, normal = eliminated(of_episode)
+        J, normal = of_episode.eliminated()
         W, R, P = J.shape
         S = of_episode.start.shape[2]
         channels = (R - S) // samples

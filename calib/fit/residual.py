@@ -74,6 +74,28 @@ class WindowRows:
     parameter: FloatArray
     start: FloatArray
 
+    def eliminated(self) -> tuple[FloatArray, FloatArray]:
+        """Eliminate the start states.
+
+        Returns:
+            The derivatives by the parameters with following start states, (W, R, K + 1), and the start
+            states' normal matrices, (W, S, S).
+        """
+        js = self.start
+        normal = np.einsum("wri,wrj->wij", js, js)
+        gain = np.linalg.solve(normal, np.einsum("wri,wrj->wij", js, self.parameter))
+        return self.parameter - np.einsum("wrs,wsp->wrp", js, gain), normal
+
+    def without_starts(self, normal: FloatArray, x: FloatArray | None = None) -> FloatArray:
+        """Return columns without their projection on the start states, whose normal matrices are given.
+
+        Columns ``x`` are (W, R, n); by default the residual, (W, R).
+        """
+        columns = self.residual[..., None] if x is None else x
+        moved = np.linalg.solve(normal, np.einsum("wrs,wri->wsi", self.start, columns))
+        left = columns - np.einsum("wrs,wsi->wri", self.start, moved)
+        return np.asarray(left[..., 0] if x is None else left)
+
 
 @dataclass(frozen=True, slots=True)
 class Normal:

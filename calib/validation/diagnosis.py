@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.cluster_robust import eliminated, without_starts
 from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
@@ -414,22 +413,14 @@ class _Left:
     @classmethod
     def of(cls, known: Evidence) -> _Left:
         """Remove the start states from the evidence."""
-        both = [eliminated(rows) for rows in known.rows]
-        rest = [
-            without_starts(rows.start, normal, rows.residual[..., None])[..., 0]
-            for rows, (_, normal) in zip(known.rows, both, strict=True)
-        ]
-        left = cls(known, [J for J, _ in both], [n for _, n in both], rest, {})
-        for signature in known.found:
-            left.columns[id(signature)] = [
-                without_starts(
-                    rows.start,
-                    normal,
-                    np.concatenate([x, np.zeros((len(x), rows.start.shape[2], x.shape[2]))], axis=1),
-                )
-                for rows, normal, x in zip(known.rows, left.normal, signature.columns, strict=True)
-            ]
-        return left
+        effective, normal = zip(*(rows.eliminated() for rows in known.rows), strict=True)
+        rest = [rows.without_starts(n) for rows, n in zip(known.rows, normal, strict=True)]
+
+        def of_prior_rows_too(rows: WindowRows, n: FloatArray, x: FloatArray) -> FloatArray:
+            return rows.without_starts(n, np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0))))
+
+        columns = {id(s): list(map(of_prior_rows_too, known.rows, normal, s.columns)) for s in known.found}
+        return cls(known, effective, normal, rest, columns)
 
     def design(self, taken: Sequence[Signature]) -> list[FloatArray]:
         """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""

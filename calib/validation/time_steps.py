@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.cluster_robust import eliminated, without_starts
 from deal_hw.calib.fit.intervals import Uncertainty, intervals, widened_to
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
@@ -293,8 +292,8 @@ def _refitted(
     P = len(belief)
     cost, gradient, hessian = 0.0, np.zeros(P), np.diag(belief)
     for one in rows:
-        jacobian, normal = eliminated(one)
-        residual = without_starts(one.start, normal, one.residual[..., None])[..., 0]
+        jacobian, normal = one.eliminated()
+        residual = one.without_starts(normal)
         cost += float(np.sum(residual**2))
         gradient += np.einsum("wri,wr->i", jacobian, residual)
         hessian += np.einsum("wri,wrj->ij", jacobian, jacobian)
