@@ -11,9 +11,9 @@ from markupsafe import Markup, escape
 
 from deal_hw.calib.report.gather import OverlayPanel, Residuals
 from deal_hw.calib.report.panels import Panel, Series, envelope, nice_step
-from deal_hw.calib.report.robot_drawing import Outline, RobotDrawing
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
+from deal_hw.viz.robot_drawing import Outline, RobotDrawing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,13 +11,13 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, whitened_residual
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, longest_windows, samples_in
-from deal_hw.calib.report.robot_drawing import RobotDrawing, draw_robot
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined
 from deal_hw.types import FloatArray
+from deal_hw.viz.robot_drawing import RobotDrawing, draw_robot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,7 +28,6 @@ from deal_hw.calib.report.page import (
     write_result,
 )
 from deal_hw.calib.report.panels import envelope
-from deal_hw.calib.report.robot_drawing import Outline, RobotDrawing
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -37,6 +36,7 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.sim.recordings.parts import part, stretches
+from deal_hw.viz.robot_drawing import Outline, RobotDrawing
 
 HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.report.charts import robot as robot_svg
-from deal_hw.calib.report.robot_drawing import RobotDrawing, draw_robot
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.sim.engine.compiling import load_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.types import FloatArray
+from deal_hw.viz.robot_drawing import RobotDrawing, draw_robot
 
 SHAPES = """
 <mujoco>
