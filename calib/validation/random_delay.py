@@ -93,16 +93,15 @@ def random_delay(
     change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])
     rms = np.sqrt(np.mean(change**2, axis=0))
     residual = np.stack([window.residual for window in windows])
-    delay = _unit(windows, "delay", rms, period_s)
-    forces = [_unit(windows, name, rms, period_s) for name in ("white", "slow")]
-    noise, delays, without, both = (
-        _fitted(residual, processes) for processes in ([], [delay], forces, [*forces, delay])
-    )
+    delay, scale = _process(windows, "delay", rms, period_s)
+    forces = [_process(windows, name, rms, period_s)[0] for name in ("white", "slow")]
+    noise, delays, without = (_fitted(residual, these)[0] for these in ([], [delay], forces))
+    both, ratios, level = _fitted(residual, [*forces, delay])
     return RandomDelay(
-        deviance=noise.deviance - delays.deviance,
-        gain=without.deviance - both.deviance,
-        share=float(both.ratios[-1] / (1 + both.ratios.sum())),
-        std_s=float(np.sqrt(both.ratios[-1] * both.level / delay.scale)),
+        deviance=noise - delays,
+        gain=without - both,
+        share=float(ratios[-1] / (1 + ratios.sum())),
+        std_s=float(np.sqrt(ratios[-1] * level / scale)),
     )
 
 
@@ -133,23 +132,14 @@ class _Window:
         return cls(residual, basis[: H * M], answer.response[:, w, :H], answer.change[w, :H])
 
 
-@dataclass(frozen=True, slots=True)
-class _Process:
-    """A random process.
-
-    Attributes:
-        covariance: Of the windows' residuals, for a mean variance of 1, (W, D, D).
-        scale: Mean variance for an intensity of 1.
-    """
-
-    covariance: FloatArray
-    scale: float
-
-
-def _unit(
+def _process(
     windows: Sequence[_Window], name: Literal["delay", "white", "slow"], rms: FloatArray, period_s: float
-) -> _Process:
-    """Return the process of late commands, or that of forces as large as command changes, (A,) rms."""
+) -> tuple[FloatArray, float]:
+    """Return the covariance of late commands, or of forces as large as command changes, (A,) rms.
+
+    It is that of the windows' residuals, (W, D, D), for a mean variance of 1. The mean variance of an
+    intensity of 1 follows.
+    """
     covariance = []
     for window in windows:
         A, H, M = window.response.shape
@@ -168,29 +158,16 @@ def _unit(
         covariance.append(columns.T @ columns)
     every = np.stack(covariance)
     scale = max(float(np.mean(np.einsum("wdd->wd", every))), 1e-300)
-    return _Process(every / scale, scale)
+    return every / scale, scale
 
 
-@dataclass(frozen=True, slots=True)
-class _Fitted:
-    """The most likely processes beside white noise.
+def _fitted(residual: FloatArray, covariances: Sequence[FloatArray]) -> tuple[float, FloatArray, float]:
+    """Return the deviance of residuals, (W, D), from the most likely processes beside white noise.
 
-    Attributes:
-        deviance: -2 log likelihood, but for a constant.
-        ratios: Mean variance of each process over that of the noise.
-        level: Variance of the noise.
+    Their mean variances over that of the noise, and the noise's variance, follow.
     """
-
-    deviance: float
-    ratios: FloatArray
-    level: float
-
-
-def _fitted(residual: FloatArray, processes: Sequence[_Process]) -> _Fitted:
-    """Return the most likely ratios of processes in residuals (W, D)."""
     count, (W, D) = residual.size, residual.shape
     unit = np.broadcast_to(np.eye(D), (W, D, D))
-    covariances = [p.covariance for p in processes]
 
     def likelihood(log_ratios: FloatArray) -> tuple[float, FloatArray, float]:
         """Return deviance, its gradient, and the noise's variance."""
@@ -206,12 +183,9 @@ def _fitted(residual: FloatArray, processes: Sequence[_Process]) -> _Fitted:
         ]
         return float(deviance), np.array(slope), level
 
-    def cost(log_ratios: FloatArray) -> tuple[float, FloatArray]:
-        return likelihood(log_ratios)[:2]
-
-    least, most = np.log(SETTINGS.ratio)
-    found = np.zeros(len(processes))
-    if processes:
-        found = minimize(cost, found, jac=True, bounds=Bounds(least, most)).x
+    found = np.zeros(len(covariances))
+    if covariances:
+        bounds = Bounds(*np.log(SETTINGS.ratio))
+        found = minimize(lambda x: likelihood(x)[:2], found, jac=True, bounds=bounds).x
     deviance, _, level = likelihood(found)
-    return _Fitted(deviance, np.exp(found), level)
+    return deviance, np.exp(found), level
