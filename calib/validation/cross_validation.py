@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, longest_windows
 from deal_hw.calib.fit.refinement import refine, refine_robust
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -108,7 +108,7 @@ def choose(
         return found
 
     def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
-        return prediction_error(test, members, length)
+        return prediction_error(test, members, window_s)
 
     found = on_folds(problem, fold_masks(problem), fits, errors, "refinement", window_s)
     return dataclasses.replace(found, steps=problem.steps - before)
@@ -191,22 +191,14 @@ def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:
     return found
 
 
-def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]], length: int) -> FloatArray:
+def prediction_error(problem: Problem, fits: Sequence[Member], seconds: float) -> FloatArray:
     """Return the root mean squared prediction error of each candidate in units of the sensor's noise, (N,).
 
-    Predictions start from smoothed states and have ``length`` samples, or fewer where no stretch is so long.
+    Predictions start from smoothed states and last ``seconds``, or less where no stretch is so long.
     """
     theta, latency = np.stack([f[0] for f in fits]), np.array([f[1] for f in fits])
     total, count = np.zeros(len(fits)), 0
-    while True:
-        try:
-            windows = problem.windows(length)
-            break
-        except InsufficientDataError:
-            if length <= 4:
-                raise
-            length = max(length // 2, 4)
-    for data in windows:
+    for data in longest_windows(problem, seconds):
         observed = problem.predict(theta, np.maximum(latency, 0.0), data).observed
         error = (observed - data.measured) / data.std
         # A diverged member counts as an error of the whole range.

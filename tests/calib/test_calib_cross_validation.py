@@ -43,7 +43,7 @@ def test_folds_keep_the_refinement_where_it_helps_and_drop_it_where_not(
     assert np.prod(off.errors["refinement"]) < 0.75 * np.prod(off.errors["search"])
     assert set(off.to_json()) == {"chosen", "errors", "window_s", "steps"}
     truth = prediction_error(
-        noisy_problem, [(noisy.theta, noisy.latency_s), (noisy.theta * 1.1, noisy.latency_s)], 40
+        noisy_problem, [(noisy.theta, noisy.latency_s), (noisy.theta * 1.1, noisy.latency_s)], 0.2
     )
     assert truth[0] < truth[1]
     dear = choose(noisy_problem, FixedSearch(noisy.theta, noisy.latency_s), Budget(), 0, 40, 10**10)
