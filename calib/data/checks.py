@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,11 +137,9 @@ def compute_sensitivity(problem: Problem) -> Sensitivity:
     theta = np.repeat(space.nominal[None], 1 + 2 * K, axis=0)
     for k in range(K):
         theta[1 + 2 * k, k], theta[2 + 2 * k, k] = space.low[k], space.high[k]
-    latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     effect = np.zeros(K)
-    for data in _spread_windows(longest_windows(problem, SETTINGS.window_s)):
-        predicted = problem.predict(theta, latency, data).observed
-        change = np.abs(predicted[1:] - predicted[:1]) / data.std
+    for change, data in _changes(problem, theta):
+        change = change / data.std
         # A member that diverges at the end of its range does have an effect.
         change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
         effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
@@ -164,13 +163,10 @@ def jumps(problem: Problem) -> dict[str, float]:
     values = np.repeat(value[None], 1 + 2 * K, axis=0)
     values[1 : 1 + K] += SETTINGS.nudge * np.diag(inwards)
     values[1 + K :] += SETTINGS.push * np.diag(inwards)
-    theta = space.from_scale(values)
-    latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     changes = []
-    for data in _spread_windows(longest_windows(problem, SETTINGS.window_s)):
-        predicted = problem.predict(theta, latency, data).observed
-        change = np.where(np.isfinite(data.std), np.abs(predicted[1:] - predicted[:1]), 0.0)
-        changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
+    for change, data in _changes(problem, space.from_scale(values)):
+        largest = np.where(np.isfinite(data.std), change, 0.0).max(axis=(2, 3))
+        changes.append(np.nan_to_num(largest, nan=0.0, posinf=0.0))
     nudged, pushed = np.split(np.concatenate(changes, axis=1), 2)
     jumping = nudged > np.maximum(
         SETTINGS.jump * SETTINGS.nudge / SETTINGS.push * pushed,
@@ -194,14 +190,18 @@ def require_sensitive(found: Sensitivity) -> None:
         )
 
 
-def _spread_windows(windows: list[WindowData]) -> list[WindowData]:
-    """Return about ``most_windows`` of the windows, evenly over all recordings."""
-    total = sum(len(data.windows) for data in windows)
-    every = max(total // SETTINGS.most_windows, 1)
-    kept, first = [], 0
+def _changes(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArray, WindowData]]:
+    """Yield how predictions of members (N, K) differ from the first one's, (N - 1, W, H, M), and windows.
+
+    There are about ``most_windows`` of them, evenly over all recordings.
+    """
+    latency, first = np.full(len(theta), problem.fixed_latency_s or 0.0), 0
+    windows = longest_windows(problem, SETTINGS.window_s)
+    every = max(sum(len(data.windows) for data in windows) // SETTINGS.most_windows, 1)
     for data in windows:
         rows = np.arange((-first) % every, len(data.windows), every)
         first += len(data.windows)
         if rows.size:
-            kept.append(taken(data, rows))
-    return kept
+            part = taken(data, rows)
+            predicted = problem.predict(theta, latency, part).observed
+            yield np.abs(predicted[1:] - predicted[:1]), part
