@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -189,6 +189,19 @@ def _slope(x: FloatArray, y: FloatArray, sigma: FloatArray) -> tuple[float, floa
     if spread <= 0:
         return 0.0, math.inf
     return float(np.sum(w * (x - mean_x) * (y - mean_y)) / spread), 1.0 / math.sqrt(spread)
+
+
+def autocorrelations(residuals: Sequence[FloatArray], longest: int) -> Iterator[tuple[float, int]]:
+    """Yield the autocorrelation of residuals, (W, H, ...) per episode, at lags 1, 2, ..., and its pairs.
+
+    A missing sample has a residual of exactly 0, and does not count. Lags end at ``longest`` samples.
+    """
+    count = max(sum(map(np.count_nonzero, residuals)), 1)
+    power = max(sum(float(np.sum(r**2)) for r in residuals) / count, 1e-300)
+    for lag in range(1, min(longest, residuals[0].shape[1] - 1) + 1):
+        products = [r[:, lag:] * r[:, :-lag] for r in residuals]
+        pairs = max(sum(map(np.count_nonzero, products)), 1)
+        yield sum(float(np.sum(p)) for p in products) / pairs / power, pairs
 
 
 @dataclass(frozen=True, slots=True)

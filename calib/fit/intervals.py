@@ -13,6 +13,7 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm, truncnorm
 from scipy.stats import t as t_law
 
+from deal_hw.calib.data.noise import autocorrelations
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import null_directions, null_space
@@ -142,18 +143,12 @@ def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = N
     channels = list(zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True))
     below = 0.0 if chance is None else float(norm.ppf(1 - chance / len(channels)))
     for channel in channels:
-        count = max(sum(map(np.count_nonzero, channel)), 1)
-        power = sum(float(np.sum(r**2)) for r in channel) / count
-        if power <= 0:
-            continue
         total, used = 1.0, 0
-        for lag in range(1, min(SETTINGS.lags, channel[0].shape[1] - 1) + 1):
-            products = [r[:, lag:] * r[:, :-lag] for r in channel]
-            pairs = max(sum(map(np.count_nonzero, products)), 1)
-            rho = sum(float(np.sum(p)) for p in products) / (pairs * power)
+        for rho, pairs in autocorrelations(channel, SETTINGS.lags):
             if rho <= 2.0 / np.sqrt(pairs):
                 break
-            total, used = total + 2 * rho, lag
+            total, used = total + 2 * rho, used + 1
+        count = max(sum(map(np.count_nonzero, channel)), 1)
         # Standard error of a time summed up to a lag: Madras and Sokal (1988).
         worst = max(worst, total * (1 - below * np.sqrt(2 * (2 * used + 1) / count)))
     return worst

@@ -7,6 +7,7 @@ solver sees the parameters alone. A robust loss is a weight per residual, comput
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
-from deal_hw.calib.data.noise import MAD_TO_STD, Mask
+from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
@@ -297,20 +298,7 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
 def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
     """Return one plus twice the sum of the residuals' correlations up to their first zero, at least 1.
 
-    Residuals are whitened, (W, H, M) per episode, and 0 for missing samples, which do not count; lags end at
-    ``longest`` samples.
+    Residuals are whitened, (W, H, M) per episode, and 0 for missing samples; lags end at ``longest`` samples.
     """
-    longest = min(longest, max(r.shape[1] for r in residuals) - 1)
-    total = sum(float(np.sum(r**2)) for r in residuals)
-    worth, count = 1.0, sum(map(np.count_nonzero, residuals))
-    for lag in range(1, longest + 1):
-        product, pairs = 0.0, 0
-        for r in residuals:
-            products = r[:, lag:] * r[:, :-lag]
-            product += float(np.sum(products))
-            pairs += int(np.count_nonzero(products))
-        correlation = product / max(pairs, 1) / max(total / max(count, 1), 1e-300)
-        if correlation <= 0:
-            break
-        worth += 2 * correlation
-    return worth
+    positive = itertools.takewhile(lambda found: found[0] > 0, autocorrelations(residuals, longest))
+    return sum((2 * correlation for correlation, _ in positive), 1.0)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
+from deal_hw.calib.data.noise import autocorrelations
 from deal_hw.calib.report.gather import OverlayPanel, Residuals
 from deal_hw.calib.report.panels import Panel, Series, envelope, nice_step
 from deal_hw.calibration import CalibrationResult
@@ -186,14 +187,8 @@ def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
 
     The band holds 95 %. A missing sample is NaN and does not count.
     """
-    seen = np.isfinite(values)
-    clean, count = np.where(seen, values, 0.0), max(int(seen.sum()), 1)
-    power = float(np.sum(clean**2)) / count or 1.0
-    rho = []
-    for lag in range(1, min(SETTINGS.lags, values.shape[1] - 1) + 1):
-        pairs = max(int(np.sum(seen[:, lag:] & seen[:, :-lag])), 1)
-        rho.append(float(np.sum(clean[:, lag:] * clean[:, :-lag])) / pairs / power)
-    return np.array(rho), 2.0 / float(np.sqrt(count))
+    rho = [found for found, _ in autocorrelations([np.nan_to_num(values)], SETTINGS.lags)]
+    return np.array(rho), 2.0 / float(np.sqrt(max(np.isfinite(values).sum(), 1)))
 
 
 def latency_scan(scan: Mapping[str, Any], tick_s: float | None) -> Markup | None:
