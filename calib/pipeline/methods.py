@@ -37,9 +37,9 @@ METHODS: dict[str, str] = {
     "ekf-one-pass": "deal_hw.calib.baselines.ekf:one_pass",
     "mujoco-sysid": "deal_hw.calib.baselines.sysid:MujocoSysid",
     "random": "deal_hw.calib.baselines.random_search:RandomSearch",
-    "midpoint": "deal_hw.calib.search.no_data:Midpoint",
-    "midpoint-linear": "deal_hw.calib.search.no_data:LinearMidpoint",
-    "nominal": "deal_hw.calib.search.no_data:Nominal",
+    "midpoint": "deal_hw.calib.search.no_data:midpoint",
+    "midpoint-linear": "deal_hw.calib.search.no_data:linear_midpoint",
+    "nominal": "deal_hw.calib.search.no_data:nominal",
 }
 """Name -> ``module:callable`` without arguments. ``default`` did best on the tuning seeds."""
 

@@ -39,7 +39,7 @@ from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.no_data import Nominal
+from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import Validation, unexplained, with_causes, with_step
 from deal_hw.calib.validation.cross_validation import (
     Choice,
@@ -328,7 +328,7 @@ def local() -> CalibrationPipeline:
     It suits a robust, damped motion and a model within a factor of about two. The fits take a twentieth of a
     search's time, the checks of the model about twice the fits'.
     """
-    return CalibrationPipeline(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
+    return CalibrationPipeline(nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
 
 
 FORCES = ("servo_stiffness", "servo_damping", "dof_frictionloss")
@@ -357,7 +357,7 @@ def gait() -> CalibrationPipeline:
     Start states are smoothed, not fitted: fitted ones would explain each landing of a foot.
     """
     settings = Validation(local_first=False, cross_validation=False)
-    return CalibrationPipeline(Nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
+    return CalibrationPipeline(nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
 
 def _scaled_together(

@@ -6,7 +6,6 @@ data.
 
 from __future__ import annotations
 
-import abc
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,7 @@ class _Draw(Stepper):
 
     STATE = ("_unit",)
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Ignorant) -> None:
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: NoData) -> None:
         super().__init__(log, rng, search)
         self._unit = self.coordinates.sample(rng, max(log.budget.population, 2))
         self._estimate = search.estimate(self.problem.space)
@@ -51,42 +50,31 @@ class _Draw(Stepper):
         )
 
 
-class Ignorant(Search, abc.ABC):
+@dataclass(frozen=True)
+class NoData(Search):
     """A method that reads no data; its interval is the whole range."""
 
+    name: str
     stepper = _Draw
     settings = NoSettings()
 
-    @abc.abstractmethod
     def estimate(self, space: ParameterSpace) -> FloatArray:
         """Return the estimate, (K,)."""
+        if self.name == "midpoint-linear":
+            return np.asarray((space.low + space.high) / 2)
+        return space.center if self.name == "midpoint" else space.nominal
 
 
-class Midpoint(Ignorant):
-    """The midpoint of every range, in the range's own scale."""
-
-    name = "midpoint"
-
-    def estimate(self, space: ParameterSpace) -> FloatArray:
-        """See :meth:`Ignorant.estimate`."""
-        return space.center
+def midpoint() -> NoData:
+    """Return `midpoint`: the middle of every range, in the range's own scale."""
+    return NoData("midpoint")
 
 
-class LinearMidpoint(Ignorant):
-    """The midpoint of every range on a linear scale."""
-
-    name = "midpoint-linear"
-
-    def estimate(self, space: ParameterSpace) -> FloatArray:
-        """See :meth:`Ignorant.estimate`."""
-        return np.asarray((space.low + space.high) / 2)
+def linear_midpoint() -> NoData:
+    """Return `midpoint-linear`: the middle of every range on a linear scale."""
+    return NoData("midpoint-linear")
 
 
-class Nominal(Ignorant):
-    """The values of the user's own model."""
-
-    name = "nominal"
-
-    def estimate(self, space: ParameterSpace) -> FloatArray:
-        """See :meth:`Ignorant.estimate`."""
-        return space.nominal
+def nominal() -> NoData:
+    """Return `nominal`: the values of the user's own model."""
+    return NoData("nominal")
