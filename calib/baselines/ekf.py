@@ -28,14 +28,9 @@ class ExtendedKalman:
     """An extended Kalman filter with numeric Jacobians; it knows no simulator.
 
     The first n of its D states move; the others, the parameters, stay. :meth:`ask` returns the points to
-    simulate for one step, and :meth:`tell` takes the results.
-
-    Args:
-        mean: First mean, (D,).
-        covariance: First covariance, (D, D).
-        moving: Number of moving states, n.
-        step: Step of the forward differences, (D,).
-        noise: Variance that is added before each step, (D,).
+    simulate for one step, and :meth:`tell` takes the results. It begins at a mean, (D,), and a covariance,
+    (D, D). ``step`` is that of the forward differences, (D,), ``noise`` the variance that is added before
+    each step, (D,).
     """
 
     def __init__(
@@ -49,17 +44,11 @@ class ExtendedKalman:
         return np.concatenate([self.mean[None], self.mean + np.diag(self._step)])
 
     def tell(self, moved: FloatArray, observed: FloatArray, measured: FloatArray, std: FloatArray) -> float:
-        """Predict and update.
+        """Predict and update; return the innovation's squared length in its own covariance over the channels.
 
-        Args:
-            moved: Moving states of each point after the step, (1 + D, n).
-            observed: Predicted measurements of each, (1 + D, M).
-            measured: The measurements, (M,).
-            std: Their standard deviation, (M,); infinite for missing ones.
-
-        Returns:
-            The innovation's squared length in its own covariance over the channels: 1 on average for a
-            consistent filter.
+        It is 1 on average for a consistent filter. ``moved`` are the moving states of each point after the
+        step, (1 + D, n), ``observed`` the predicted measurements of each, (1 + D, M). The measurements are
+        (M,), their standard deviations (M,) too; infinite for missing ones.
         """
         n, D = self._moving, len(self.mean)
         known = np.isfinite(std)

@@ -69,14 +69,9 @@ def members_of(problem: Problem, values: FloatArray) -> Members:
 class Innovations:
     """Window innovations, whitened around one simulator, of parameters in their own scale and the latency.
 
-    The parameters' priors follow as one more residual each.
-
-    Args:
-        problem: Data and simulator.
-        ticks: Window length in control periods.
-        centre: The simulator to linearise around, (K + 1,).
-        follow: Linearise around the most probable start states there, not around the smoothed ones; right
-            once the simulator is nearly right.
+    The parameters' priors follow as one more residual each. Windows have ``ticks`` control periods. The
+    simulator to linearise around is (K + 1,). With ``follow`` it is linearised around the most probable start
+    states there, not around the smoothed ones; right once the simulator is nearly right.
     """
 
     def __init__(self, problem: Problem, ticks: int, centre: FloatArray, *, follow: bool) -> None:

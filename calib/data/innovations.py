@@ -140,14 +140,9 @@ _MOST_SPREAD = 1e6
 def linearise(
     problem: Problem, centre: Members, data: WindowData, offset: FloatArray | None = None
 ) -> Whitening:
-    """Linearise the prediction by the start states around one simulator.
+    """Linearise the prediction by the start states around one simulator, such as the population's mean.
 
-    Args:
-        problem: Data and simulator.
-        centre: One member, the mean of the population.
-        data: The windows.
-        offset: Start states at the linearisation point, in standard deviations from the smoothed ones, (W, 2
-            C).
+    ``offset`` are the start states at that point, in standard deviations from the smoothed ones, (W, 2 C).
     """
     W, C = data.start_position.shape
     std = problem.starts[data.episode].std[data.windows.start]
@@ -190,19 +185,11 @@ def whitened_residual(
     offsets: list[FloatArray] | None = None,
     whitenings: Sequence[Whitening] | None = None,
 ) -> FloatArray:
-    """Return recording minus prediction of every window, whitened around one simulator.
+    """Return recording minus prediction of every window, whitened around one simulator, ``centre``.
 
-    Args:
-        problem: Data and simulator.
-        members: The N simulators.
-        centre: The simulator to linearise around, such as the population's mean.
-        windows: The windows.
-        offsets: Start states at the linearisation point, one array per entry of ``windows``, updated in
-            place. None for the smoothed states.
-        whitenings: Precomputed for the same simulator and start states, one per entry of ``windows``.
-
-    Returns:
-        (N, M); not finite in rows of diverged members.
+    It is (N, M), not finite in rows of diverged members. ``offsets`` are the start states at the
+    linearisation point, one array per entry of ``windows``, updated in place; None for the smoothed states.
+    ``whitenings`` were computed before for the same simulator and start states.
     """
     parts = []
     for i, data in enumerate(windows):

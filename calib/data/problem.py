@@ -92,14 +92,10 @@ class PopulationPolicy(Protocol):
     def restart(
         self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
     ) -> None:
-        """Start N simulators from one common past.
+        """Start N simulators, ``count``, from one common past.
 
-        Args:
-            count: Number of simulators N.
-            position: Past states, oldest first, (h, C).
-            velocity: Likewise.
-            command: The policy's commands in these states, (h, A).
-            number: Number of its commands so far; at least h.
+        Past states are (h, C), oldest first, the policy's commands in them (h, A). ``number`` counts its
+        commands so far; at least h.
         """
         ...
 
@@ -302,11 +298,7 @@ class Problem:
         return np.concatenate([moved, np.zeros_like(moved)], axis=1)[:, self.channels]
 
     def windows(self, length: int, offset: int = 0) -> list[WindowData]:
-        """Cut all episodes into windows of ``length`` samples.
-
-        Args:
-            length: Samples predicted in each window, H.
-            offset: First sample that may start a window.
+        """Cut all episodes into windows that predict ``length`` samples, H; none starts before ``offset``.
 
         Raises:
             InsufficientDataError: No episode holds a window.
@@ -371,14 +363,9 @@ class Problem:
         position: FloatArray | None = None,
         velocity: FloatArray | None = None,
     ) -> MemberPrediction:
-        """Predict windows with N parameter vectors.
+        """Predict windows with N parameter vectors, (N, K), and total latencies, (N,) [s].
 
-        Args:
-            theta: Physical values, (N, K).
-            latency_s: Total latency of each member, (N,) [s].
-            data: The windows.
-            position: Start positions, (W, C) or (N, W, C); the smoothed ones by default.
-            velocity: Start velocities, likewise.
+        Start positions and velocities are (W, C) or (N, W, C); the smoothed ones by default.
         """
         batch = self.batch(len(theta))
         batch.set_parameters(theta)

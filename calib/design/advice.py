@@ -161,14 +161,9 @@ def advise(
 ) -> tuple[Advice, ...]:
     """Return advice for each weak or unidentified parameter of a result.
 
-    Args:
-        robot: The nominal model, with a fixed base.
-        result: The calibration's result.
-        seen: Information of its recordings, (K + 1, K + 1), from
-            :func:`~deal_hw.calib.design.experiment_design.information`.
-        balance: Makes the balancing policy; None for robots that stand by themselves.
-        settings: Which excitations are tried.
-        threads: Simulation threads.
+    The robot's base is fixed. ``seen`` is the information of the recordings, (K + 1, K + 1), from
+    :func:`~deal_hw.calib.design.experiment_design.information`. ``balance`` makes the balancing policy; None
+    for robots that stand by themselves.
     """
     space, K = result.space, len(result.space)
     known = result.distribution()

@@ -66,15 +66,8 @@ class Trial:
 class TrialRunner:
     """Runs behaviours on the members of a scenario; the simulator is kept between candidates.
 
-    Args:
-        robot: The nominal model, with a fixed base.
-        space: The parameters.
-        scenario: The members.
-        seconds: Length of a run [s].
-        threads: Simulation threads; None for all CPUs.
-        trip_share: Share of the trip ranges that a trial may use. A few dozen simulated robots do not cover
-            all real ones: a design that used the whole range on 48 of them tripped on one of the first three
-            emulated ones.
+    A trial may use ``trip_share`` of the trip ranges. A few dozen simulated robots do not cover all real
+    ones: a design that used the whole range on 48 of them tripped on one of the first three emulated ones.
 
     Raises:
         ConfigurationError: The robot's base floats, or its rates do not divide.

@@ -140,17 +140,9 @@ def information(
 class Experiment:
     """Predicts the information of candidates, all on the same members.
 
-    Args:
-        robot: The nominal model.
-        known: Distribution of the parameters and the latency.
-        seconds: Length of a run [s].
-        draws: Members D.
-        rng: Draws them.
-        rest: Behaviour that hardly moves the robot. Members that leave the limits even under it are drawn
-            again. None to take the first draws.
-        threads: Simulation threads.
-        settings: How members are drawn and tried.
-        prior: Information before the recording; that of ``known`` by default.
+    The D members, ``draws`` of them, are drawn from what is ``known``. ``rest`` is a behaviour that hardly
+    moves the robot: members that leave the limits even under it are drawn again. Without it the first draws
+    are taken. ``prior`` is the information before the recording; that of ``known`` by default.
 
     Raises:
         CalibrationError: Hardly any draw can be run.

@@ -88,17 +88,11 @@ class _Level:
 def clustered(
     rows: Sequence[WindowRows], bread: FloatArray, samples: int, correlation_samples: float = 1.0
 ) -> Clustered | None:
-    """Compare the cluster-robust covariance with the covariance of independent residuals.
+    """Compare the cluster-robust covariance with ``bread``, that of independent residuals of unit variance.
 
-    Args:
-        rows: Linearised residuals at the estimate.
-        bread: Covariance under independent residuals of unit variance, (P, P); zero rows and columns for
-            fixed coordinates.
-        samples: Samples H of a window.
-        correlation_samples: Autocorrelation time of the residuals; blocks are at least twice as long.
-
-    Returns:
-        None where the recordings hold too few blocks.
+    The latter, (P, P), has zero rows and columns for fixed coordinates. Windows have ``samples`` samples.
+    Blocks are at least twice as long as the residuals' autocorrelation time. It is None where the recordings
+    hold too few blocks.
     """
     if not rows:
         return None

@@ -132,12 +132,8 @@ def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = N
 
     It is that of the worst channel, over all recordings: each recording alone is short, and the worst of many
     would be far from white by chance. White residuals have 1. Samples that filled a gap do not count: their
-    whitened residual is exactly 0.
-
-    Args:
-        residuals: The residuals.
-        chance: Return a lower bound instead, which the true time of any channel is below with this
-            probability.
+    whitened residual is exactly 0. With a ``chance``, it is a lower bound instead, which the true time of any
+    channel is below with this probability.
     """
     worst = 1.0
     channels = list(zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True))
@@ -166,19 +162,12 @@ def uncertainty(
     timing_std_s: float = 0.0,
     kinks: float = SETTINGS.kinks,
 ) -> Uncertainty:
-    """Turn normal equations into intervals.
+    """Turn normal equations at an estimate, (K,) and latency [s], into intervals.
 
-    Args:
-        space: The parameters.
-        theta: Estimate, (K,).
-        latency_s: Estimate [s].
-        normal: Normal equations there. Their gradient shows how hard a bound is pressed. Their rows give the
-            clustered variances; without rows, residuals count as independent but for their correlation time.
-        chi2: Mean squared whitened residual.
-        latency_range_s: Searched latencies [s].
-        fixed_latency: The latency was given.
-        timing_std_s: Jitter of the sample times [s].
-        kinks: Factor on standard deviations for nonlinearity.
+    Their gradient shows how hard a bound is pressed. Their rows give the clustered variances; without rows,
+    residuals count as independent but for their correlation time. ``chi2`` is the mean squared whitened
+    residual, ``timing_std_s`` the jitter of the sample times [s], ``kinks`` a factor on standard deviations
+    for nonlinearity.
     """
     K = len(space)
     tau = correlation_time(normal.residual)

@@ -135,15 +135,10 @@ def fit_output_error(
     iterations: int | None = None,
     central: bool = False,
 ) -> OutputErrorFit:
-    """Fit from a start.
+    """Fit from a start, (K,) and latency [s].
 
-    Args:
-        problem: Recordings and simulator.
-        theta: Start, (K,).
-        latency_s: Its latency [s].
-        recipe: Settings.
-        iterations: Most steps; 0 to stay at the start, the recipe's by default.
-        central: See :class:`OutputErrorFit`.
+    There are at most ``iterations`` steps, the recipe's by default; 0 stays at the start. For ``central`` see
+    :class:`OutputErrorFit`.
 
     Raises:
         InsufficientDataError: No recording holds a window.

@@ -124,15 +124,11 @@ class Normal:
 
 
 class Shooting:
-    """Residuals, normal equations and candidate steps for one cut into windows.
+    """Residuals, normal equations and candidate steps for one cut into windows of ``length`` samples.
 
-    Args:
-        problem: The problem.
-        length: Samples a window predicts.
-        data: The windows; all windows of the recordings by default.
-        given: Use the smoothed start states; otherwise each is an unknown. Exact states are always given.
-        prior_share: Spread of parameters around their nominal values as a share of their range, in their own
-            scale; infinite to use their own priors only.
+    Start states are ``given``, the smoothed ones, or each is an unknown; exact states are always given.
+    ``prior_share`` is the spread of parameters around their nominal values as a share of their range, in
+    their own scale; infinite to use their own priors only.
     """
 
     def __init__(
@@ -222,12 +218,9 @@ class Shooting:
     ) -> Normal:
         """Return the normal equations at a point; derivatives by forward differences in one batch.
 
-        Args:
-            point: The point.
-            keep: Return the linearised residuals, too; they take much memory.
-            stretch: Factor on the differences' steps; negative for backward differences.
-            central: Use central differences, at twice the cost: the truncation error of one-sided ones looks
-                like information where there is none.
+        With ``keep`` the linearised residuals, which take much memory, are returned, too. ``stretch`` is a
+        factor on the differences' steps; negative for backward ones. ``central`` differences cost twice as
+        much: the truncation error of one-sided ones looks like information where there is none.
         """
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.given else C

@@ -121,16 +121,10 @@ def gather(
     window_s: float = SETTINGS.window_s,
     threads: int | None = None,
 ) -> ReportInputs:
-    """Simulate the predictions of the report.
+    """Simulate the predictions of the report on the fitted recordings and on held-out ones.
 
-    Args:
-        robot: The nominal model.
-        result: The calibration's result.
-        episodes: The fitted recordings.
-        holdout: Recordings that the search has not seen.
-        telemetry: Verdicts of the telemetry checks, in words.
-        window_s: Length of drawn predictions [s]; shorter where no recording is as long.
-        threads: Simulation threads.
+    ``telemetry`` are verdicts of the telemetry checks, in words. Drawn predictions last ``window_s``, or less
+    where no recording is as long.
     """
     overlays: list[OverlayPanel] = []
     residuals: list[Residuals] = []

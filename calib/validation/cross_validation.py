@@ -124,13 +124,9 @@ def on_folds(
 ) -> Choice:
     """Fit every candidate without each fold and compare the predictions of that fold.
 
-    Args:
-        problem: All fitted data.
-        masks: For each fold the samples of each recording that it leaves out, (T,) each.
-        fits: Makes all candidates from a fold's data and its number.
-        errors: Returns each candidate's prediction error on a part, (N,).
-        usual: Name of the candidate to take where nothing is better or no fold can be fitted.
-        window_s: Length of the predictions [s].
+    For each fold, ``masks`` hold the samples of each recording that it leaves out, (T,) each. ``fits`` makes
+    all candidates from a fold's data and its number, ``errors`` returns each one's prediction error on a
+    part, (N,). ``usual`` is taken where nothing is better or no fold can be fitted.
     """
     found: dict[str, list[float]] = {}
     for fold, left_out in enumerate(masks):

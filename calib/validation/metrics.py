@@ -74,14 +74,9 @@ def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
 class HeldOut:
     """Held-out recordings; each candidate is simulated once.
 
-    Args:
-        robot: The robot's model.
-        space: The parameters.
-        episodes: The recordings.
-        window_s: Length of the predictions, each from the smoothed reported state [s].
-        threads: Simulation threads.
-        truth: Noise-free positions at the episodes' samples, (T, n) each in the order of the measured
-            coordinates; None to predict the reported ones.
+    Predictions last ``window_s``, each from the smoothed reported state. ``truth`` holds noise-free positions
+    at the episodes' samples, (T, n) each in the order of the measured coordinates; without it, the reported
+    ones are predicted.
 
     Raises:
         InsufficientDataError: No recording holds a window.
