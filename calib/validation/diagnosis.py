@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -173,9 +174,9 @@ class Play:
         return self.chi2 < MISMATCH.chi2 and self.diagnosis.share >= SETTINGS.decisive
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Evidence:
-    """Evidence for a diagnosis.
+    """Evidence for a diagnosis; regressions on it leave the start states free.
 
     Attributes:
         rows: Linearised residuals, per episode.
@@ -194,6 +195,77 @@ class Evidence:
     period_s: float
     time_s: Sequence[FloatArray]
     names: Sequence[str]
+
+    @cached_property
+    def _eliminated(self) -> list[tuple[FloatArray, FloatArray]]:
+        return [rows.eliminated() for rows in self.rows]
+
+    @cached_property
+    def _rest(self) -> list[FloatArray]:
+        """The residual without its projection on the start states, (W, R) per episode."""
+        return [
+            rows.without_starts(normal) for rows, (_, normal) in zip(self.rows, self._eliminated, strict=True)
+        ]
+
+    @cached_property
+    def _columns(self) -> dict[int, list[FloatArray]]:
+        """Each signature's columns without theirs, by its identity; rows of the prior are 0."""
+
+        def left(rows: WindowRows, eliminated: tuple[FloatArray, FloatArray], x: FloatArray) -> FloatArray:
+            padded = np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0)))
+            return rows.without_starts(eliminated[1], padded)
+
+        return {id(s): list(map(left, self.rows, self._eliminated, s.columns)) for s in self.found}
+
+    def _design(self, taken: Sequence[Signature]) -> list[FloatArray]:
+        """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
+        columns = [self._columns[id(s)] for s in taken]
+        effective = (J for J, _ in self._eliminated)
+        return [np.concatenate(parts, axis=2) for parts in zip(effective, *columns, strict=True)]
+
+    def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return each window's normal matrix, (W, n, n), and vector, (W, n), squares, (W,), and the prior."""
+        design = self._design(taken)
+        matrix = np.concatenate([np.einsum("wri,wrj->wij", x, x) for x in design])
+        vector = np.concatenate(
+            [np.einsum("wri,wr->wi", x, r) for x, r in zip(design, self._rest, strict=True)]
+        )
+        squares = np.concatenate([np.sum(r**2, axis=1) for r in self._rest])
+        own = np.einsum("wii->i", matrix)
+        prior = np.append(self.prior, 1e-6 * own[len(self.prior) :] + 1e-12)
+        return matrix, vector, squares, prior
+
+    def coefficients(self, taken: Sequence[Signature]) -> FloatArray:
+        """Return the regression's coefficients on all windows, parameters first, (P + n,)."""
+        matrix, vector, _, prior = self._normal(taken)
+        return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
+
+    def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
+        """Return the residual after the regression, (W, R) per episode."""
+        found = self.coefficients(taken)
+        return [r - x @ found for x, r in zip(self._design(taken), self._rest, strict=True)]
+
+    @cached_property
+    def count(self) -> int:
+        """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
+        measured = sum(int(np.count_nonzero(r)) for r in self._rest)
+        return max(measured - sum(len(n) * int(n.shape[1]) for _, n in self._eliminated), 1)
+
+    def held_out(self, taken: Sequence[Signature]) -> float:
+        """Return the total cost of each fold's windows with the regression fitted to the others."""
+        matrix, vector, squares, prior = self._normal(taken)
+        fold = FOLDS.of(len(squares))
+        cost = 0.0
+        for k in range(FOLDS.parts):
+            mine, others = fold == k, fold != k
+            found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
+            each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
+            cost += float(each[mine].sum())
+        return cost
+
+    def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
+        """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
+        return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
 def diagnose(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> tuple[Diagnosis, ...]:
@@ -318,23 +390,22 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
 
 def name_causes(known: Evidence) -> list[Diagnosis]:
     """Return the causes that evidence supports, best first; each is tested together with those before it."""
-    left = _Left.of(known)
     found: list[Diagnosis] = []
     taken: list[Signature] = []
     groups = _groups(known.found)
     while groups and len(found) < SETTINGS.most:
-        gains = [left.gain(taken, group) for group in groups]
+        gains = [known.gain(taken, group) for group in groups]
         group = groups[int(np.argmax(gains))]
-        share = 1 - float(np.exp(-max(gains) / left.count))
+        share = 1 - float(np.exp(-max(gains) / known.count))
         if max(gains) <= MISMATCH.evidence or share <= SETTINGS.noticed:
             break
-        found.append(_cause_diagnosis(left, taken, group, share, max(gains)))
+        found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
     varying = _varying_delay(known)
     if varying is not None:
         found.append(varying)
-    bursts = _bursts(known, left.residual(taken))
+    bursts = _bursts(known, known.residual(taken))
     if bursts is not None:
         found.append(bursts)
     return sorted(found, key=lambda f: -f.deviance)
@@ -360,26 +431,26 @@ def _finding(
 
 
 def _cause_diagnosis(
-    left: _Left, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
+    known: Evidence, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
 ) -> Diagnosis:
     cause = group[0].cause
     if cause == "mass":
-        return _mass_diagnosis(left, taken, share, deviance)
-    gains = np.array([left.gain(taken, [signature]) for signature in group])
+        return _mass_diagnosis(known, taken, share, deviance)
+    gains = np.array([known.gain(taken, [signature]) for signature in group])
     order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
     joints = [group[k].where for k in order[:4]]
     return _finding(cause, share, deviance, joints, listed(joints))
 
 
-def _mass_diagnosis(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
+def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
     """Name each body that explains about as much: without a known torque, motion shows mass ratios only."""
-    bodies = [s for s in left.known.found if s.cause == "mass"]
-    gains = {k: left.gain(taken, [body]) for k, body in enumerate(bodies)}
+    bodies = [s for s in known.found if s.cause == "mass"]
+    gains = {k: known.gain(taken, [body]) for k, body in enumerate(bodies)}
     alike = sorted(
         (k for k, gain in gains.items() if gain >= SETTINGS.alike * deviance), key=lambda k: -gains[k]
     )
     # The signature is a change per share of the mass; the residual is prediction minus measurement.
-    change = {k: -float(left.coefficients([*taken, bodies[k]])[-1]) for k in alike}
+    change = {k: -float(known.coefficients([*taken, bodies[k]])[-1]) for k in alike}
     ways = [
         f"{bodies[k].where} {percent(abs(change[k]))} {'heavier' if change[k] > 0 else 'lighter'}"
         for k in alike
@@ -390,86 +461,6 @@ def _mass_diagnosis(left: _Left, taken: Sequence[Signature], share: float, devia
     )
     names = [bodies[k].where for k in alike]
     return _finding("mass", share, deviance, names, " and ".join(names), seen)
-
-
-@dataclass(frozen=True, slots=True)
-class _Left:
-    """Residuals and their derivatives, both without their projection on the start states.
-
-    Attributes:
-        known: The evidence.
-        effective: Derivatives by parameters with following start states, (W, R, P) per episode.
-        normal: Start states' normal matrices, (W, S, S) per episode.
-        rest: The residual, (W, R) per episode.
-        columns: Each signature's columns, by its identity.
-    """
-
-    known: Evidence
-    effective: Sequence[FloatArray]
-    normal: Sequence[FloatArray]
-    rest: Sequence[FloatArray]
-    columns: dict[int, list[FloatArray]]
-
-    @classmethod
-    def of(cls, known: Evidence) -> _Left:
-        """Remove the start states from the evidence."""
-        effective, normal = zip(*(rows.eliminated() for rows in known.rows), strict=True)
-        rest = [rows.without_starts(n) for rows, n in zip(known.rows, normal, strict=True)]
-
-        def of_prior_rows_too(rows: WindowRows, n: FloatArray, x: FloatArray) -> FloatArray:
-            return rows.without_starts(n, np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0))))
-
-        columns = {id(s): list(map(of_prior_rows_too, known.rows, normal, s.columns)) for s in known.found}
-        return cls(known, effective, normal, rest, columns)
-
-    def design(self, taken: Sequence[Signature]) -> list[FloatArray]:
-        """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
-        columns = [self.columns[id(s)] for s in taken]
-        return [np.concatenate(parts, axis=2) for parts in zip(self.effective, *columns, strict=True)]
-
-    def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return each window's normal matrix, (W, n, n), and vector, (W, n), squares, (W,), and the prior."""
-        design = self.design(taken)
-        matrix = np.concatenate([np.einsum("wri,wrj->wij", x, x) for x in design])
-        vector = np.concatenate(
-            [np.einsum("wri,wr->wi", x, r) for x, r in zip(design, self.rest, strict=True)]
-        )
-        squares = np.concatenate([np.sum(r**2, axis=1) for r in self.rest])
-        own = np.einsum("wii->i", matrix)
-        prior = np.append(self.known.prior, 1e-6 * own[len(self.known.prior) :] + 1e-12)
-        return matrix, vector, squares, prior
-
-    def coefficients(self, taken: Sequence[Signature]) -> FloatArray:
-        """Return the regression's coefficients on all windows, parameters first, (P + n,)."""
-        matrix, vector, _, prior = self._normal(taken)
-        return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
-
-    def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
-        """Return the residual after the regression, (W, R) per episode."""
-        found = self.coefficients(taken)
-        return [r - x @ found for x, r in zip(self.design(taken), self.rest, strict=True)]
-
-    @property
-    def count(self) -> int:
-        """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
-        measured = sum(int(np.count_nonzero(r)) for r in self.rest)
-        return max(measured - sum(len(n) * int(n.shape[1]) for n in self.normal), 1)
-
-    def held_out(self, taken: Sequence[Signature]) -> float:
-        """Return the total cost of each fold's windows with the regression fitted to the others."""
-        matrix, vector, squares, prior = self._normal(taken)
-        fold = FOLDS.of(len(squares))
-        cost = 0.0
-        for k in range(FOLDS.parts):
-            mine, others = fold == k, fold != k
-            found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
-            each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
-            cost += float(each[mine].sum())
-        return cost
-
-    def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
-        """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
-        return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
 def _varying_delay(known: Evidence) -> Diagnosis | None:
