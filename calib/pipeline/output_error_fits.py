@@ -288,23 +288,17 @@ class OutputErrorFits(Fits):
         self, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
     ) -> SplitHalf:
         """Fit two halves of the motions from the estimate on all data, and compare."""
-        space, before = problem.space, problem.steps
-        estimates, halves = [], []
-        for mask in fold_masks(problem, 2):
-            try:
-                half = fit_output_error(
-                    problem.part(mask),
-                    fit.theta,
-                    fit.latency_s,
-                    recipe,
-                    iterations=self.settings.half_iterations,
-                    central=True,
-                )
-            except InsufficientDataError as err:
-                return SplitHalf((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
-            estimates.append(half.theta)
-            halves.append(uncertainty_at(problem, half))
-        return agreement(problem, fit.theta, known, estimates, halves, problem.steps - before)
+        before, most = problem.steps, self.settings.half_iterations
+        parts = map(problem.part, fold_masks(problem, 2))
+        try:
+            halves = [
+                fit_output_error(part, fit.theta, fit.latency_s, recipe, iterations=most, central=True)
+                for part in parts
+            ]
+        except InsufficientDataError as err:
+            return SplitHalf(note=f"a half cannot be fitted: {err}")
+        both = [uncertainty_at(problem, half) for half in halves]
+        return agreement(problem, fit.theta, known, [h.theta for h in halves], both, problem.steps - before)
 
     def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
         settings = self.settings

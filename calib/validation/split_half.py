@@ -7,7 +7,7 @@ hold every phase of the motion. It costs less than one stage of the refinement.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -83,9 +83,9 @@ class SplitHalf:
         note: Why nothing was compared.
     """
 
-    rows: tuple[SplitHalfRow, ...]
-    flagged: tuple[str, ...]
-    reach: FloatArray
+    rows: tuple[SplitHalfRow, ...] = ()
+    flagged: tuple[str, ...] = ()
+    reach: FloatArray = field(default_factory=lambda: np.zeros(0))
     scale: float = 1.0
     steps: int = 0
     note: str = ""
@@ -129,14 +129,13 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
 
     Parameters that ``known`` calls unidentified are not compared.
     """
-    shooting, K = refined.shooting, len(problem.space)
-    nothing = np.zeros(K)
+    shooting = refined.shooting
     windows = sum(len(d.windows) for d in shooting.data)
     if windows < SETTINGS.fewest_windows:
-        return SplitHalf((), (), nothing, note=f"{windows} windows are too few to halve: record longer")
+        return SplitHalf(note=f"{windows} windows are too few to halve: record longer")
     cost = _steps(problem, shooting)
     if cost > SETTINGS.most_steps:
-        return SplitHalf((), (), nothing, note=f"left out: it would take {cost:.1g} physics steps")
+        return SplitHalf(note=f"left out: it would take {cost:.1g} physics steps")
     before = problem.steps
     block = 1
     if known.clustered is not None:

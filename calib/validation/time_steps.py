@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -191,7 +191,7 @@ class StepCheck:
     """
 
     step_s: float
-    bias: FloatArray
+    bias: FloatArray = field(default_factory=lambda: np.zeros(0))
     gain: float = 0.0
     note: str = ""
 
@@ -214,19 +214,18 @@ class StepCheck:
 
 def check_step(problem: Problem, refined: Refined, settings: StepSettings | None = None) -> StepCheck:
     """Compare predictions with the model's step and with half of it; the fit has linearised residuals."""
-    step_s, K = problem.robot.step_s, len(problem.space)
-    nothing = np.zeros(K + 1)
+    step_s = problem.robot.step_s
     if problem.robot.base is not None:
         # A contact at another moment changes a prediction more than the step's error does.
-        return StepCheck(step_s, nothing, note="not compared for robots in contact")
+        return StepCheck(step_s, note="not compared for robots in contact")
     shooting, rows = refined.shooting, refined.normal.rows
     steps = 3.0 * shooting.device_periods * problem.episodes[0].step_s / step_s
     if steps > (settings or STEP).most_steps:
-        return StepCheck(step_s, nothing, note=f"not compared: it would take {steps:.1g} physics steps")
+        return StepCheck(step_s, note=f"not compared: it would take {steps:.1g} physics steps")
     finer = Shooting(halved(problem), shooting.length, data=shooting.data)
     before, after = shooting.residuals(refined.point), finer.residuals(refined.point)
     if not all(np.isfinite(r).all() for r in after):
-        return StepCheck(step_s, nothing, note="not compared: half the step diverged")
+        return StepCheck(step_s, note="not compared: half the step diverged")
     moved = [_shifted(r, b - a) for r, a, b in zip(rows, before, after, strict=True)]
     width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
     belief = refined.normal.prior + 12.0 / width**2
