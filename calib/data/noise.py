@@ -279,19 +279,15 @@ def _local_polynomials(
             f"the recording has {T} usable samples, the shortest that can be smoothed has {length}; "
             "record longer"
         )
-    smooth, slope = np.empty_like(values), np.empty_like(values)
-    gain, slope_gain = np.empty(T), np.empty(T)
-    centre = savgol_coeffs(length, order, use="dot")
-    rate = savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
-    for t in range(T):
-        first = min(max(t - half, 0), T - length)
-        at = t - first
-        if at == half:
-            weights, rates = centre, rate
-        else:
-            weights = savgol_coeffs(length, order, pos=at, use="dot")
-            rates = savgol_coeffs(length, order, deriv=1, delta=period_s, pos=at, use="dot")
-        section = values[first : first + length]
-        smooth[t], slope[t] = weights @ section, rates @ section
-        gain[t], slope_gain[t] = np.linalg.norm(weights), np.linalg.norm(rates)
+    # Near both ends a sample is not in the middle of its section.
+    first = np.clip(np.arange(T) - half, 0, T - length)
+    at = np.arange(T) - first
+
+    def filtered(**derivative: float) -> tuple[FloatArray, FloatArray]:
+        weights = [savgol_coeffs(length, order, pos=p, use="dot", **derivative) for p in range(length)]
+        found = [weights[a] @ values[f : f + length] for a, f in zip(at, first, strict=True)]
+        return np.stack(found), np.array([np.linalg.norm(w) for w in weights])[at]
+
+    smooth, gain = filtered()
+    slope, slope_gain = filtered(deriv=1, delta=period_s)
     return smooth, slope, gain, slope_gain

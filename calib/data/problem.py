@@ -19,6 +19,7 @@ import numpy.typing as npt
 from deal_hw.calib.data.noise import (
     SETTINGS,
     DataSettings,
+    Mask,
     NoiseModel,
     StartStates,
     noise_model,
@@ -60,7 +61,7 @@ class WindowData:
     start_velocity: FloatArray
     prior_mean: FloatArray
     prior_std: FloatArray
-    prior_counts: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    prior_counts: Mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +213,7 @@ class Problem:
         """Physics steps simulated so far."""
         return self._batches.steps
 
-    def part(self, chosen: Sequence[npt.NDArray[np.bool_]]) -> Problem:
+    def part(self, chosen: Sequence[Mask]) -> Problem:
         """Return the problem with only the samples under one mask per recording, (T,), usable.
 
         Noise, smoothed states and simulators are shared; nothing is estimated again.
@@ -333,9 +334,7 @@ class Problem:
             raise InsufficientDataError(problem)
         return found
 
-    def _prior(
-        self, index: int, std: FloatArray
-    ) -> tuple[FloatArray, FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    def _prior(self, index: int, std: FloatArray) -> tuple[FloatArray, FloatArray, Mask]:
         """Return the prior of each state: mean and std, (T, 2 C), and which entries count as measurements."""
         episode, C = self.episodes[index], self.coordinates
         T = len(episode.sample)
