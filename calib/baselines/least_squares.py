@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -164,9 +164,27 @@ class LeastSquaresBaseline(OneShotSearch):
 
     def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """See :meth:`OneShotSearch.solve`."""
-        space, latency_s = log.problem.space, log.coordinates.clip_latency(0.0)
-        start = rng.uniform(space.low, space.high) if self.settings.random_start else space.center
-        return _solve(log.problem, start, latency_s, log.budget.generations, self.settings)
+        problem, space, settings = log.problem, log.problem.space, self.settings
+        latency_s = log.coordinates.clip_latency(0.0)
+        start = rng.uniform(space.low, space.high) if settings.random_start else space.center
+        error = OneStep(problem, latency_s, settings.diverged)
+        ends: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), settings.tolerance)
+        ends["max_nfev"] = max(log.budget.generations, 1)
+        solution = _minimise(error, 0.0, space.to_scale(start), ends)
+        count = len(solution.fun)
+        if np.isfinite(space.prior[1]).any():
+            # Without a noise model, a prior's standard deviation is weighted by the residuals' own spread.
+            spread = float(np.sqrt(solution.fun @ solution.fun / max(count - len(space), 1)))
+            solution = _minimise(error, max(spread, np.finfo(float).tiny), solution.x, ends)
+        return FittedStart(
+            theta=np.clip(space.from_scale(solution.x), space.low, space.high),
+            covariance=textbook_covariance(space, np.asarray(solution.jac)[:count], solution.fun[:count]),
+            latency_s=latency_s,
+            iterations=int(solution.nfev),
+            message=str(solution.message),
+            source=f"textbook s^2 inv(J'J), latency {latency_s:g} s",
+            alarms=() if solution.status else (_unfinished(int(solution.nfev)),),
+        )
 
 
 def from_random_start() -> LeastSquaresBaseline:
@@ -183,30 +201,6 @@ def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: F
     information = jacobian.T @ jacobian / max(variance, np.finfo(float).tiny)
     prior = 12.0 / space.width**2 + 1.0 / space.prior[1] ** 2
     return np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
-
-
-def _solve(
-    problem: Problem, start: FloatArray, latency_s: float, iterations: int, settings: LeastSquaresSettings
-) -> FittedStart:
-    space = problem.space
-    error = OneStep(problem, latency_s, settings.diverged)
-    ends = dict.fromkeys(("ftol", "xtol", "gtol"), settings.tolerance) | {"max_nfev": max(iterations, 1)}
-    solution = _minimise(error, 0.0, space.to_scale(start), ends)
-    count = len(solution.fun)
-    if np.isfinite(space.prior[1]).any():
-        # Without a noise model, a prior's standard deviation is weighted by the residuals' own spread.
-        spread = float(np.sqrt(solution.fun @ solution.fun / max(count - len(space), 1)))
-        solution = _minimise(error, max(spread, np.finfo(float).tiny), solution.x, ends)
-    theta = np.clip(space.from_scale(solution.x), space.low, space.high)
-    return FittedStart(
-        theta=theta,
-        covariance=textbook_covariance(space, np.asarray(solution.jac)[:count], solution.fun[:count]),
-        latency_s=latency_s,
-        iterations=int(solution.nfev),
-        message=str(solution.message),
-        source=f"textbook s^2 inv(J'J), latency {latency_s:g} s",
-        alarms=() if solution.status else (_unfinished(int(solution.nfev)),),
-    )
 
 
 def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[str, Any]) -> Any:
@@ -311,43 +305,34 @@ class MultiStartLeastSquares(OneShotSearch):
 
     def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """See :meth:`OneShotSearch.solve`."""
-        drawn = log.coordinates.members(log.coordinates.sample(rng, self.settings.starts - 1))
-        nominal = log.problem.space.nominal, log.coordinates.clip_latency(0.0)
+        problem, settings = log.problem, self.settings
+        drawn = log.coordinates.members(log.coordinates.sample(rng, settings.starts - 1))
+        nominal = problem.space.nominal, log.coordinates.clip_latency(0.0)
         starts = [nominal, *zip(drawn.theta, map(float, drawn.latency_s), strict=True)]
-        return _solve_starts(log.problem, starts, self.settings, log.budget.generations)
-
-
-def _solve_starts(
-    problem: Problem,
-    starts: Sequence[tuple[FloatArray, float]],
-    settings: MultiStartSettings,
-    iterations: int,
-) -> FittedStart:
-    recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
-    parts = [p for e in problem.episodes for p in stretches(e, settings.part_s)]
-    part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
-    rough = [fit_output_error(part, *start, recipe, iterations=settings.first_iterations) for start in starts]
-    order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]
-    fits = [
-        fit_output_error(problem, rough[i].theta, rough[i].latency_s, recipe, iterations=max(iterations, 1))
-        for i in order
-    ]
-    best = min(fits, key=_score)
-    K = len(problem.space)
-    residual = np.concatenate([r.ravel() for r in best.normal.residual])
-    variance = float(residual @ residual) / max(len(residual) - K, 1)
-    # The range as a flat prior keeps insensitive parameters finite.
-    flat = np.diag(12.0 / problem.space.width**2)
-    return FittedStart(
-        theta=best.theta,
-        covariance=np.asarray(np.linalg.inv(best.normal.hessian[:K, :K] / variance + flat)),
-        latency_s=best.latency_s,
-        iterations=sum(fit.iterations for fit in (*rough, *fits)),
-        message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
-        source=f"textbook s^2 inv(J'J), best of {settings.starts} starts",
-        steps=part.steps,
-        alarms=() if best.iterations < iterations else (_unfinished(iterations),),
-    )
+        recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
+        parts = [p for e in problem.episodes for p in stretches(e, settings.part_s)]
+        part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
+        few, most = settings.first_iterations, max(log.budget.generations, 1)
+        rough = [fit_output_error(part, *start, recipe, iterations=few) for start in starts]
+        order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]
+        good = [(rough[i].theta, rough[i].latency_s) for i in order]
+        fits = [fit_output_error(problem, *start, recipe, iterations=most) for start in good]
+        best = min(fits, key=_score)
+        K = len(problem.space)
+        residual = np.concatenate([r.ravel() for r in best.normal.residual])
+        variance = float(residual @ residual) / max(len(residual) - K, 1)
+        # The range as a flat prior keeps insensitive parameters finite.
+        flat = np.diag(12.0 / problem.space.width**2)
+        return FittedStart(
+            theta=best.theta,
+            covariance=np.asarray(np.linalg.inv(best.normal.hessian[:K, :K] / variance + flat)),
+            latency_s=best.latency_s,
+            iterations=sum(fit.iterations for fit in (*rough, *fits)),
+            message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
+            source=f"textbook s^2 inv(J'J), best of {settings.starts} starts",
+            steps=part.steps,
+            alarms=() if best.iterations < most else (_unfinished(most),),
+        )
 
 
 def _unfinished(iterations: int) -> Alarm:
