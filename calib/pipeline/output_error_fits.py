@@ -236,7 +236,7 @@ class OutputErrorFits(Fits):
             searched, start = None, _member(first)
             if search:
                 rng = np.random.default_rng([seed, fold])
-                searched = run.search.run(self._reduced(train, first), run.budget, rng)
+                searched = run.attempts.search.run(self._reduced(train, first), run.budget, rng)
                 if self._better_start(train, first, searched):
                     start = searched.estimate, searched.latency_s
             return self._members(train, first, self._windows(run, train, start), searched)

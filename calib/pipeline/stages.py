@@ -133,7 +133,6 @@ class CalibrationRun:
         problem: Recordings and simulator.
         budget: Limits of the searches.
         rng: The only source of randomness.
-        search: The search.
         attempts: Runs the search on all recordings and stores its results.
         settings: Which checks to run.
         local: The local fit, if there is one.
@@ -144,7 +143,6 @@ class CalibrationRun:
     problem: Problem
     budget: Budget
     rng: np.random.Generator
-    search: CalibrationMethod[Problem]
     attempts: Restarts
     settings: Validation
     local: Refined | None = None
@@ -225,7 +223,6 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             problem=problem,
             budget=budget,
             rng=rng,
-            search=self.search,
             attempts=attempts,
             settings=self.settings,
             progress=progress,
@@ -340,7 +337,9 @@ class Refinement(Fits):
         # A fold's search needs no more generations than that on all data, and ends as early.
         generations = max(len(searched.trace), self.restarts.fewest_generations)
         less = dataclasses.replace(run.budget, generations=generations, brief=brief)
-        return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
+        return choose(
+            run.problem, run.attempts.search, less, seed, refined.shooting.length, searched.steps, robust
+        )
 
 
 def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:

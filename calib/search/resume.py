@@ -170,7 +170,7 @@ class Restarts:
     def __init__(
         self, search: CalibrationMethod[Problem], rng: np.random.Generator, store: StateStore | None
     ) -> None:
-        self._search, self._rng, self._store = search, rng, store
+        self.search, self._rng, self._store = search, rng, store
         saved = store.load() if store is not None else None
         self._states: list[State] = [] if saved is None else list(saved["searches"])
         self._done: list[tuple[Problem, int, Budget, CalibrationResult]] = []
@@ -191,7 +191,7 @@ class Restarts:
                 return result
         steps, began = problem.steps, time.perf_counter()
         kept = () if self._store is None else (self,)
-        result = self._search.run(problem, budget, self._rng, progress, *kept)
+        result = self.search.run(problem, budget, self._rng, progress, *kept)
         self.earlier_steps += result.steps - (problem.steps - steps)
         self.earlier_seconds += max(result.seconds - (time.perf_counter() - began), 0.0)
         self._done.append((problem, number, budget, result))

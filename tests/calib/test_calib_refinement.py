@@ -104,7 +104,6 @@ def test_a_search_that_ends_in_another_minimum_is_not_the_answer(noisy: Case, re
         problem=problem,
         budget=Budget(population=8, generations=1),
         rng=np.random.default_rng(0),
-        search=search,
         attempts=Restarts(search, np.random.default_rng(0), None),
         settings=UNCHECKED,
         local=best if rescued_by == "local fit" else None,
@@ -145,7 +144,6 @@ def test_new_start_states_are_tried_before_drawn_points(
         problem=problem,
         budget=Budget(population=8, generations=1),
         rng=np.random.default_rng(0),
-        search=search,
         attempts=Restarts(search, np.random.default_rng(0), None),
         settings=Validation(cross_validation=False),
     )
@@ -173,7 +171,6 @@ def test_only_the_first_search_is_brief(
         problem=problem,
         budget=Budget(population=8, generations=60),
         rng=np.random.default_rng(0),
-        search=search,
         attempts=Restarts(search, np.random.default_rng(0), None),
         settings=Validation(cross_validation=False),
     )

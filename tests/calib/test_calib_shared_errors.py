@@ -213,7 +213,6 @@ def test_a_search_that_predicts_as_well_refutes_it(
         problem=right,
         budget=Budget(population=20, generations=4),
         rng=rng,
-        search=Eki(),
         attempts=Restarts(Eki(), rng, None),
         settings=Validation(),
         progress=said.append,
