@@ -293,11 +293,6 @@ class Problem:
         episode = self.episodes[index]
         return np.concatenate([episode.position, episode.velocity], axis=1)[:, self.channels]
 
-    def channel_speed(self, index: int) -> FloatArray:
-        """Return the speed of each measured channel, (T, M); 0 for velocities."""
-        moved = self.starts[index].velocity
-        return np.concatenate([moved, np.zeros_like(moved)], axis=1)[:, self.channels]
-
     def windows(self, length: int, offset: int = 0) -> list[WindowData]:
         """Cut all episodes into windows that predict ``length`` samples, H; none starts before ``offset``.
 
@@ -313,7 +308,9 @@ class Problem:
                 problem = str(err)
                 continue
             starts = self.starts[index]
-            std = self.noise.std(self.channel_speed(index))
+            # A jitter of the sample times does not show in velocities.
+            speed = np.concatenate([starts.velocity, np.zeros_like(starts.velocity)], axis=1)
+            std = self.noise.std(speed[:, self.channels])
             if episode.reported is not None:
                 std = np.where(episode.reported[:, None], std, np.inf)
             mean, spread, counts = self._prior(index, std)

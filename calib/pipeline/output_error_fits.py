@@ -50,7 +50,7 @@ from deal_hw.calib.validation.cross_validation import (
     time_masks,
 )
 from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_split_half
-from deal_hw.calibration import Z90, Alarm, CalibrationResult
+from deal_hw.calibration import Z90, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
@@ -197,11 +197,13 @@ class OutputErrorFits(Fits):
             "split_half": split.to_json(),
             "confounded": [dataclasses.asdict(pair) for pair in found],
         }
-        known = dataclasses.replace(
-            known,
-            alarms=(*known.alarms, *self._unexplained(chi2)),
-            null_directions=tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))),
-        )
+        if chi2 > MISMATCH.chi2:
+            seconds = settings.mismatch_s or settings.long_s
+            kind = "fitted" if settings.mismatch_s else "smoothed"
+            window = f" over {seconds:g} s from {kind} start states"
+            known = known.with_alarms(last=[mismatch(chi2, window)])
+        words = dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))
+        known = dataclasses.replace(known, null_directions=tuple(words))
         return FitOutcome(
             searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
         )
@@ -299,16 +301,6 @@ class OutputErrorFits(Fits):
             return SplitHalf(note=f"a half cannot be fitted: {err}")
         both = [uncertainty_at(problem, half) for half in halves]
         return agreement(problem, fit.theta, known, [h.theta for h in halves], both, problem.steps - before)
-
-    def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
-        settings = self.settings
-        if chi2 <= MISMATCH.chi2:
-            return ()
-        seconds, kind = (
-            settings.mismatch_s or settings.long_s,
-            "fitted" if settings.mismatch_s else "smoothed",
-        )
-        return (mismatch(chi2, f" over {seconds:g} s from {kind} start states"),)
 
 
 def output_error_method() -> CalibrationPipeline:

@@ -60,11 +60,6 @@ class Coordinates:
         """Number of coordinates: K, plus one if the latency is searched."""
         return len(self.space) + (self.fixed_latency_s is None)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
-        return self.space.names + (("latency_s",) if self.fixed_latency_s is None else ())
-
     def members(self, unit: FloatArray) -> Members:
         """Map unit coordinates, (N, C), to physical values; parameters are clipped to their range."""
         K, space = len(self.space), self.space

@@ -183,9 +183,12 @@ def _fitted(residual: FloatArray, covariances: Sequence[FloatArray]) -> tuple[fl
         ]
         return float(deviance), np.array(slope), level
 
+    def cost(log_ratios: FloatArray) -> tuple[float, FloatArray]:
+        return likelihood(log_ratios)[:2]
+
     found = np.zeros(len(covariances))
     if covariances:
-        bounds = Bounds(*np.log(SETTINGS.ratio))
-        found = minimize(lambda x: likelihood(x)[:2], found, jac=True, bounds=bounds).x
+        least, most = np.log(SETTINGS.ratio)
+        found = minimize(cost, found, jac=True, bounds=Bounds(least, most)).x
     deviance, _, level = likelihood(found)
     return deviance, np.exp(found), level

@@ -195,16 +195,6 @@ class StepCheck:
     gain: float = 0.0
     note: str = ""
 
-    @property
-    def rejected(self) -> bool:
-        """Whether the recordings contradict the finer step, as simulated ones do."""
-        return self.gain < -STEP.clearly
-
-    @property
-    def preferred(self) -> bool:
-        """Whether the recordings prefer the finer step."""
-        return self.gain > STEP.clearly
-
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         if self.note:
@@ -240,7 +230,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
 
 def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: StepCheck) -> Uncertainty:
     """Return ``known`` with intervals widened by the step's shift, unless the recordings contradict it."""
-    if found.note or found.rejected:
+    if found.note or found.gain < -STEP.clearly:
         return known
     std = np.sqrt(np.diag(known.covariance)) + np.abs(found.bias[:-1]) / Z90
     known = widened_to(problem, known, theta, std)
@@ -253,7 +243,7 @@ def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: Step
 
 def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
     """Return the alarm of a step that is too coarse, if it is; ``known`` is without the step's shift."""
-    if found.note or not found.preferred:
+    if found.note or not found.gain > STEP.clearly:
         return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
     moved = np.abs(found.bias[:-1]) > half_width

@@ -11,6 +11,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.validation.time_steps import (
+    STEP,
     StepCheck,
     StepSettings,
     check_step,
@@ -90,7 +91,7 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
     assert not inside.all()
     wider = counted(problem, known, theta, found).interval
     assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
-    assert found.preferred
+    assert found.gain > STEP.clearly
     (alarm,) = step_alarm(problem, known, found)
     assert "2.5 ms is too coarse" in alarm.means and "--physics-step 0.00125" in alarm.do
     assert "hinge.armature" in alarm.seen or "hinge.damping" in alarm.seen
@@ -103,7 +104,7 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
     """The finer step explains them worse: nothing is said, no interval is widened."""
     problem, theta, known, found = checked(tmp_path, STEP_S)
-    assert found.rejected and step_alarm(problem, known, found) == ()
+    assert found.gain < -STEP.clearly and step_alarm(problem, known, found) == ()
     assert counted(problem, known, theta, found) is known
     assert np.all(known.interval[:, 0] <= TRUTH) and np.all(known.interval[:, 1] >= TRUTH)
 
