@@ -283,11 +283,11 @@ def _local_polynomials(
     first = np.clip(np.arange(T) - half, 0, T - length)
     at = np.arange(T) - first
 
-    def filtered(**derivative: float) -> tuple[FloatArray, FloatArray]:
-        weights = [savgol_coeffs(length, order, pos=p, use="dot", **derivative) for p in range(length)]
+    def filtered(deriv: int, delta: float) -> tuple[FloatArray, FloatArray]:
+        weights = [savgol_coeffs(length, order, deriv, delta, p, use="dot") for p in range(length)]
         found = [weights[a] @ values[f : f + length] for a, f in zip(at, first, strict=True)]
         return np.stack(found), np.array([np.linalg.norm(w) for w in weights])[at]
 
-    smooth, gain = filtered()
-    slope, slope_gain = filtered(deriv=1, delta=period_s)
+    smooth, gain = filtered(0, 1.0)
+    slope, slope_gain = filtered(1, period_s)
     return smooth, slope, gain, slope_gain
