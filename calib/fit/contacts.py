@@ -46,16 +46,14 @@ class ContactSettings:
 CONTACTS = ContactSettings()
 
 
-def solve_contacts(
-    shooting: Shooting, point: Point, iterations: int, *, fixed_latency: bool
-) -> tuple[Point, Normal, int]:
+def solve_contacts(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states; return the best point, its normal equations, and derivatives."""
     best, best_cost = settle(shooting, point, CONTACTS.start_iterations)
     bounds, waited, used = value_bounds(shooting.problem), 0, 0
     while used < iterations and waited <= CONTACTS.patience:
         fit = Sticking(shooting, best, CONTACTS.stretches[waited % len(CONTACTS.stretches)])
         settings = SolverSettings(iterations=iterations - used)
-        _, more = minimise(fit, best.value, bounds, settings, fixed_latency=fixed_latency)
+        _, more = minimise(fit, best.value, bounds, settings, fixed_latency=shooting.fixed_latency)
         used += max(more, 1)
         fell = best_cost - fit.best_cost
         if fell > 0:

@@ -76,7 +76,6 @@ class OutputErrorFit:
         plain: The windows, with the sensors' noise.
         weighed: The windows, with ``scale``. An uncertainty counts the residuals' correlation itself.
         point: The solver's point.
-        fixed_latency: Whether the latency was not fitted.
         central: Whether predictions are linearised by central differences, which an uncertainty needs.
     """
 
@@ -88,7 +87,6 @@ class OutputErrorFit:
     plain: Shooting
     weighed: Shooting
     point: Point
-    fixed_latency: bool
     central: bool
 
     @property
@@ -115,7 +113,7 @@ class OutputErrorFit:
         They are zero for a fixed latency. The residuals are divided by ``scale``.
         """
         normal = self.weighed.normal(self.point, keep=True, central=self.central)
-        free = np.append(np.ones(len(self.theta)), 0.0 if self.fixed_latency else 1.0)
+        free = np.append(np.ones(len(self.theta)), 0.0 if self.plain.fixed_latency else 1.0)
         left = zip(self.plain.data, self.plain.residuals(self.point), strict=True)
         return dataclasses.replace(
             normal,
@@ -148,9 +146,8 @@ def fit_output_error(
     if problem.fixed_latency_s is None:
         latency_s = float(np.clip(latency_s, *problem.latency_range_s))
     windows = longest_windows(problem, recipe.seconds)
-    plain = Shooting(
-        problem, windows[0].windows.length, data=windows, given=True, prior_share=recipe.prior_std
-    )
+    length, share = windows[0].windows.length, recipe.prior_std
+    plain = Shooting(problem, length, windows, given=True, prior_share=share, fixed_latency=fixed)
     point = plain.start(np.clip(theta, space.low, space.high), latency_s)
     left = recipe.iterations if iterations is None else iterations
     used = 0
@@ -162,13 +159,13 @@ def fit_output_error(
         solver = SolverSettings(
             iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
         )
-        point, normal, more = solve(weighed, point, solver, fixed_latency=fixed)
+        point, normal, more = solve(weighed, point, solver)
         left, used = left - max(more, 1), used + more
         if not before - normal.cost > recipe.converged * before:
             break
     weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf, correlated=False)
     return OutputErrorFit(
-        plain.theta(point), float(point.value[-1]), recipe, scale, used, plain, weighed, point, fixed, central
+        plain.theta(point), float(point.value[-1]), recipe, scale, used, plain, weighed, point, central
     )
 
 
@@ -219,5 +216,4 @@ def _weighed(
         weight = huber_weights(error / scale) if recipe.robust else np.ones_like(error)
         std = np.where(reported, scale * np.sqrt(correlation / weight), np.inf)
         data.append(dataclasses.replace(d, std=std))
-    share = plain.prior_share if prior_share is None else prior_share
-    return Shooting(problem, plain.length, data=data, given=True, prior_share=share), scale
+    return plain.on(data, prior_share=prior_share), scale

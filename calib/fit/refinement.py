@@ -129,26 +129,24 @@ def refine(
     space, settings = problem.space, SETTINGS
     theta = np.clip(theta, space.low, space.high)
     stages_s = stages_s or window_stages(problem)
-    fixed_latency = problem.fixed_latency_s is not None
-    if problem.noise_free:
-        if shake and not fixed_latency:
-            theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
-        # The latency of a simulated target is a whole number of steps.
-        fixed_latency = True
+    if problem.noise_free and shake and problem.fixed_latency_s is None:
+        theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
     result: Refined | None = None
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
     done = 0
     for seconds in stages_s:
         try:
-            shooting = Shooting(problem, samples_in(problem, seconds))
+            # The latency of a simulated target is a whole number of steps.
+            fixed = True if problem.noise_free else None
+            shooting = Shooting(problem, samples_in(problem, seconds), fixed_latency=fixed)
         except InsufficientDataError:
             if result is None:
                 raise
             break
         point = shooting.start(theta, latency_s, states)
         if shooting.contacts:
-            point, normal, used = _with_contacts(shooting, point, iterations, fixed_latency, shake, rng)
+            point, normal, used = _with_contacts(shooting, point, iterations, shake, rng)
         elif shooting.given:
             point, normal, used = _from_known_states(
                 shooting, point, iterations, settings.rounds if shake else 0
@@ -156,17 +154,17 @@ def refine(
         else:
             told = None
             if notify_step is not None:
-                told = partial(_tell, notify_step, shooting, done, fixed_latency)
-            point, normal, used = _solved(shooting, point, iterations, fixed_latency, hopeless, told)
+                told = partial(_tell, notify_step, shooting, done)
+            point, normal, used = _solved(shooting, point, iterations, hopeless, told)
         done += used
-        found = _refined(shooting, point, normal, done, fixed_latency)
+        found = _refined(shooting, point, normal, done)
         if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
             break
         result, theta, latency_s = found, found.theta, found.latency_s
         if not shooting.given:
             states = shooting.states(point)
         if notify is not None:
-            _tell(notify, shooting, done, fixed_latency, point, normal)
+            _tell(notify, shooting, done, point, normal)
         if not found.chi2 < hopeless:
             break
     if result is None:
@@ -181,12 +179,10 @@ def window_stages(problem: Problem) -> tuple[float, ...]:
     return SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
 
 
-def refine_windows(
-    shooting: Shooting, point: Point, iterations: int = 6, fixed_latency: bool = False
-) -> Refined:
+def refine_windows(shooting: Shooting, point: Point, iterations: int) -> Refined:
     """Refine from a point in its own windows, such as a part of all windows or weighted ones."""
-    point, normal, used = _solved(shooting, point, iterations, fixed_latency)
-    return _refined(shooting, point, normal, used, fixed_latency)
+    point, normal, used = _solved(shooting, point, iterations)
+    return _refined(shooting, point, normal, used)
 
 
 def _clear_gains(notify: Callable[[Refined], None]) -> Callable[[Refined], None]:
@@ -205,15 +201,10 @@ def _clear_gains(notify: Callable[[Refined], None]) -> Callable[[Refined], None]
 
 
 def _tell(
-    notify: Callable[[Refined], None],
-    shooting: Shooting,
-    done: int,
-    fixed_latency: bool,
-    point: Point,
-    normal: Normal,
+    notify: Callable[[Refined], None], shooting: Shooting, done: int, point: Point, normal: Normal
 ) -> None:
     """Report an intermediate fit; a diverged one is none."""
-    found = _refined(shooting, point, normal, done, fixed_latency)
+    found = _refined(shooting, point, normal, done)
     if np.isfinite(found.chi2):
         notify(found)
 
@@ -222,27 +213,26 @@ def _solved(
     shooting: Shooting,
     point: Point,
     iterations: int,
-    fixed_latency: bool,
     hopeless: float = np.inf,
     notify: Callable[[Point, Normal], None] | None = None,
 ) -> tuple[Point, Normal, int]:
     if shooting.contacts:
-        return solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
+        return solve_contacts(shooting, point, iterations)
     solver = SolverSettings(iterations=iterations, hopeless=hopeless)
-    return solve(shooting, point, solver, fixed_latency=fixed_latency, notify=notify)
+    return solve(shooting, point, solver, notify)
 
 
-def _refined(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Refined:
-    chi2 = normal.cost / _degrees(shooting, normal, fixed_latency)
+def _refined(shooting: Shooting, point: Point, normal: Normal, used: int) -> Refined:
+    chi2 = normal.cost / _degrees(shooting, normal)
     return Refined(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
 
 
-def _degrees(shooting: Shooting, normal: Normal, fixed_latency: bool) -> int:
+def _degrees(shooting: Shooting, normal: Normal) -> int:
     """Return the residuals' degrees of freedom; at least 1."""
-    return max(normal.count - len(shooting.problem.space) - (not fixed_latency), 1)
+    return max(normal.count - len(shooting.problem.space) - (not shooting.fixed_latency), 1)
 
 
-def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
+def refine_robust(refined: Refined) -> Refined:
     """Continue a refinement, in its windows, with less weight on large residuals.
 
     The windows' standard deviations are divided by the roots of the weights. So normal equations, intervals
@@ -254,11 +244,9 @@ def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
             dataclasses.replace(d, std=d.std / np.sqrt(huber_weights(r)))
             for d, r in zip(plain.data, plain.residuals(found.point), strict=True)
         ]
-        found = refine_windows(
-            plain.on(data), found.point, SETTINGS.robust_iterations, fixed_latency=fixed_latency
-        )
+        found = refine_windows(plain.on(data), found.point, SETTINGS.robust_iterations)
         iterations += found.iterations
-    chi2 = plain.cost(found.point) / _degrees(plain, found.normal, fixed_latency)
+    chi2 = plain.cost(found.point) / _degrees(plain, found.normal)
     return dataclasses.replace(found, chi2=chi2, iterations=iterations)
 
 
@@ -280,8 +268,7 @@ def at_parameters(
         normal = shooting.normal(point)
     else:
         point, normal = converged(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
-    found = _refined(shooting, point, normal, 0, problem.fixed_latency_s is not None)
-    return dataclasses.replace(found, theta=theta, latency_s=latency_s)
+    return dataclasses.replace(_refined(shooting, point, normal, 0), theta=theta, latency_s=latency_s)
 
 
 def _whole_step(
@@ -295,7 +282,7 @@ def _whole_step(
     low, high = (round(v / step_s) for v in problem.latency_range_s)
     nearest = round(latency_s / step_s)
     beside = sorted((nearest - 1, nearest + 1), key=lambda tick: abs(tick * step_s - latency_s))
-    shooting = Shooting(problem, samples_in(problem, seconds))
+    shooting = Shooting(problem, samples_in(problem, seconds), fixed_latency=True)
     best, least = (theta, nearest * step_s), np.inf
     for tick in (nearest, *(t for t in beside if low <= t <= high)):
         start = shooting.start(theta, tick * step_s)
@@ -323,13 +310,12 @@ def _from_known_states(
     median (Cauchy's weights). The solution then rests on windows that can be explained.
     """
     settings = SETTINGS
-    point, normal, used = solve(plain, point, SolverSettings(iterations=iterations), fixed_latency=True)
+    point, normal, used = solve(plain, point, SolverSettings(iterations=iterations))
     for _ in range(rounds):
         if _most(normal) < settings.given_chi2:
             break
         weighed, before = plain.on(cauchy_windows(plain.data, normal.residual)), point.value
-        solver = SolverSettings(iterations=settings.round_iterations)
-        point, _, more = solve(weighed, point, solver, fixed_latency=True)
+        point, _, more = solve(weighed, point, SolverSettings(iterations=settings.round_iterations))
         used += more
         normal = plain.normal(point)
         if np.max(np.abs(point.value - before)) < settings.given_still:
@@ -338,22 +324,17 @@ def _from_known_states(
 
 
 def _with_contacts(
-    shooting: Shooting,
-    point: Point,
-    iterations: int,
-    fixed_latency: bool,
-    shake: bool,
-    rng: np.random.Generator,
+    shooting: Shooting, point: Point, iterations: int, shake: bool, rng: np.random.Generator
 ) -> tuple[Point, Normal, int]:
     """Solve; while the residual is unexplained, draw other start states and solve again."""
     settings = SETTINGS
-    point, normal, used = _solved(shooting, point, iterations, fixed_latency)
+    point, normal, used = _solved(shooting, point, iterations)
     for spread in settings.shakes if shake else ():
-        if normal.cost / _degrees(shooting, normal, fixed_latency) < settings.explained:
+        if normal.cost / _degrees(shooting, normal) < settings.explained:
             break
         before = normal.cost
         point = shooting.shaken(point, spread, settings.shake_count, rng)
-        point, normal, more = _solved(shooting, point, iterations, fixed_latency)
+        point, normal, more = _solved(shooting, point, iterations)
         used += more
         if normal.cost > settings.shaken * before:
             break

@@ -128,7 +128,8 @@ class Shooting:
 
     Start states are ``given``, the smoothed ones, or each is an unknown; exact states are always given.
     ``prior_share`` is the spread of parameters around their nominal values as a share of their range, in
-    their own scale; infinite to use their own priors only.
+    their own scale; infinite to use their own priors only. A ``fixed_latency`` stays as it is in all steps;
+    by default one that the problem gives.
     """
 
     def __init__(
@@ -139,8 +140,10 @@ class Shooting:
         *,
         given: bool = False,
         prior_share: float = np.inf,
+        fixed_latency: bool | None = None,
     ) -> None:
         self.problem = problem
+        self.fixed_latency = problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency
         self.given = given or problem.noise_free
         self.prior_share = prior_share
         self.data: Sequence[WindowData] = problem.windows(length) if data is None else data
@@ -176,9 +179,19 @@ class Shooting:
         """Whether sticking and slipping feet make kinks in the effect of start states."""
         return self.problem.robot.base is not None and not self.given
 
-    def on(self, data: Sequence[WindowData]) -> Shooting:
+    def on(
+        self,
+        data: Sequence[WindowData],
+        *,
+        prior_share: float | None = None,
+        fixed_latency: bool | None = None,
+    ) -> Shooting:
         """Return the same fit of other windows, such as a part of these, or weighted ones."""
-        return Shooting(self.problem, self.length, data=data, given=self.given, prior_share=self.prior_share)
+        share = self.prior_share if prior_share is None else prior_share
+        fixed = self.fixed_latency if fixed_latency is None else fixed_latency
+        return Shooting(
+            self.problem, self.length, data, given=self.given, prior_share=share, fixed_latency=fixed
+        )
 
     def start(self, theta: FloatArray, latency_s: float, states: States | None = None) -> Point:
         """Return the point at parameters (K,) and latency [s].

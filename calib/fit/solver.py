@@ -146,8 +146,6 @@ def solve(
     shooting: Shooting,
     point: Point,
     settings: SolverSettings,
-    *,
-    fixed_latency: bool,
     notify: Callable[[Point, Normal], None] | None = None,
 ) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states.
@@ -161,7 +159,7 @@ def solve(
     # shows that this is the end.
     while True:
         fit = _Following(shooting, point, normal, notify)
-        value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
+        value, more = minimise(fit, point.value, bounds, settings, fixed_latency=shooting.fixed_latency)
         point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
         used += max(more, 1)
         gained = normal.cost < before * (1 - settings.gain)

@@ -415,7 +415,7 @@ def conclude_fit(
         refined = whole.refined[whole.best]
     decided = whole is not None or problem.fixed_latency_s is not None
     if choice is not None and choice.chosen == "robust refinement":
-        refined = refine_robust(refined, decided)
+        refined = refine_robust(refined)
     refined = with_rows(refined)
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:

@@ -103,7 +103,7 @@ def choose(
             "refinement": (refined.theta, refined.latency_s),
         }
         if robust:
-            weighed = refine_robust(refined, problem.fixed_latency_s is not None)
+            weighed = refine_robust(refined)
             found["robust refinement"] = weighed.theta, weighed.latency_s
         return found
 

@@ -144,9 +144,7 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
         block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
     estimates, halves = [], []
     for half in range(2):
-        found = refine_windows(
-            *half_of(shooting, refined.point, half, block), SETTINGS.iterations, fixed_latency=True
-        )
+        found = refine_windows(*half_of(shooting, refined.point, half, block), SETTINGS.iterations)
         own = uncertainty_at(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: the clustering of all blocks holds for it, too.
         std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
@@ -206,7 +204,7 @@ def widened_by_split_half(
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
     """Return every other block of the windows, from block ``half``, and the point in them.
 
-    The count of windows continues over recordings.
+    The count of windows continues over recordings. The latency is fixed.
     """
     data, position, velocity, first = [], [], [], 0
     for e, of_episode in enumerate(shooting.data):
@@ -217,7 +215,7 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
             data.append(taken(of_episode, mine))
             position.append(point.position[e][mine])
             velocity.append(point.velocity[e][mine])
-    return shooting.on(data), Point(point.value, tuple(position), tuple(velocity))
+    return shooting.on(data, fixed_latency=True), Point(point.value, tuple(position), tuple(velocity))
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:

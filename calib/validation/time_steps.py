@@ -21,7 +21,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import Uncertainty, intervals, widened_to
 from deal_hw.calib.fit.refinement import Refined, refine_windows
-from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
+from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
 from deal_hw.types import FloatArray
 
@@ -108,10 +108,11 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
         # The given refinement is at a whole tick, with more iterations than its neighbours get.
         found[centre] = refined
     waiting = [t for t in range(centre - reach, centre + reach + 1) if low <= t <= high and t not in found]
+    shooting = refined.shooting.on(refined.shooting.data, fixed_latency=True)
     while waiting and len(found) < SCAN.most:
         t = waiting.pop(0)
-        start = _at_latency(refined, t * tick)
-        found[t] = refine_windows(refined.shooting, start, iterations, fixed_latency=True)
+        start = shooting.followed(refined.point, refined.normal, _latency_step(refined, t * tick))
+        found[t] = refine_windows(shooting, start, iterations)
         if progress is not None:
             progress(
                 Progress(
@@ -132,11 +133,11 @@ def _information(refined: Refined) -> FloatArray:
     return np.asarray(refined.normal.hessian + np.diag(prior))
 
 
-def _at_latency(refined: Refined, latency_s: float) -> Point:
-    """Return where a fit ends at another latency, were its predictions straight in everything."""
+def _latency_step(refined: Refined, latency_s: float) -> FloatArray:
+    """Return the step to where a fit ends at another latency, were its predictions straight, (K + 1,)."""
     information, shift = _information(refined), latency_s - refined.latency_s
     others = -np.linalg.solve(information[:-1, :-1], information[:-1, -1]) * shift
-    return refined.shooting.followed(refined.point, refined.normal, np.append(others, shift))
+    return np.append(others, shift)
 
 
 def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:

@@ -125,9 +125,9 @@ def test_robust_refinement_shrugs_off_wild_samples(
     point = shooting.start(
         noisy_refined.theta, noisy.latency_s, noisy_refined.shooting.states(noisy_refined.point)
     )
-    plain = refine_windows(shooting, point, 6, fixed_latency=True)
+    plain = refine_windows(shooting, point, 6)
     assert kurtosis(plain.normal.residual) > 6.0
-    robust = refine_robust(plain, fixed_latency=True)
+    robust = refine_robust(plain)
     scaled = [spoilt.space.to_scale(p.theta) for p in (noisy_refined, plain, robust)]
     assert np.linalg.norm(scaled[2] - scaled[0]) < 0.5 * np.linalg.norm(scaled[1] - scaled[0])
     # What it leaves out of the loss it does not leave out of the verdict.

@@ -58,6 +58,6 @@ def test_a_scan_of_the_latency_ends_where_each_tick_fitted_alone_ends(
     tick_s = problem.episodes[0].step_s
     for tick, found in zip(scan.ticks, scan.refined, strict=True):
         start = free.shooting.start(free.theta, tick * tick_s)
-        alone = refine_windows(free.shooting, start, 10, fixed_latency=True)
+        alone = refine_windows(free.shooting.on(free.shooting.data, fixed_latency=True), start, 10)
         assert found.normal.cost == pytest.approx(alone.normal.cost, rel=2e-3)
     assert scan.ticks[scan.best] == 3
