@@ -354,8 +354,7 @@ def _scaled_together(
     factor = np.array([1.0 + std * (p.kind in kinds) for p in space])
     moved = space.to_scale(theta * factor)
     along = moved - space.to_scale(theta)
-    covariance = known.covariance.copy()
-    covariance[: len(along), : len(along)] += np.outer(along, along)
+    covariance = known.covariance + np.outer(along, along)
     at, ends = space.to_scale(theta), space.to_scale(known.interval.T)
     sides = np.sign(ends - at) * np.hypot(ends - at, Z90 * along)
     interval = np.stack(list(space.from_scale(at + sides)), axis=1)
@@ -366,8 +365,7 @@ def _including(problem: Problem, known: Uncertainty, theta: FloatArray, other: F
     """Widen intervals and covariance to include another estimate, (K,)."""
     apart = problem.space.to_scale(other) - problem.space.to_scale(theta)
     low, high = known.interval.T
-    covariance = known.covariance.copy()
-    covariance[: len(apart), : len(apart)] += np.outer(apart, apart)
+    covariance = known.covariance + np.outer(apart, apart)
     interval = np.stack([np.minimum(low, other), np.maximum(high, other)], axis=1)
     return dataclasses.replace(known, interval=interval, covariance=covariance)
 

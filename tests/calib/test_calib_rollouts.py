@@ -202,7 +202,7 @@ def test_whitening_takes_out_a_wrong_start_state(ideal: Case, problem: Problem) 
 def test_coordinates_map_the_cube_to_ranges_and_back(problem: Problem) -> None:
     """Corners of the unit cube are those of the ranges; the latency reaches past its own by the margin."""
     coordinates = Coordinates(problem)
-    assert coordinates.names[-1] == "latency_s"
+    assert coordinates.count == len(problem.space) + 1
     corners = coordinates.members(np.stack([np.zeros(10), np.ones(10)]))
     np.testing.assert_allclose(corners.theta, [problem.space.low, problem.space.high])
     np.testing.assert_allclose(corners.latency_s, [-0.004, 0.044])
