@@ -93,9 +93,11 @@ MISMATCH, SETTINGS = MismatchSettings(), IntervalSettings()
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Uncertainty of parameters and latency.
+    """Uncertainty of an estimate of parameters and latency.
 
     Attributes:
+        space: The parameters.
+        theta: The estimate, (K,).
         covariance: Of the parameters in their own scale, (K, K).
         interval: 90 % intervals, physical, (K, 2).
         latency_interval_s: 90 % interval of the latency [s].
@@ -110,6 +112,8 @@ class Uncertainty:
         widened: Factor of clustering on each parameter's interval, (K,).
     """
 
+    space: ParameterSpace
+    theta: FloatArray
     covariance: FloatArray
     interval: FloatArray
     latency_interval_s: tuple[float, float]
@@ -125,6 +129,22 @@ class Uncertainty:
     def with_alarms(self, *first: Alarm, last: Sequence[Alarm] = ()) -> Uncertainty:
         """Return it with more alarms, before and after its own."""
         return dataclasses.replace(self, alarms=(*first, *self.alarms, *last))
+
+    def widened_to(self, std: FloatArray) -> Uncertainty:
+        """Return it with standard deviations of at least ``std``, (K,), correlations kept.
+
+        They are in each parameter's own scale.
+        """
+        own = np.sqrt(np.diag(self.covariance))
+        factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)
+        covariance = self.covariance * np.outer(factor, factor)
+        return dataclasses.replace(
+            self,
+            covariance=covariance,
+            interval=intervals(self.space, self.theta, covariance, self.blind, self.bound),
+            verdicts=_verdicts(self.space, np.sqrt(np.diag(covariance)), self.blind),
+            widened=self.widened * factor,
+        )
 
 
 def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:
@@ -200,6 +220,8 @@ def uncertainty(
         latency = (latency_s, latency_s)
     blind |= std[:K] > SETTINGS.blind_share * np.sqrt(flat[:K])
     return Uncertainty(
+        space=space,
+        theta=theta,
         covariance=covariance[:K, :K],
         interval=intervals(space, theta, covariance[:K, :K], blind, bound),
         latency_interval_s=latency,
@@ -418,21 +440,4 @@ def uncertainty_at(
         fixed_latency=problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency,
         timing_std_s=0.0 if noise else problem.noise.timing_std_s,
         kinks=SETTINGS.kinks if smooth else SETTINGS.contact_kinks,
-    )
-
-
-def widened_to(problem: Problem, known: Uncertainty, theta: FloatArray, std: FloatArray) -> Uncertainty:
-    """Return ``known`` with standard deviations of at least ``std``, (K,), correlations kept.
-
-    They are in each parameter's own scale; ``theta``, (K,), is the estimate.
-    """
-    own = np.sqrt(np.diag(known.covariance))
-    factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)
-    covariance = known.covariance * np.outer(factor, factor)
-    return dataclasses.replace(
-        known,
-        covariance=covariance,
-        interval=intervals(problem.space, theta, covariance, known.blind, known.bound),
-        verdicts=_verdicts(problem.space, np.sqrt(np.diag(covariance)), known.blind),
-        widened=known.widened * factor,
     )

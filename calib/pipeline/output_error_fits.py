@@ -164,16 +164,16 @@ class OutputErrorFits(Fits):
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
         known = uncertainty_at(problem, fit)
         split = self._split_half(problem, fit, recipe, known)
-        known = widened_by_split_half(problem, known, theta, split)
+        known = widened_by_split_half(known, split)
         if settings.hold_first:
-            known = _including(problem, known, theta, first.theta)
+            known = _including(known, first.theta)
         for kinds, std in settings.common_std:
-            known = _scaled_together(problem, known, theta, kinds, std)
+            known = _scaled_together(known, kinds, std)
         facts: dict[str, Any] = {}
         if run.local is not None:
             # With fitted start states the residual shows model error, not smoothing error.
             local = with_rows(run.local)
-            known, facts["physics_step"] = with_step(run.problem, local, known, theta)
+            known, facts["physics_step"] = with_step(run.problem, local, known)
         chi2, left = fit.chi2, None
         if settings.mismatch_s:
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
@@ -300,7 +300,7 @@ class OutputErrorFits(Fits):
         except InsufficientDataError as err:
             return SplitHalf(note=f"a half cannot be fitted: {err}")
         both = [uncertainty_at(problem, half) for half in halves]
-        return agreement(problem, fit.theta, known, [h.theta for h in halves], both, problem.steps - before)
+        return agreement(known, [h.theta for h in halves], both, problem.steps - before)
 
 
 def output_error_method() -> CalibrationPipeline:
@@ -346,24 +346,21 @@ def gait() -> CalibrationPipeline:
     return CalibrationPipeline(nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
 
-def _scaled_together(
-    problem: Problem, known: Uncertainty, theta: FloatArray, kinds: Container[str], std: float
-) -> Uncertainty:
+def _scaled_together(known: Uncertainty, kinds: Container[str], std: float) -> Uncertainty:
     """Add a common relative error ``std`` of all parameters of these kinds to what is known."""
-    space = problem.space
+    space, at = known.space, known.space.to_scale(known.theta)
     factor = np.array([1.0 + std * (p.kind in kinds) for p in space])
-    moved = space.to_scale(theta * factor)
-    along = moved - space.to_scale(theta)
+    along = space.to_scale(known.theta * factor) - at
     covariance = known.covariance + np.outer(along, along)
-    at, ends = space.to_scale(theta), space.to_scale(known.interval.T)
+    ends = space.to_scale(known.interval.T)
     sides = np.sign(ends - at) * np.hypot(ends - at, Z90 * along)
     interval = np.stack(list(space.from_scale(at + sides)), axis=1)
     return dataclasses.replace(known, interval=interval, covariance=covariance)
 
 
-def _including(problem: Problem, known: Uncertainty, theta: FloatArray, other: FloatArray) -> Uncertainty:
+def _including(known: Uncertainty, other: FloatArray) -> Uncertainty:
     """Widen intervals and covariance to include another estimate, (K,)."""
-    apart = problem.space.to_scale(other) - problem.space.to_scale(theta)
+    apart = known.space.to_scale(other) - known.space.to_scale(known.theta)
     low, high = known.interval.T
     covariance = known.covariance + np.outer(apart, apart)
     interval = np.stack([np.minimum(low, other), np.maximum(high, other)], axis=1)

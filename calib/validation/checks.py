@@ -14,7 +14,6 @@ from deal_hw.calib.validation.split_half import check_split_half, widened_by_spl
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calibration import Alarm
 from deal_hw.parameters import LONGEST_LATENCY_S
-from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,26 +110,24 @@ def judge(
             "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
         }
     if settings.physics_step:
-        known, facts["physics_step"] = with_step(problem, refined, known, refined.theta)
+        known, facts["physics_step"] = with_step(problem, refined, known)
     if settings.split_half:
         split = check_split_half(problem, refined, known)
-        known = widened_by_split_half(problem, known, refined.theta, split)
+        known = widened_by_split_half(known, split)
         facts["split_half"] = split.to_json()
     if settings.diagnosis and unexplained(refined):
         known, facts["diagnosis"] = with_causes(problem, refined, known, fitted)
     return known, facts
 
 
-def with_step(
-    problem: Problem, refined: Refined, known: Uncertainty, theta: FloatArray
-) -> tuple[Uncertainty, dict[str, Any]]:
+def with_step(problem: Problem, refined: Refined, known: Uncertainty) -> tuple[Uncertainty, dict[str, Any]]:
     """Check the physics step; return the updated uncertainty and the result as plain JSON values.
 
-    ``refined`` has linearised residuals; ``theta``, (K,), is the estimate of ``known``.
+    ``refined`` has linearised residuals.
     """
     step = check_step(problem, refined)
-    alarms = step_alarm(problem, known, step)
-    return counted(problem, known, theta, step).with_alarms(last=alarms), step.to_json()
+    alarms = step_alarm(known, step)
+    return counted(problem, known, step).with_alarms(last=alarms), step.to_json()
 
 
 def with_causes(

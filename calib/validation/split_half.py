@@ -15,7 +15,7 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
 from deal_hw.calib.data.problem import Problem, taken
-from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, widened_to, with_rows
+from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calibration import Z90, Alarm, listed
@@ -149,20 +149,15 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
         # A half holds few blocks: the clustering of all blocks holds for it, too.
         std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
         estimates.append(found.theta)
-        halves.append(widened_to(problem, own, found.theta, std))
-    return agreement(problem, refined.theta, known, estimates, halves, problem.steps - before)
+        halves.append(own.widened_to(std))
+    return agreement(known, estimates, halves, problem.steps - before)
 
 
 def agreement(
-    problem: Problem,
-    theta: FloatArray,
-    known: Uncertainty,
-    estimates: Sequence[FloatArray],
-    halves: Sequence[Uncertainty],
-    steps: int,
+    known: Uncertainty, estimates: Sequence[FloatArray], halves: Sequence[Uncertainty], steps: int
 ) -> SplitHalf:
-    """Return whether two halves agree, given estimates, (K,), and uncertainties of all data and halves."""
-    space = problem.space
+    """Return whether two halves agree, from their estimates, (K,) each, and from what is known of all data."""
+    space = known.space
 
     def three(half: int, k: int) -> tuple[float | None, float, float]:
         estimate, (low, high) = float(estimates[half][k]), map(float, halves[half].interval[k])
@@ -182,23 +177,21 @@ def agreement(
     power, count = float(np.sum(compared**2)), len(compared)
     by_chance = not count or power <= chi2_law.ppf(1 - SETTINGS.false_alarms, count)
     scale = 1.0 if by_chance else float(np.sqrt(power / count))
-    reach = np.max(np.abs(scaled - space.to_scale(theta)), axis=0)
+    reach = np.max(np.abs(scaled - space.to_scale(known.theta)), axis=0)
     return SplitHalf(rows, flagged, reach, scale, steps)
 
 
-def widened_by_split_half(
-    problem: Problem, known: Uncertainty, theta: FloatArray, split: SplitHalf
-) -> Uncertainty:
+def widened_by_split_half(known: Uncertainty, split: SplitHalf) -> Uncertainty:
     """Return ``known`` with all intervals wider by the scale of the halves' distance.
 
     Those of flagged parameters hold the estimates of both halves.
     """
     if not split.flagged and split.scale == 1.0:
         return known
-    flagged = np.array([name in split.flagged for name in problem.space.names])
+    flagged = np.array([name in split.flagged for name in known.space.names])
     std = split.scale * np.sqrt(np.diag(known.covariance))
-    wider = widened_to(problem, known, theta, np.maximum(std, np.where(flagged, split.reach / Z90, 0.0)))
-    return wider.with_alarms(last=split.alarms(problem.space))
+    wider = known.widened_to(np.maximum(std, np.where(flagged, split.reach / Z90, 0.0)))
+    return wider.with_alarms(last=split.alarms(known.space))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:

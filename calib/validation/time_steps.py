@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import Uncertainty, intervals, widened_to
+from deal_hw.calib.fit.intervals import Uncertainty, intervals
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
@@ -142,8 +142,8 @@ def _latency_step(refined: Refined, latency_s: float) -> FloatArray:
 
 def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:
     """Widen the uncertainty at the best latency by the spread over the plausible latencies."""
-    space, tick = problem.space, problem.episodes[0].step_s
-    center = space.to_scale(scan.refined[scan.best].theta)
+    space, tick = best.space, problem.episodes[0].step_s
+    center = space.to_scale(best.theta)
     covariance = np.zeros_like(best.covariance)
     for weight, refined in zip(scan.weights, scan.refined, strict=True):
         shift = space.to_scale(refined.theta) - center
@@ -157,7 +157,7 @@ def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertai
     return dataclasses.replace(
         best,
         covariance=covariance,
-        interval=intervals(space, scan.refined[scan.best].theta, covariance, best.blind, best.bound),
+        interval=intervals(space, best.theta, covariance, best.blind, best.bound),
         latency_interval_s=(max(latency - half, low), min(latency + half, high)),
     )
 
@@ -229,12 +229,12 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
     return StepCheck(step_s, 2.0 * (finer_where - where), cost - finer_cost)
 
 
-def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: StepCheck) -> Uncertainty:
+def counted(problem: Problem, known: Uncertainty, found: StepCheck) -> Uncertainty:
     """Return ``known`` with intervals widened by the step's shift, unless the recordings contradict it."""
     if found.note or found.gain < -STEP.clearly:
         return known
     std = np.sqrt(np.diag(known.covariance)) + np.abs(found.bias[:-1]) / Z90
-    known = widened_to(problem, known, theta, std)
+    known = known.widened_to(std)
     (first, last), (low, high) = problem.latency_range_s, known.latency_interval_s
     if low == high:
         return known
@@ -242,13 +242,13 @@ def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: Step
     return dataclasses.replace(known, latency_interval_s=(max(low - more, first), min(high + more, last)))
 
 
-def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
+def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
     """Return the alarm of a step that is too coarse, if it is; ``known`` is without the step's shift."""
     if found.note or not found.gain > STEP.clearly:
         return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
     moved = np.abs(found.bias[:-1]) > half_width
-    names = [n for n, m, b in zip(problem.space.names, moved, known.blind, strict=True) if m and not b]
+    names = [n for n, m, b in zip(known.space.names, moved, known.blind, strict=True) if m and not b]
     if not names:
         return ()
     return (

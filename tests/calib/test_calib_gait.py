@@ -38,11 +38,13 @@ def problem() -> Problem:
     return cast("Problem", _OfSpace(walk_space()))
 
 
-def known_at(theta: np.ndarray) -> Uncertainty:
+def known_at(space: ParameterSpace, theta: np.ndarray) -> Uncertainty:
     """Return an uncertainty with independent parameters, each known to a share."""
     half = np.exp(Z90 * SHARE)
     K = len(theta)
     return Uncertainty(
+        space=space,
+        theta=theta,
         covariance=SHARE**2 * np.eye(K),
         interval=np.stack([theta / half, theta * half], axis=1),
         latency_interval_s=(0.0, 0.01),
@@ -60,7 +62,7 @@ def known_at(theta: np.ndarray) -> Uncertainty:
 def test_forces_that_may_be_off_together_widen_what_scales_with_them(problem: Problem) -> None:
     """Gains by the root of both squares, and they move together; the floor's friction stays."""
     space, theta = problem.space, problem.space.nominal
-    wider = _scaled_together(problem, known_at(theta), theta, FORCES, 0.05)
+    wider = _scaled_together(known_at(space, theta), FORCES, 0.05)
     half = np.log(wider.interval[:, 1] / theta)
     for k, p in enumerate(space):
         wanted = np.hypot(SHARE, np.log(1.05)) if p.kind in FORCES else SHARE
@@ -80,11 +82,11 @@ def test_a_walk_may_be_wrong_about_the_floor(problem: Problem) -> None:
 
 def test_intervals_hold_what_other_windows_found(problem: Problem) -> None:
     """An estimate far outside moves one end to it; one inside moves none."""
-    theta = problem.space.nominal
+    space, theta = problem.space, problem.space.nominal
     other = theta.copy()
     other[0], other[1] = 1.5 * theta[0], 1.001 * theta[1]
-    before = known_at(theta)
-    after = _including(problem, before, theta, other)
+    before = known_at(space, theta)
+    after = _including(before, other)
     assert after.interval[0, 1] == pytest.approx(other[0])
     np.testing.assert_allclose(after.interval[1:], before.interval[1:])
     assert after.covariance[0, 0] == pytest.approx(SHARE**2 + np.log(1.5) ** 2)

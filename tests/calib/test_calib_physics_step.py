@@ -19,7 +19,6 @@ from deal_hw.calib.validation.time_steps import (
     halved,
     step_alarm,
 )
-from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -60,8 +59,8 @@ def recording(step_s: float) -> str:
 
 def checked(
     folder: Path, step_s: float, settings: StepSettings | None = None
-) -> tuple[Problem, FloatArray, Uncertainty, StepCheck]:
-    """Return problem, estimate, what is known and what half the step says, of data with a step."""
+) -> tuple[Problem, Uncertainty, StepCheck]:
+    """Return problem, what is known and what half the step says, of data with a step."""
     (folder / "hinge.xml").write_text(HINGE.format(step=STEP_S, damping="0.07", armature="0.003"))
     (folder / "params.yaml").write_text(PARAMETERS)
     (folder / "data.csv").write_text(recording(step_s))
@@ -78,7 +77,6 @@ def checked(
     fit = with_rows(fit)
     return (
         problem,
-        fit.theta,
         uncertainty_at(problem, fit, fixed_latency=True),
         check_step(problem, fit, settings),
     )
@@ -86,34 +84,34 @@ def checked(
 
 def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
     """Truth with a step of 0.1 ms, model with 2.5: the interval misses it, the counted one holds it."""
-    problem, theta, known, found = checked(tmp_path, 1e-4)
+    problem, known, found = checked(tmp_path, 1e-4)
     inside = (known.interval[:, 0] <= TRUTH) & (known.interval[:, 1] >= TRUTH)
     assert not inside.all()
-    wider = counted(problem, known, theta, found).interval
+    wider = counted(problem, known, found).interval
     assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
     assert found.gain > STEP.clearly
-    (alarm,) = step_alarm(problem, known, found)
+    (alarm,) = step_alarm(known, found)
     assert "2.5 ms is too coarse" in alarm.means and "--physics-step 0.00125" in alarm.do
     assert "hinge.armature" in alarm.seen or "hinge.damping" in alarm.seen
     # Half the error is removed by half the step: corrected, the estimate is nearer the truth.
-    corrected = problem.space.from_scale(problem.space.to_scale(theta) + found.bias[:-1])
-    off, was = (np.abs(np.log(value / TRUTH)).max() for value in (corrected, theta))
+    corrected = problem.space.from_scale(problem.space.to_scale(known.theta) + found.bias[:-1])
+    off, was = (np.abs(np.log(value / TRUTH)).max() for value in (corrected, known.theta))
     assert off < 0.5 * was
 
 
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
     """The finer step explains them worse: nothing is said, no interval is widened."""
-    problem, theta, known, found = checked(tmp_path, STEP_S)
-    assert found.gain < -STEP.clearly and step_alarm(problem, known, found) == ()
-    assert counted(problem, known, theta, found) is known
+    problem, known, found = checked(tmp_path, STEP_S)
+    assert found.gain < -STEP.clearly and step_alarm(known, found) == ()
+    assert counted(problem, known, found) is known
     assert np.all(known.interval[:, 0] <= TRUTH) and np.all(known.interval[:, 1] >= TRUTH)
 
 
 def test_a_check_that_would_take_too_long_says_so(tmp_path: Path) -> None:
     """Nothing is compared, nothing is widened, and the provenance says why."""
-    problem, theta, known, found = checked(tmp_path, STEP_S, StepSettings(most_steps=10.0))
+    problem, known, found = checked(tmp_path, STEP_S, StepSettings(most_steps=10.0))
     assert "it would take" in found.to_json()["note"]
-    assert counted(problem, known, theta, found) is known and step_alarm(problem, known, found) == ()
+    assert counted(problem, known, found) is known and step_alarm(known, found) == ()
 
 
 def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:

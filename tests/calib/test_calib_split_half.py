@@ -47,7 +47,7 @@ def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Re
         for estimate, low, high in (row.first, row.second):
             assert estimate is None or low <= estimate <= high
     assert set(split.to_json()["parameters"]) == set(noisy_problem.space.names)
-    assert widened_by_split_half(noisy_problem, known, noisy_refined.theta, split) is known
+    assert widened_by_split_half(known, split) is known
 
 
 def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
@@ -60,13 +60,13 @@ def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
     ends = np.stack([problem.space.unnormalize(np.full(K, u)) for u in (0.05, 0.95)], axis=1)
     blind = dataclasses.replace(known, interval=ends, verdicts=(nothing,) * K)
     low = problem.space.unnormalize(np.full(K, 0.01))
-    split = agreement(problem, noisy_refined.theta, known, [low, noisy_refined.theta], [blind, known], 0)
+    split = agreement(known, [low, noisy_refined.theta], [blind, known], 0)
     assert all(row.first[0] is None and row.second[0] is not None for row in split.rows)
     assert all(row.agree is None for row in split.rows) and split.flagged == ()
     assert split.to_json()["parameters"][problem.space.names[0]]["agree"] is None
     # The same two estimates from halves that tell them disagree, and are flagged.
     tight = dataclasses.replace(known, interval=np.stack([low, 1.01 * low], axis=1))
-    split = agreement(problem, noisy_refined.theta, known, [low, noisy_refined.theta], [tight, known], 0)
+    split = agreement(known, [low, noisy_refined.theta], [tight, known], 0)
     assert all(row.agree is False for row in split.rows)
     told = np.array(problem.space.names)[~known.blind]
     assert set(split.flagged) <= set(told) and "servo.stiffness" in split.flagged
@@ -84,9 +84,7 @@ def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
     far = noisy_problem.space.from_scale(far + 10 * std * np.eye(len(noisy_problem.space))[k])[k]
     reach = np.zeros(len(noisy_problem.space))
     reach[k] = 10 * std
-    wide = widened_by_split_half(
-        noisy_problem, known, noisy_refined.theta, SplitHalf((), ("servo.stiffness",), reach)
-    )
+    wide = widened_by_split_half(known, SplitHalf((), ("servo.stiffness",), reach))
     assert wide.interval[k, 1] == pytest.approx(far)
     assert wide.interval[0] == pytest.approx(known.interval[0])
     assert any("disagree about servo.stiffness" in alarm.seen for alarm in wide.alarms)
@@ -105,13 +103,13 @@ def test_halves_that_differ_more_than_intervals_expect_widen_all_of_them(
         return [problem.space.from_scale(at + side * off * std * told) for side in (-1, 1)]
 
     wide = dataclasses.replace(known, interval=np.stack([problem.space.low, problem.space.high], axis=1))
-    split = agreement(problem, theta, known, halves(2.1), [wide, wide], 0)
+    split = agreement(known, halves(2.1), [wide, wide], 0)
     assert split.flagged == () and split.scale == pytest.approx(2.1 * np.sqrt(2), rel=1e-6)
     assert split.to_json()["scale"] == split.scale
-    wider = widened_by_split_half(problem, known, theta, split)
+    wider = widened_by_split_half(known, split)
     assert np.sqrt(np.diag(wider.covariance)) == pytest.approx(split.scale * std)
-    by_chance = agreement(problem, theta, known, halves(0.7), [wide, wide], 0)
-    assert by_chance.scale == 1.0 and widened_by_split_half(problem, known, theta, by_chance) is known
+    by_chance = agreement(known, halves(0.7), [wide, wide], 0)
+    assert by_chance.scale == 1.0 and widened_by_split_half(known, by_chance) is known
 
 
 def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:
