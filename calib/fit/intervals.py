@@ -130,21 +130,21 @@ class Uncertainty:
         """Return it with more alarms, before and after its own."""
         return dataclasses.replace(self, alarms=(*first, *self.alarms, *last))
 
-    def widened_to(self, std: FloatArray) -> Uncertainty:
-        """Return it with standard deviations of at least ``std``, (K,), correlations kept.
-
-        They are in each parameter's own scale.
-        """
-        own = np.sqrt(np.diag(self.covariance))
-        factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)
-        covariance = self.covariance * np.outer(factor, factor)
+    def with_covariance(self, covariance: FloatArray) -> Uncertainty:
+        """Return it with another covariance, (K, K), and the intervals and verdicts that follow from it."""
         return dataclasses.replace(
             self,
             covariance=covariance,
             interval=intervals(self.space, self.theta, covariance, self.blind, self.bound),
             verdicts=_verdicts(self.space, np.sqrt(np.diag(covariance)), self.blind),
-            widened=self.widened * factor,
         )
+
+    def widened_to(self, std: FloatArray) -> Uncertainty:
+        """Return it with standard deviations of at least ``std``, (K,), in own scales; correlations stay."""
+        own = np.sqrt(np.diag(self.covariance))
+        factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)
+        wider = self.with_covariance(self.covariance * np.outer(factor, factor))
+        return dataclasses.replace(wider, widened=self.widened * factor)
 
 
 def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:

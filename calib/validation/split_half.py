@@ -156,7 +156,7 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
 def agreement(
     known: Uncertainty, estimates: Sequence[FloatArray], halves: Sequence[Uncertainty], steps: int
 ) -> SplitHalf:
-    """Return whether two halves agree, from their estimates, (K,) each, and from what is known of all data."""
+    """Return whether two halves agree, from their estimates, (K,), and from what is known of all data."""
     space = known.space
 
     def three(half: int, k: int) -> tuple[float | None, float, float]:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import Uncertainty, intervals
+from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
@@ -154,12 +154,8 @@ def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertai
     half = max(Z90 * spread, 0.5) * tick
     latency = scan.refined[scan.best].latency_s
     low, high = problem.latency_range_s
-    return dataclasses.replace(
-        best,
-        covariance=covariance,
-        interval=intervals(space, best.theta, covariance, best.blind, best.bound),
-        latency_interval_s=(max(latency - half, low), min(latency + half, high)),
-    )
+    interval_s = max(latency - half, low), min(latency + half, high)
+    return dataclasses.replace(best.with_covariance(covariance), latency_interval_s=interval_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import Uncertainty, ended_at_bound, uncertainty
 from deal_hw.calib.fit.null_space import null_space, sparse_basis
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
+from deal_hw.calib.validation.time_steps import LatencyScan, averaged
 from deal_hw.calibration import Z90
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
@@ -137,6 +143,22 @@ def test_what_a_null_direction_hardly_moves_keeps_its_value() -> None:
     projector = np.eye(3) - np.outer(v, v) / (v @ v)
     told = _told(_space("a", "b", "c"), [1.0, 1.0, 1.0], 1e8 * projector)
     assert told.verdicts == ("not identifiable", "not identifiable", "identifiable")
+
+
+def test_plausible_latencies_that_disagree_cost_a_verdict() -> None:
+    """At two ticks that explain the data alike one parameter differs by half: it is weak."""
+    space = _space("a", "b")
+    told = _told(space, [1.0, 1.0], np.diag([1e4, 1e4]))
+    assert told.verdicts == ("identifiable", "identifiable")
+    fits = [
+        SimpleNamespace(theta=np.array([a, 1.0]), latency_s=0.003, chi2=1.0, normal=SimpleNamespace(cost=9.0))
+        for a in (1.0, 1.65)
+    ]
+    problem = SimpleNamespace(episodes=[SimpleNamespace(step_s=1e-3)], latency_range_s=(0.0, 0.04))
+    scan = LatencyScan((3, 4), cast("tuple[Refined, ...]", tuple(fits)))
+    found = averaged(cast("Problem", problem), scan, told)
+    assert found.verdicts == ("weak", "identifiable")
+    assert found.covariance[0, 0] == pytest.approx(1.44e-4 + np.log(1.65) ** 2 / 2, rel=1e-3)
 
 
 def test_sparse_basis_finds_the_readable_directions() -> None:
