@@ -355,7 +355,7 @@ def _scaled_together(known: Uncertainty, kinds: Container[str], std: float) -> U
     ends = space.to_scale(known.interval.T)
     sides = np.sign(ends - at) * np.hypot(ends - at, Z90 * along)
     interval = np.stack(list(space.from_scale(at + sides)), axis=1)
-    return dataclasses.replace(known, interval=interval, covariance=covariance)
+    return dataclasses.replace(known.with_covariance(covariance), interval=interval)
 
 
 def _including(known: Uncertainty, other: FloatArray) -> Uncertainty:
@@ -364,7 +364,7 @@ def _including(known: Uncertainty, other: FloatArray) -> Uncertainty:
     low, high = known.interval.T
     covariance = known.covariance + np.outer(apart, apart)
     interval = np.stack([np.minimum(low, other), np.maximum(high, other)], axis=1)
-    return dataclasses.replace(known, interval=interval, covariance=covariance)
+    return dataclasses.replace(known.with_covariance(covariance), interval=interval)
 
 
 def _joined_stretches(problem: Problem) -> Problem:

@@ -90,6 +90,7 @@ def test_intervals_hold_what_other_windows_found(problem: Problem) -> None:
     assert after.interval[0, 1] == pytest.approx(other[0])
     np.testing.assert_allclose(after.interval[1:], before.interval[1:])
     assert after.covariance[0, 0] == pytest.approx(SHARE**2 + np.log(1.5) ** 2)
+    assert after.verdicts[0] != "identifiable" and set(after.verdicts[1:]) == {"identifiable"}
 
 
 def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
