@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +17,15 @@ from deal_hw.calib.data.noise import autocorrelations
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import null_directions, null_space
-from deal_hw.calib.fit.output_error import OutputErrorFit
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calibration import EXPLAINED_CHI2, Z90, Alarm, Identifiability, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import find_kind
 from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.fit.output_error import OutputErrorFit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -422,22 +424,26 @@ def with_rows(refined: Refined) -> Refined:
 
 
 def uncertainty_at(
-    problem: Problem, fit: Refined | OutputErrorFit, fixed_latency: bool | None = None
+    problem: Problem,
+    fit: Refined | OutputErrorFit,
+    fixed_latency: bool | None = None,
+    *,
+    own_scale: bool = False,
 ) -> Uncertainty:
     """Return the uncertainty of a fit; variances are clustered if it holds linearised residuals.
 
-    Residuals of an output-error fit count as noise. The latency is fixed where the problem gives it, unless
-    ``fixed_latency`` says otherwise.
+    Residuals that a fit divides by their ``own_scale`` count as noise. The latency is fixed where the problem
+    gives it, unless ``fixed_latency`` says otherwise.
     """
-    smooth, noise = problem.robot.base is None or problem.noise_free, isinstance(fit, OutputErrorFit)
+    smooth = problem.robot.base is None or problem.noise_free
     return uncertainty(
         problem.space,
         fit.theta,
         fit.latency_s,
         fit.normal,
-        1.0 if noise else fit.chi2,
+        1.0 if own_scale else fit.chi2,
         problem.latency_range_s,
         fixed_latency=problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency,
-        timing_std_s=0.0 if noise else problem.noise.timing_std_s,
+        timing_std_s=0.0 if own_scale else problem.noise.timing_std_s,
         kinks=SETTINGS.kinks if smooth else SETTINGS.contact_kinks,
     )

@@ -162,7 +162,7 @@ class OutputErrorFits(Fits):
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
-        known = uncertainty_at(problem, fit)
+        known = uncertainty_at(problem, fit, own_scale=True)
         split = self._split_half(problem, fit, recipe, known)
         known = widened_by_split_half(known, split)
         if settings.hold_first:
@@ -299,7 +299,7 @@ class OutputErrorFits(Fits):
             ]
         except InsufficientDataError as err:
             return SplitHalf(note=f"a half cannot be fitted: {err}")
-        both = [uncertainty_at(problem, half) for half in halves]
+        both = [uncertainty_at(problem, half, own_scale=True) for half in halves]
         return agreement(known, [h.theta for h in halves], both, problem.steps - before)
 
 

@@ -142,7 +142,7 @@ def test_intervals_count_the_correlation_of_residuals_once(problem: Problem) -> 
         spoilt.starts = problem.starts
         fit = fit_output_error(spoilt, TRUTH, LATE_S, Recipe(), central=True)
         assert fit.normal.cost == pytest.approx(fit.normal.count, rel=0.05)
-        known = uncertainty_at(problem, fit)
+        known = uncertainty_at(problem, fit, own_scale=True)
         off = problem.space.to_scale(fit.theta) - problem.space.to_scale(TRUTH)
         errors.append(off / np.sqrt(np.diag(known.covariance)))
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 1.2
