@@ -1,4 +1,8 @@
-"""The one solver of all fits: scipy's bounded least squares over the parameters and the latency.
+"""The one solver of all fits: bounded Gauss-Newton steps over the parameters and the latency.
+
+Each step is the exact minimum of the linear model in a box: the bounds cut by the trust region (scipy's
+``lsq_linear``). scipy's own ``least_squares`` (dogbox) ends a step where the first parameter meets the box.
+Of 92 parameters one always does at once: 9 such steps left 1.7 % of the cost, 9 exact ones 2e-11.
 
 Unknown start states of windows follow the parameters (variable projection, Golub and Pereyra 1973), so the
 solver sees the parameters alone. A robust loss is a weight per residual, computed from the previous fit.
@@ -13,9 +17,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares, lsq_linear
+from scipy.optimize import lsq_linear
 
-from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
+from deal_hw.calib.data.noise import MAD_TO_STD, autocorrelations
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
@@ -31,6 +35,9 @@ class SolverSettings:
         latency_unit_s: Latency change that counts like a factor e of a parameter [s].
         converged: Relative decrease of the cost below which a step is the last.
         smallest_step: Relative step length below which a step is the last.
+        good: Share of the predicted decrease above which the trust region may grow; it doubles.
+        poor: Share below which it shrinks.
+        shrunk: The shrunk radius as a share of the step.
         reach: Width of a prior around the start, in the parameters' own scale, which holds insensitive
             parameters. It is as wide as a range of ratio 5, and moves with each new start.
         gain: Relative decrease of the cost below which the solver is not started again.
@@ -43,6 +50,9 @@ class SolverSettings:
     latency_unit_s: float = 0.007
     converged: float = 1e-4
     smallest_step: float = 1e-5
+    good: float = 0.75
+    poor: float = 0.25
+    shrunk: float = 0.25
     reach: float = 1.0
     gain: float = 3e-3
     hopeless: float = np.inf
@@ -82,11 +92,12 @@ def minimise(
     # A solution at a bound may come back beside it by rounding.
     for bound in bounds:
         start = np.where(free & (np.abs(start - bound) < 1e-9 * (high - low)), bound, start)
-    if settings.iterations < 1 or not free.any() or not np.isfinite(fit.residual(start)).all():
+    if settings.iterations < 1 or not free.any():
         return start, 0
     unit = np.full(len(value), settings.first_step)
     unit[-1] *= settings.latency_unit_s
-    used, hold = 0, settings.first_step / settings.reach
+    hold = settings.first_step / settings.reach
+    lower, upper = (low - start)[free] / unit[free], (high - start)[free] / unit[free]
 
     def at(step: FloatArray) -> FloatArray:
         found: FloatArray = start.copy()
@@ -97,49 +108,40 @@ def minimise(
         return np.concatenate([fit.residual(at(step)), hold * step])
 
     def jacobian(step: FloatArray) -> FloatArray:
-        nonlocal used
-        used += 1
         # Beside parameters whose simulation diverges, a difference may not be finite: it gives no direction.
         rows = np.nan_to_num(fit.jacobian(at(step))[:, free] * unit[free], nan=0.0, posinf=0.0, neginf=0.0)
         return np.concatenate([rows, hold * np.eye(len(step))])
 
-    def ends() -> tuple[FloatArray, FloatArray]:
-        return (low - start)[free] / unit[free], (high - start)[free] / unit[free]
-
-    if np.any(free & ((start == low) | (start == high))):
-        here = np.zeros(int(free.sum()))
-        free[free] = ~_stay(jacobian(here), residual(here), *ends())
-        if not free.any():
-            return start, used
-        used = 0
-    # The trust region begins with radius 1 because the start is at 0. A rectangular one (dogbox) follows
-    # parameters that end at their bound without slowing down before it, as an interior method does.
-    found = least_squares(
-        residual,
-        np.zeros(int(free.sum())),
-        jacobian,
-        bounds=ends(),
-        method="dogbox",
-        ftol=settings.converged,
-        xtol=settings.smallest_step,
-        gtol=1e-10,
-        max_nfev=1 + settings.iterations,
-    )
-    return at(found.x), used
-
-
-def _stay(rows: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray) -> Mask:
-    """Return which parameters are at a bound and stay there, (K,), by the linear model inside the bounds.
-
-    Dogbox frees a parameter at its bound if the gradient alone points inside. Where the others' steps push it
-    out again, it ends there, with steps near zero.
-    """
-    at = (low == 0) | (high == 0)
-    triangle = np.asarray(np.linalg.qr(np.column_stack([rows, -residual]), mode="r"))
-    inside = np.maximum(low, -1.0), np.minimum(high, 1.0)
-    step = lsq_linear(triangle[:, :-1], triangle[:, -1], inside, method="bvls").x
-    stays: Mask = at & np.where(low == 0, step <= 0, step >= 0)
-    return stays
+    here = np.zeros(int(free.sum()))
+    left = residual(here)
+    if not np.isfinite(left).all():
+        return start, 0
+    cost, radius, used = float(left @ left), 1.0, 0
+    triangle: FloatArray | None = None
+    for _ in range(settings.iterations):
+        if triangle is None:
+            used += 1
+            triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian(here), -left]), mode="r"))
+        rows, wanted = triangle[:, :-1], triangle[:, -1]
+        box = np.maximum(lower - here, -radius), np.minimum(upper - here, radius)
+        step = lsq_linear(rows, wanted, box, method="bvls", max_iter=10 * len(here)).x
+        expected = cost - float(np.sum((rows @ step - wanted) ** 2))
+        if not expected > 0:
+            break
+        new, moved = residual(here + step), float(np.abs(step).max())
+        gained = cost - float(new @ new) if np.isfinite(new).all() else -np.inf
+        if gained < settings.poor * expected:
+            radius = settings.shrunk * moved
+        elif gained > settings.good * expected and moved > 0.95 * radius:
+            radius *= 2.0
+        small = settings.smallest_step * (settings.smallest_step + float(np.linalg.norm(here)))
+        ends = float(np.linalg.norm(step)) < small
+        if gained > 0:
+            ends |= settings.poor * expected < gained < settings.converged * cost
+            here, left, cost, triangle = here + step, new, cost - gained, None
+        if ends:
+            break
+    return at(here), used
 
 
 def solve(

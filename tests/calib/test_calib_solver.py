@@ -45,3 +45,23 @@ def test_a_fit_does_not_end_beside_a_bound() -> None:
         if cost > 1.01 * least:
             stuck.append(seed)
     assert not stuck
+
+
+def test_one_derivative_solves_a_linear_problem_of_many_parameters() -> None:
+    """92 parameters, many of which end at their range: one exact step. Steps to the first bound need many.
+
+    The solution is that of a library, to 1e-6 of its cost.
+    """
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(400, 93)) * np.logspace(-2, 2, 93)
+    problem = Linear(rows, rows @ rng.normal(size=93))
+    low, high = np.full(93, -0.5), np.full(93, 0.5)
+    settings = SolverSettings(reach=1e6)
+    value, used = minimise(problem, np.zeros(93), (low, high), settings, fixed_latency=True)
+    best = lsq_linear(rows[:, :92], problem.wanted, (low[:92], high[:92]), method="bvls", max_iter=1000).x
+    cost = float(np.sum(problem.residual(value) ** 2))
+    least = float(np.sum(problem.residual(np.append(best, 0.0)) ** 2))
+    assert np.count_nonzero(np.abs(value) >= 0.5) > 30
+    assert cost < least * (1 + 1e-6)
+    # The second shows that nothing is left to gain.
+    assert used <= 2
