@@ -287,16 +287,16 @@ def _whole_step(
     for tick in (nearest, *(t for t in beside if low <= t <= high)):
         start = shooting.start(theta, tick * step_s)
         point, normal, _ = _from_known_states(shooting, start, SolverSettings().iterations, 1)
-        if _most(normal) < least:
-            best, least = (shooting.theta(point), tick * step_s), _most(normal)
+        if _most(normal.residual) < least:
+            best, least = (shooting.theta(point), tick * step_s), _most(normal.residual)
         if least < SETTINGS.given_right:
             break
     return best
 
 
-def _most(normal: Normal) -> float:
-    """Return the quantile of the windows' chi2 at ``most_windows``."""
-    each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in normal.residual])
+def _most(residuals: Sequence[FloatArray]) -> float:
+    """Return the quantile of the windows' chi2 at ``most_windows``; residuals are (W, H, M) each."""
+    each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in residuals])
     return float(np.quantile(each, SETTINGS.most_windows))
 
 
@@ -310,17 +310,20 @@ def _from_known_states(
     median (Cauchy's weights). The solution then rests on windows that can be explained.
     """
     settings = SETTINGS
-    point, normal, used = solve(plain, point, SolverSettings(iterations=iterations))
+    point, last, used = solve(plain, point, SolverSettings(iterations=iterations))
+    normal: Normal | None = last
+    left: Sequence[FloatArray] = last.residual
     for _ in range(rounds):
-        if _most(normal) < settings.given_chi2:
+        if _most(left) < settings.given_chi2:
             break
-        weighed, before = plain.on(cauchy_windows(plain.data, normal.residual)), point.value
+        weighed, before = plain.on(cauchy_windows(plain.data, left)), point.value
         point, _, more = solve(weighed, point, SolverSettings(iterations=settings.round_iterations))
         used += more
-        normal = plain.normal(point)
+        # Weights need residuals alone. Derivatives cost as many simulations as there are parameters.
+        normal, left = None, plain.residuals(point)
         if np.max(np.abs(point.value - before)) < settings.given_still:
             break
-    return point, normal, used
+    return point, normal or plain.normal(point), used
 
 
 def _with_contacts(
