@@ -15,6 +15,7 @@ import argparse
 import itertools
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ import torch
 
 from deal_hw.bench.calibration import make_cells, run_cell
 from deal_hw.bench.rows import write_rows
+from deal_hw.calib.search.critic import PenaltyCritic, Samples
 from deal_hw.calib.search.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
 from deal_hw.cli.bench import parse_seeds
@@ -42,12 +44,14 @@ class Step:
         eta: sigma_t in units of the full DDPM noise; 0 is deterministic.
         schedule: How alpha_t falls.
         common: Whether all members share the mean of their estimates.
+        adapt: Whether eq. 9 scales sigma_t by the critic's mean output on the members, with lambda = 1.
     """
 
     keep: float
     eta: float
     schedule: Schedule = "cosine"
     common: bool = False
+    adapt: bool = False
 
 
 STEPS: dict[str, Step | None] = {
@@ -62,6 +66,7 @@ STEPS: dict[str, Step | None] = {
     "0.005, eta 1": Step(0.005, 1.0),
     "0.02, eta 1, linear": Step(0.02, 1.0, "linear"),
     "0.02, eta 1, common": Step(0.02, 1.0, common=True),
+    "0.05, eta 1, eq. 9": Step(0.05, 1.0, adapt=True),
 }
 """Steps by name: the share that is kept, sigma, and what else differs."""
 
@@ -75,14 +80,25 @@ class Still(np.random.Generator):
 
 
 class Diffusion(EnsembleKalman):
-    """Members that are denoised towards their posterior means, and noised again."""
+    """Members that are denoised towards their posterior means, and noised again.
 
-    def __init__(self, ensemble: FloatArray, rng: np.random.Generator, step_clip: float, step: Step) -> None:
+    ``outputs`` gets the critic's mean output on the members before each step; eq. 9 reads the last one.
+    """
+
+    def __init__(
+        self,
+        ensemble: FloatArray,
+        rng: np.random.Generator,
+        step_clip: float,
+        step: Step,
+        outputs: Sequence[float] = (0.0,),
+    ) -> None:
         super().__init__(ensemble, Still(rng.bit_generator), step_clip)
-        self._noise, self._step = rng, step
+        self._noise, self._step, self._outputs = rng, step, outputs
         self._centre, self._scale = ensemble.mean(axis=0), ensemble.std(axis=0, ddof=1)
         self._alpha = alpha_schedule(GENERATIONS, step.schedule)
         self._t = GENERATIONS
+        self.deltas: list[float] = []
 
     @property
     def finished(self) -> bool:
@@ -102,6 +118,11 @@ class Diffusion(EnsembleKalman):
         noise = (theta - np.sqrt(alpha) * estimate) / np.sqrt(1 - alpha)  # eq. 2
         full = np.sqrt((1 - later) / (1 - alpha)) * np.sqrt(max(1 - alpha / later, 0.0))
         sigma = self._step.eta * full
+        if self._step.adapt:
+            # Eq. 9, cut to what eq. 10 can hold.
+            delta = float(np.exp(np.clip(-self._outputs[-1], -50.0, 50.0)))
+            sigma = min(delta * sigma, np.sqrt(1 - later))
+            self.deltas.append(delta)
         theta = np.sqrt(later) * estimate + np.sqrt(max(1 - later - sigma**2, 0.0)) * noise  # eq. 3
         theta += sigma * self._noise.standard_normal(theta.shape)
         self._members = self._centre + self._scale * theta
@@ -111,20 +132,35 @@ class Diffusion(EnsembleKalman):
 
 def measure(name: str, seed: int, ratio: float) -> dict[str, Any]:
     """Search one cart-pole with a step by its name in :data:`STEPS`."""
-    usual, step = KalmanStepper.new_ensemble, STEPS[name]
+    usual, statistics, step = KalmanStepper.new_ensemble, PenaltyCritic.statistics, STEPS[name]
+    ensembles: list[Diffusion] = []
+    outputs: list[float] = []
 
     def draw(stepper: KalmanStepper) -> EnsembleKalman:
+        if step is None:
+            return usual(stepper)
         unit = stepper.coordinates.sample(stepper.rng, stepper.log.budget.population)
-        return (
-            Diffusion(logit(unit), stepper.rng, stepper.settings.step_clip, step) if step else usual(stepper)
-        )
+        ensembles.append(Diffusion(logit(unit), stepper.rng, stepper.settings.step_clip, step, outputs))
+        return ensembles[-1]
+
+    def heard(critic: PenaltyCritic, samples: Samples) -> FloatArray:
+        found = statistics(critic, samples)
+        if len(samples) > 1:  # members, not the recording
+            outputs.append(float(np.nanmean(found[:, -1])))
+        return found
 
     (cell,) = make_cells("fixed-range", ["cartpole"], "ideal", ["deal"], [ratio], [seed])
     start_s = time.process_time()
-    with mock.patch.object(KalmanStepper, "new_ensemble", draw):
+    with (
+        mock.patch.object(KalmanStepper, "new_ensemble", draw),
+        mock.patch.object(PenaltyCritic, "statistics", heard),
+    ):
         row = run_cell(cell, population=100, generations=GENERATIONS, threads=1)
     kept = ("error", "log_error_x100", "heldout_nrmse_nominal", "heldout_nrmse_calibrated")
     named = {key: row.get(key) for key in kept}
+    deltas = [delta for ensemble in ensembles for delta in ensemble.deltas]
+    if deltas:
+        named["delta"] = [min(deltas), float(np.median(deltas)), max(deltas)]
     return {"step": name, "seed": seed, "range_ratio": ratio, **named, "cpu_s": time.process_time() - start_s}
 
 
