@@ -132,7 +132,7 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     assert case.truth is not None
     theta = np.array([case.truth.parameters[name] for name in space.names])
     problem = Problem(case.robot, space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
-    found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4), iterations=4))
+    found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4)))
     known, _ = judge(problem, found, uncertainty_at(problem, found, fixed_latency=True), Validation())
     assert len(known.null_directions) == 2
     # The same is said before a search begins.
