@@ -175,6 +175,7 @@ class Critic(Stateful):
             parts = list(pool.map(output, range(0, len(x), chunk)))
         return np.asarray(torch.cat(parts).numpy())
 
+    @torch_threads(1)
     @torch.no_grad()
     def statistics(self, samples: Samples) -> FloatArray:
         """Return the mean hidden activations and output, (N, h1 + h2 + 1), of samples, (N, n, inputs)."""

@@ -35,7 +35,7 @@ from deal_hw.calib.data.innovations import (
 )
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
+from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import KalmanStepper
 from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.calibration import CalibrationResult
@@ -61,7 +61,6 @@ class DealSettings:
         alarm_chi2: Chi2 of a noisy recording above which the result carries an alarm.
         noise_draws: Draws of the noise that estimate its effect on the statistics (noisy recordings).
         smooth_draws: Number of these draws in a member's mean statistics.
-        torch_threads: Threads of the critic's arithmetic.
     """
 
     critic: CriticSettings = field(default_factory=lambda: _CRITIC)
@@ -76,7 +75,6 @@ class DealSettings:
     alarm_chi2: float = 3.0
     noise_draws: int = 100
     smooth_draws: int = 4
-    torch_threads: int = 1
 
 
 class _Deal(KalmanStepper):
@@ -109,8 +107,7 @@ class _Deal(KalmanStepper):
         """One round of critic updates and one Kalman step."""
         z = self.kalman.ask()
         members, centre = self.population(z)
-        with torch_threads(self.settings.torch_threads):
-            residual, gap = self._view.residual(members, centre)
+        residual, gap = self._view.residual(members, centre)
         # Statistics of noisy recordings are whitened by their noise, so the tempering ends at the noise.
         # Noise-free ones have no such end: each step leaves a fixed share of the residual.
         step = self.kalman.tell(residual, keep=None if self._noisy else self.settings.keep)
