@@ -149,8 +149,11 @@ class CanLink:
         *,
         device: bool = False,
     ) -> None:
+        from cantools.database import EncodeError  # Loaded with the table of frames.
+
         self.errors = self.torn = 0
         self.fault = ""
+        self._unfit = (EncodeError, KeyError, UnicodeEncodeError)
         self._node, self._version, self._unique_id = check_node(node), version, unique_id
         # The host's frames have the numbers 0 to 7; a chip filters by the same bits.
         self._number_bits = 3 if device else _NUMBER_BITS
@@ -177,11 +180,9 @@ class CanLink:
         group = type(message).__name__
         values = _to_values(message, self._version)
         names = _frames_of(group)
-        from cantools.database import EncodeError  # Loaded with the table of frames.
-
         try:
             parts = [_pack(name, values) for name in names]
-        except (EncodeError, KeyError, UnicodeEncodeError) as error:
+        except self._unfit as error:
             raise FrameError(f"{message} does not fit its frames: {error}") from error
         if len(parts) > 1:
             parts[-1] = parts[-1][:-2] + self._crc(group, parts).to_bytes(2, "little")
