@@ -1,8 +1,9 @@
 """The bench of speed: the cost of a search, beside bare physics in the same run and the paper's Table 3.
 
-Bare physics is the engine alone: as many members with the same parameters advance on the same threads, with
-constant commands and one record at the end of each rollout. The rest of a search's time goes into policy
-calls, records, critic and its own arithmetic.
+Bare physics is the engine alone: as many members advance as many steps on the same threads, with the commands
+that the policy gave each of them, in one call and with one record at its end. So robots move as in the search
+and have the same contacts. The rest of a search's time goes into policy calls, records, critic and its own
+arithmetic. Beside it are the engine's seconds with constant commands, where a robot soon rests.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from deal_hw.workflows.calibration.run import calibrate_episodes
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calibration import CalibrationResult
+    from deal_hw.types import FloatArray
 
 METHODS: Final = ("deal-paper",)
 """Measured if no method is named."""
@@ -84,7 +86,7 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
 
     Returns:
         The row's figures: wall-clock and processor seconds, physics steps, the engine's own seconds for as
-        many steps, and the ratio.
+        many steps, under the policy's and under constant commands, and the ratio to the former.
     """
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.pipeline.methods import usual_budget
@@ -108,9 +110,9 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
     cpu_s = time.process_time()
     result = search(generations)
     cpu_s = time.process_time() - cpu_s
-    problem = Problem(case.robot, case.space, [case.fit], threads=threads)
-    per_step_s = bare_step_s(problem, population)
-    physics_s = result.steps * per_step_s
+    problem = Problem(case.robot, case.space, [case.fit], threads=threads, policy=case.policy)
+    moving_s, constant_s = bare_step_s(problem, population)
+    physics_s = result.steps * moving_s
     return {
         "parameters": len(case.space),
         "recorded_s": float(case.fit.steps * case.fit.step_s),
@@ -118,36 +120,54 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
         "steps": result.steps,
         "seconds": result.seconds,
         "cpu_seconds": cpu_s,
-        "bare_step_us": 1e6 * per_step_s,
+        "bare_step_us": 1e6 * moving_s,
         "seconds_physics": physics_s,
+        "seconds_physics_constant": result.steps * constant_s,
         "ratio": result.seconds / physics_s,
         "paper_seconds": PAPER_SECONDS.get(case.task),
         "load": os.getloadavg()[0],
     }
 
 
-def bare_step_s(problem: Problem, population: int) -> float:
-    """Return the seconds that the engine takes for one physics step of one member, all threads together."""
+def bare_step_s(problem: Problem, population: int) -> tuple[float, float]:
+    """Return the engine's seconds for one physics step of one member, all threads together.
+
+    Members are drawn from the whole range, as in the first generation. The first value is under the commands
+    that the policy gives each member, the second under the first of them, held.
+    """
+    from deal_hw.calib.data.innovations import Members
+    from deal_hw.calib.search.fitness import FitnessSettings
+    from deal_hw.calib.search.rollouts import control_ticks, policy_of, rollout_population
     from deal_hw.sim.engine.closed_loop import on_physics_steps
+    from deal_hw.sim.engine.servo import slew
 
     episode = problem.episodes[0]
-    first = int(np.argmax(episode.usable))
-    rng = np.random.default_rng(0)
+    ticks = control_ticks(problem, 0, FitnessSettings().ticks, policy_of(problem).history)
+    theta = problem.space.sample(np.random.default_rng(0), population)
+    action = rollout_population(problem, Members(theta, np.zeros(population)), 0, ticks)[2]
     batch = problem.batch(population)
-    batch.set_parameters(problem.space.sample(rng, population))
-    command = np.repeat(episode.target[None, :1], population, axis=0)
-    control = on_physics_steps(batch, np.repeat(command, min(episode.steps, 2000), axis=1), episode.step_s)
-    taken = []
-    for _ in range(REPETITIONS):
-        batch.set_state(
-            problem.starts[0].position[first],
-            problem.starts[0].velocity[first],
-            reference=None if episode.reference is None else episode.reference[first],
-        )
-        began = time.perf_counter()
-        batch.advance(control)
-        taken.append(time.perf_counter() - began)
-    return float(statistics.median(taken) / (population * control.shape[1]))
+    batch.set_parameters(theta)
+    first, (begin, end) = int(ticks.sample[0]), (int(ticks.start[0]), int(ticks.start[-1]))
+    limit = batch.servo_factor("servo_speed_limit")[:, None] * episode.speed_limit[None, begin:end]
+
+    def per_step_s(command: FloatArray) -> float:
+        target = np.repeat(command, np.diff(ticks.start), axis=1)
+        target[:, ticks.lead :] = target[:, : target.shape[1] - ticks.lead]
+        path = slew(target[:, 0], target, limit * episode.step_s)
+        control = on_physics_steps(batch, path, episode.step_s)
+        taken = []
+        for _ in range(REPETITIONS):
+            batch.set_state(
+                problem.starts[0].position[first],
+                problem.starts[0].velocity[first],
+                reference=None if episode.reference is None else episode.reference[first],
+            )
+            began = time.perf_counter()
+            batch.advance(control)
+            taken.append(time.perf_counter() - began)
+        return float(statistics.median(taken) / (population * control.shape[1]))
+
+    return per_step_s(action), per_step_s(np.repeat(action[:, :1], action.shape[1], axis=1))
 
 
 def line(row: Row) -> str:

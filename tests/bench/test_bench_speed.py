@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.cli.bench import Bench, bench
 from deal_hw.errors import ConfigurationError
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.types import FloatArray
 
 
 def test_a_cell_is_a_search_and_the_same_steps_of_the_engine(tmp_path: Path) -> None:
@@ -45,16 +48,34 @@ def test_a_cell_is_a_search_and_the_same_steps_of_the_engine(tmp_path: Path) -> 
     assert out.read_bytes() == before
 
 
-def test_the_engine_alone_advances_every_member(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time of one step is that of a rollout over members times steps."""
+def test_the_engine_alone_repeats_what_the_policy_commanded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time of a step is a rollout's over members times steps; its commands are the policy's, or held."""
     case = make_case("cartpole", "ideal", 3, 5.0, by_policy=True)
-    problem = Problem(case.robot, case.space, [case.fit], threads=1)
-    ticks = iter(np.arange(0.0, 100.0, 0.5))
-    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
-    before = problem.steps
-    found = speed.bare_step_s(problem, 5)
-    steps = problem.steps - before
-    assert steps == speed.REPETITIONS * 5 * round(0.5 / (5 * found))
+    problem = Problem(case.robot, case.space, [case.fit], threads=1, policy=case.policy)
+    # Moving members take 0.5 s for a rollout, others 0.25 s.
+    now, sent = 0.0, list[FloatArray]()
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    advance = ServoBatch.advance
+
+    def timed(self: ServoBatch, setpoint: FloatArray, *more: Any) -> Any:
+        nonlocal now
+        sent.append(setpoint)
+        now += 0.5 if np.any(setpoint != setpoint[:, :1]) else 0.25
+        return advance(self, setpoint, *more)
+
+    monkeypatch.setattr(ServoBatch, "advance", timed)
+    moving_s, constant_s = speed.bare_step_s(problem, 5)
+    whole = sent[-1].shape[1]
+    assert moving_s == pytest.approx(0.5 / (5 * whole))
+    assert constant_s == pytest.approx(0.25 / (5 * whole))
+    # The rollout in closed loop advances by one control period at a time.
+    ticks = [part for part in sent if part.shape[1] < whole]
+    assert sum(part.shape[1] for part in ticks) == whole
+    rolled = np.stack([part[:, -1] for part in ticks], axis=1)
+    for repeated in sent[-2 * speed.REPETITIONS : -speed.REPETITIONS]:
+        # Before the first command they differ by the set-point that the recording begins with.
+        again = repeated[:, ticks[0].shape[1] - 1 :: ticks[0].shape[1]]
+        np.testing.assert_allclose(again[:, 20:], rolled[:, 20:], rtol=1e-9, atol=1e-12)
 
 
 def test_rows_in_words() -> None:

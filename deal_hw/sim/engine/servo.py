@@ -97,5 +97,7 @@ def delay(setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray) -
     steps = setpoint.shape[1]
     index = longest - whole[:, None] + np.arange(steps)[:, None]
     late = np.take_along_axis(padded, index, axis=1)
+    if not part.any():
+        return late
     later = np.take_along_axis(padded, index - 1, axis=1)
     return np.asarray((1 - part) * late + part * later)
