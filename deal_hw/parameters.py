@@ -193,8 +193,9 @@ class ParameterSpace:
         return np.where(self._log, np.log(np.where(self._log, theta, 1.0)), theta)
 
     def from_scale(self, value: FloatArray) -> FloatArray:
-        """Undo :meth:`to_scale`."""
-        return np.where(self._log, np.exp(np.where(self._log, value, 0.0)), value)
+        """Undo :meth:`to_scale`; far ends of an interval may become 0 or infinite."""
+        with np.errstate(over="ignore"):
+            return np.where(self._log, np.exp(np.where(self._log, value, 0.0)), value)
 
     def normalize(self, theta: FloatArray) -> FloatArray:
         """Map physical values, (..., K), to the unit cube; values outside the range leave the cube."""

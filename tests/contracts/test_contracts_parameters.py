@@ -45,6 +45,13 @@ def test_cube_by_hand() -> None:
     np.testing.assert_allclose(SPACE.width, [np.log(100.0), 4.0])
 
 
+def test_the_end_of_an_interval_without_limit_is_infinite() -> None:
+    """A parameter that the data do not show may have an interval of thousands of e-folds: no warning."""
+    np.testing.assert_array_equal(
+        SPACE.from_scale(np.array([[-2000.0, 0.0], [2000.0, 1.0]])), [[0, 0], [np.inf, 1]]
+    )
+
+
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=2))
 def test_cube_there_and_back(unit: list[float]) -> None:
