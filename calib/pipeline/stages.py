@@ -240,11 +240,11 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
             found = conclude_weighted(run, weighted)
         else:
+            fits = self.fits.started(run)
             if local is not None and progress is not None:
                 local = with_rows(local)
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
-            fits = self.fits.started(run)
             if local is not None and self.settings.diagnosis:
                 run = dataclasses.replace(run, play=fit_play(problem))
             found = with_play(run) or with_shared_error(fits, run)
