@@ -13,6 +13,7 @@ import stable_baselines3
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -153,7 +154,7 @@ def _load(model: SAC, config: SacConfig, found: Checkpoint) -> None:
 
 
 def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
-    return SAC(
+    model = SAC(
         "MlpPolicy",
         adapter,
         learning_rate=LinearSchedule(config.learning_rate, config.final_learning_rate, 1.0),
@@ -170,6 +171,9 @@ def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
         seed=seed,
         device="cpu",
     )
+    # The default logger leaves an empty folder in the temporary directory.
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
 
 
 class _Adapter(VecEnv):

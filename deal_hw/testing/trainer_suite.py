@@ -59,11 +59,15 @@ class TrainerCase:
 
 @dataclass(frozen=True, slots=True)
 class KeptTraining:
-    """A short training with the seed of ``short``: its policy, its reports, and its checkpoint as bytes."""
+    """A short training with the seed of ``short``.
+
+    Its policy, its reports, its checkpoint as bytes, and the names that it left in the temporary directory.
+    """
 
     policy: Policy
     reports: tuple[tuple[int, int], ...]
     checkpoint: bytes
+    leftovers: tuple[str, ...]
 
 
 class TrainerSuite:
@@ -86,13 +90,17 @@ class TrainerSuite:
     def second(cls, case: TrainerCase, tmp_path_factory: pytest.TempPathFactory) -> KeptTraining:
         """Return a second short training, with reports and a checkpoint."""
         file = tmp_path_factory.mktemp("second") / "checkpoint.safetensors"
+        temporary = tmp_path_factory.mktemp("temporary")
         reports: list[tuple[int, int]] = []
-        policy = case.train(
-            case.short_config,
-            progress=lambda status: reports.append((status.steps, status.total)),
-            files=TrainingFiles(checkpoint=file),
-        )
-        return KeptTraining(policy, tuple(reports), file.read_bytes())
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("tempfile.tempdir", str(temporary))
+            policy = case.train(
+                case.short_config,
+                progress=lambda status: reports.append((status.steps, status.total)),
+                files=TrainingFiles(checkpoint=file),
+            )
+        left = tuple(entry.name for entry in temporary.iterdir())
+        return KeptTraining(policy, tuple(reports), file.read_bytes(), left)
 
     def test_learns_the_toy_under_the_step_budget(self, case: TrainerCase) -> None:
         """A trained policy exceeds the score `learned`; a hardly trained one does not."""
@@ -135,6 +143,10 @@ class TrainerSuite:
         other = case.train(case.short_config, seed=_SEED + 1)
         np.testing.assert_array_equal(second.policy.act(observation), short.act(observation))
         assert not np.array_equal(other.act(observation), short.act(observation))
+
+    def test_nothing_is_left_in_the_temporary_directory(self, second: KeptTraining) -> None:
+        """A training writes the requested files only."""
+        assert second.leftovers == ()
 
     def test_progress_counts_up_to_the_budget(self, case: TrainerCase, second: KeptTraining) -> None:
         """Progress rises and ends at the requested number of steps."""
