@@ -113,8 +113,11 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
 
 
 def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]:
-    """Describe the combinations of parameters without effect on the recordings."""
-    return tuple(_describe(space, direction) for direction in unseen.directions)
+    """Describe the combinations of parameters without effect on the recordings, each once.
+
+    Directions that differ in parts too small to be named have one description.
+    """
+    return tuple(dict.fromkeys(_describe(space, direction) for direction in unseen.directions))
 
 
 def _describe(space: ParameterSpace, direction: FloatArray) -> str:

@@ -20,7 +20,7 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
-from deal_hw.calib.fit.null_space import null_directions, null_space
+from deal_hw.calib.fit.null_space import NullSpace, null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.fit.solver import correlated_samples
@@ -364,6 +364,9 @@ def test_null_direction_names_the_common_factor() -> None:
     (words,) = _unseen(_two(), np.diag([1e6, 0.0]))
     assert words.startswith("b leaves no trace")
     assert _unseen(_two(), np.diag([1e6, 1e6])) == ()
+    # Two directions that differ by 5 % of a: "b leaves no trace" once.
+    same = NullSpace(np.array([[0.05, 1.0], [-0.05, 1.0]]), np.ones(2))
+    assert null_directions(_two(), same) == (words,)
 
 
 def test_k11_names_its_null_directions_on_real_information(noisy: Case) -> None:
