@@ -115,18 +115,29 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
 def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]:
     """Describe the combinations of parameters without effect on the recordings, each once.
 
-    Directions that differ in parts too small to be named have one description.
+    Single parameters come last, in one sentence. Directions that differ in parts too small to be named have
+    one description.
     """
-    return tuple(dict.fromkeys(_describe(space, direction) for direction in unseen.directions))
+    named = [
+        [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > SETTINGS.part]
+        for direction in unseen.directions
+    ]
+    combined = zip(named, unseen.directions, strict=True)
+    words = dict.fromkeys(
+        _describe(space, direction, parts) for parts, direction in combined if len(parts) > 1
+    )
+    alone = dict.fromkeys(space.names[parts[0]] for parts in named if len(parts) == 1)
+    if not alone:
+        return tuple(words)
+    leave, them = ("leaves", "it") if len(alone) == 1 else ("leave", "them")
+    ask = f"excite {them} or measure {them} by other means"
+    return (*words, f"{', '.join(alone)} {leave} no trace in this recording: {ask}")
 
 
-def _describe(space: ParameterSpace, direction: FloatArray) -> str:
-    parts = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > SETTINGS.part]
+def _describe(space: ParameterSpace, direction: FloatArray, parts: list[int]) -> str:
     lead = np.sign(direction[parts[0]])
     up = [space.names[k] for k in parts if np.sign(direction[k]) == lead]
     down = [space.names[k] for k in parts if np.sign(direction[k]) != lead]
-    if len(parts) == 1:
-        return f"{up[0]} leaves no trace in this recording: excite it or measure it by other means"
     if not down:
         return (
             f"{', '.join(up)} can only be told up to a common factor: measure one of them "

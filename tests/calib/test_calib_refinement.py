@@ -367,6 +367,9 @@ def test_null_direction_names_the_common_factor() -> None:
     # Two directions that differ by 5 % of a: "b leaves no trace" once.
     same = NullSpace(np.array([[0.05, 1.0], [-0.05, 1.0]]), np.ones(2))
     assert null_directions(_two(), same) == (words,)
+    # Both alone: one sentence names them.
+    (both,) = null_directions(_two(), NullSpace(np.eye(2), np.ones(2)))
+    assert both == "a, b leave no trace in this recording: excite them or measure them by other means"
 
 
 def test_k11_names_its_null_directions_on_real_information(noisy: Case) -> None:
