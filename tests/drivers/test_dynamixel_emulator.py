@@ -21,9 +21,10 @@ from dynamixel_sdk import (
     PortHandler,
 )
 
-from deal_hw.clock import MonotonicClock
+from deal_hw.clock import Clock, MonotonicClock, VirtualClock
 from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole.dynamixel.connect import dynamixel_robot, parse_port
+from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
 from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS
 from deal_hw.drivers.cartpole.dynamixel.emulator import ServoEmulator, dynamixel_emulator
@@ -31,8 +32,11 @@ from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.cartpole.faults import Hazards, ServoFaults
 from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.transports.serial_transport import SerialTransport
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError
 from deal_hw.findings import Finding, Level
+from deal_hw.transport import Transport
 
 TORQUE_ENABLE, LED, GOAL_POSITION, PRESENT_POSITION, REALTIME_TICK = 64, 65, 116, 132, 120
 
@@ -159,9 +163,15 @@ def test_a_port_of_another_rate_hears_nothing(monkeypatch: pytest.MonkeyPatch) -
 
 
 def findings(faults: ServoFaults, tmp_path: Path) -> list[Finding]:
-    """Return what the doctor finds on emulated servos."""
-    with emulated(faults) as (path, _):
-        return list(examine_servos(path + PATIENT, MonotonicClock(), tmp_path))
+    """Return what the doctor finds on emulated servos, whose silence takes no time."""
+    clock = VirtualClock()
+    device = DynamixelDevice(nominal_truth(), DynamixelSettings(baud_rate=faults.servo_baud_rate), faults)
+
+    def at(path: str, rate: int, _: Clock) -> Transport:
+        device.host_baud_rate = rate
+        return VirtualTransport(device, clock)
+
+    return list(examine_servos("servos", clock, tmp_path, at))
 
 
 def test_doctor_lists_servos(tmp_path: Path) -> None:
@@ -199,6 +209,20 @@ def test_doctor_tells_what_is_wrong(faults: ServoFaults, says: str, remedy: str,
     wrong = [f for f in findings(faults, tmp_path) if f.level is Level.FAIL]
     assert says in wrong[0].message
     assert re.search(remedy, wrong[0].remedy)
+
+
+def test_doctor_finds_servos_of_another_rate_on_a_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The port itself is set to each rate in turn, and is free again at its end."""
+    monkeypatch.setattr("deal_hw.drivers.cartpole.dynamixel.doctor.BAUD_RATES", (57600, 1_000_000))
+    with emulated(ServoFaults(servo_baud_rate=57600)) as (path, _):
+        found = examine_servos(path + PATIENT, MonotonicClock(), tmp_path)
+        assert [f.message for f in found if f.level is Level.FAIL] == [
+            f"id {servo} is set to 57600 baud, but deal-hw expects 1000000" for servo in (1, 2)
+        ]
+        with SerialTransport(path):
+            pass
 
 
 def test_doctor_reads_the_latency_timer(tmp_path: Path) -> None:

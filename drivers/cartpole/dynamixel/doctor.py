@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +26,7 @@ from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
 from deal_hw.findings import Finding, Level
+from deal_hw.transport import Transport
 
 AREA: Final = "servos"
 _LISTEN_S: Final = 0.1
@@ -35,13 +36,19 @@ _LONG_DELAY_US = 250
 _FAST_BAUD = 1_000_000
 
 
-def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Finding]:
+def examine_servos(
+    port: str,
+    clock: Clock,
+    sysfs: Path = _SYSFS,
+    transport_at: Callable[[str, int, Clock], Transport] = SerialTransport,
+) -> Iterator[Finding]:
     """Yield findings at every baud rate; nothing is written to a servo.
 
     Args:
         port: The port, with settings as for ``--port``.
         clock: For the waiting.
         sysfs: Folder of the kernel's information on serial ports.
+        transport_at: Makes a transport of a path, a baud rate and a clock.
 
     Raises:
         DealHwError: The port cannot be opened.
@@ -51,7 +58,7 @@ def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Fi
     found = 0
     for rate in (settings.baud_rate, *(rate for rate in BAUD_RATES if rate != settings.baud_rate)):
         try:
-            transport = SerialTransport(path, rate, clock)
+            transport = transport_at(path, rate, clock)
             transport.open()
         except DealHwError as error:
             if rate == settings.baud_rate:
