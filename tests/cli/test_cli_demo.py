@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import re
 from pathlib import Path
@@ -12,15 +13,18 @@ from typing import Any
 import mujoco
 import pytest
 
+from deal_hw.calib.pipeline import output_error_fits
 from deal_hw.cli import demo_cartpole, demo_go2
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.demo import Demo, demo
+from deal_hw.cli.deploy import Deploy
 from deal_hw.control.loop import Outcome
+from deal_hw.control.posture import PostureConfig
 from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
-from deal_hw.workflows.running.settings import LinkOptions
+from deal_hw.workflows.running.settings import LegOptions, LinkOptions
 
 
 def beside_in_short(config: Calibrate) -> CalibrateReport:
@@ -35,6 +39,8 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
 ) -> None:
     """Every stage leaves its file, parameters are found within 5 % on average, the table is printed."""
     monkeypatch.setattr(demo_cartpole, "calibrate", beside_in_short)
+    # What a longer deployment shows of the loop, four seconds show, too.
+    monkeypatch.setattr(demo_cartpole, "Deploy", functools.partial(Deploy, seconds=4.0))
     folder = tmp_path / "demo"
     report = demo(Demo(out=folder, profile="sensor", seed=1, episodes=1, steps=2000))
     summary = json.loads((folder / "summary.json").read_text())
@@ -66,13 +72,23 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     assert Path(inspect.split()[2]).is_file() and Path(page.removeprefix("python3 -m webbrowser ")).is_file()
 
 
+def walked_in_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the Go2 stand up faster, walk a part of the profile and lie down faster."""
+    quick = PostureConfig(fold_s=0.5, rise_s=0.8, lie_s=0.8)
+    monkeypatch.setattr(demo_go2, "LegOptions", functools.partial(LegOptions, posture=quick))
+    monkeypatch.setattr(demo_go2, "PROFILE", ((0.0, (0.8, 0.0, 0.0)), (2.0, (0.0, 0.4, 0.8))))
+    monkeypatch.setattr(demo_go2, "PROFILE_S", 4.0)
+    monkeypatch.setattr(demo_go2, "HELDOUT_S", 4.0)
+    # The walk's calibration is judged where it has a test of its own: tests/bench/test_bench_go2_loop.py.
+    monkeypatch.setattr(output_error_fits, "GAIT", dataclasses.replace(output_error_fits.GAIT, fitted_s=2.0))
+
+
 @pytest.mark.slow
 def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A short walk over Zenoh, a few steps of training: all stages leave files, the truth stays apart."""
-    monkeypatch.setattr(demo_go2, "PROFILE", ((0.0, (0.8, 0.0, 0.0)), (3.0, (0.0, 0.4, 0.8))))
-    monkeypatch.setattr(demo_go2, "PROFILE_S", 6.0)
+    walked_in_short(monkeypatch)
     folder = tmp_path / "demo"
     report = demo(Demo(robot="go2", transport="zenoh", out=folder, profile="sensor", seed=2, steps=4800))
     summary = json.loads((folder / "summary.json").read_text())
