@@ -16,7 +16,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
-from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, huber_weights, solve
+from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, solve
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -37,8 +37,6 @@ class RefinementSettings:
         shakes: Spreads of the drawn start states where contacts stop the solver, in standard deviations.
         shake_count: Draws of each.
         shaken: Share of the cost above which a draw is the last one: then the model is wrong.
-        robust_rounds: Rounds of Huber's weights, see :func:`refine_robust`.
-        robust_iterations: Most steps of each.
         rounds: Most rounds of weights for exact start states.
         round_iterations: Most steps of each.
         given_chi2: Chi2 at the truth for exact start states, in most windows. A kink magnifies rounding in a
@@ -58,8 +56,6 @@ class RefinementSettings:
     shakes: tuple[float, ...] = (0.5, 0.25, 0.12)
     shake_count: int = 60
     shaken: float = 0.95
-    robust_rounds: int = 3
-    robust_iterations: int = 4
     rounds: int = 4
     round_iterations: int = 4
     given_chi2: float = 1e-9
@@ -230,24 +226,6 @@ def _refined(shooting: Shooting, point: Point, normal: Normal, used: int) -> Ref
 def _degrees(shooting: Shooting, normal: Normal) -> int:
     """Return the residuals' degrees of freedom; at least 1."""
     return max(normal.count - len(shooting.problem.space) - (not shooting.fixed_latency), 1)
-
-
-def refine_robust(refined: Refined) -> Refined:
-    """Continue a refinement, in its windows, with less weight on large residuals.
-
-    The windows' standard deviations are divided by the roots of the weights. So normal equations, intervals
-    and start states use the same weights. ``chi2`` keeps equal weights, or the loss would hide model error.
-    """
-    plain, found, iterations = refined.shooting, refined, refined.iterations
-    for _ in range(SETTINGS.robust_rounds):
-        data = [
-            dataclasses.replace(d, std=d.std / np.sqrt(huber_weights(r)))
-            for d, r in zip(plain.data, plain.residuals(found.point), strict=True)
-        ]
-        found = refine_windows(plain.on(data), found.point, SETTINGS.robust_iterations)
-        iterations += found.iterations
-    chi2 = plain.cost(found.point) / _degrees(plain, found.normal)
-    return dataclasses.replace(found, chi2=chi2, iterations=iterations)
 
 
 def at_parameters(

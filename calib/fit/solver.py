@@ -237,13 +237,11 @@ class RobustSettings:
     Attributes:
         huber: Residuals beyond this many standard deviations weigh less; 95 % as efficient as least squares
             on noise (Huber 1964).
-        heavy_tails: Kurtosis (noise: 3) above which a robust fit is tried.
         least_scale: Smallest residual scale; smaller residuals of noise-free recordings are rounding [rad or
             m].
     """
 
     huber: float = 1.345
-    heavy_tails: float = 6.0
     least_scale: float = 1e-9
 
 

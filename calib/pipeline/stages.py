@@ -36,10 +36,8 @@ from deal_hw.calib.fit.refinement import (
     local_fit,
     part_of,
     refine,
-    refine_robust,
     window_stages,
 )
-from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
@@ -331,15 +329,12 @@ class Refinement(Fits):
         if not run.settings.cross_validation or floating or conclusive(run.problem, refined):
             return None
         run.say("cross-validation", "does the refinement predict unseen data better?")
-        robust = run.settings.robust and kurtosis(refined.normal.residual) > ROBUST.heavy_tails
         # Drawn after all searches, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
         # A fold's search needs no more generations than that on all data, and ends as early.
         generations = max(len(searched.trace), self.restarts.fewest_generations)
         less = dataclasses.replace(run.budget, generations=generations, brief=brief)
-        return choose(
-            run.problem, run.attempts.search, less, seed, refined.shooting.length, searched.steps, robust
-        )
+        return choose(run.problem, run.attempts.search, less, seed, refined.shooting.length, searched.steps)
 
 
 def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
@@ -414,8 +409,6 @@ def conclude_fit(
     if whole is not None:
         refined = whole.refined[whole.best]
     decided = whole is not None or problem.fixed_latency_s is not None
-    if choice is not None and choice.chosen == "robust refinement":
-        refined = refine_robust(refined)
     refined = with_rows(refined)
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:

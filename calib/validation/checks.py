@@ -42,9 +42,6 @@ class Validation:
     cross_validation: bool = True
     """Where the residual is unexplained, keep the refinement only if it predicts better on inner folds."""
 
-    robust: bool = False
-    """Try Huber's loss on those folds, too, where the residual has heavy tails."""
-
     split_half: bool = True
     """Refine two halves of the data alone and compare."""
 

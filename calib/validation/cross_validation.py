@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem, longest_windows
-from deal_hw.calib.fit.refinement import refine, refine_robust
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -82,12 +82,10 @@ def choose(
     seed: int,
     length: int,
     search_steps: int,
-    robust: bool = False,
 ) -> Choice:
     """Fit every candidate without each fold and compare the predictions of that fold.
 
     The search on all data cost ``search_steps`` physics steps. Predictions have ``length`` samples.
-    ``robust`` adds the robust refinement.
     """
     window_s = length * problem.episodes[0].period_s
     if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
@@ -98,14 +96,10 @@ def choose(
     def fits(train: Problem, fold: int) -> dict[str, Member]:
         searched = search.run(train, budget, np.random.default_rng([seed, fold]))
         refined = refine(train, searched.estimate, searched.latency_s)
-        found = {
+        return {
             "search": (searched.estimate, searched.latency_s),
             "refinement": (refined.theta, refined.latency_s),
         }
-        if robust:
-            weighed = refine_robust(refined)
-            found["robust refinement"] = weighed.theta, weighed.latency_s
-        return found
 
     def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
         return prediction_error(test, members, window_s)

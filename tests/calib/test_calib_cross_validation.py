@@ -11,7 +11,8 @@ from fakes.fixed_search import FixedSearch
 
 from deal_hw.bench.tasks import Case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined, at_parameters, refine_robust, refine_windows
+from deal_hw.calib.fit.output_error import Recipe, fit_output_error
+from deal_hw.calib.fit.refinement import Refined, at_parameters
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
@@ -106,7 +107,7 @@ def test_huber_weights_by_hand() -> None:
     assert kurtosis([np.array([1.0, 0.0, 0.0, -1.0, 0.0])]) == 1.0
 
 
-def test_robust_refinement_shrugs_off_wild_samples(
+def test_robust_fit_shrugs_off_wild_samples(
     noisy: Case, noisy_problem: Problem, noisy_refined: Refined
 ) -> None:
     """A cart sample in the middle of each window off by 10 mm: Huber's loss stays nearer to the clean fit."""
@@ -121,14 +122,9 @@ def test_robust_refinement_shrugs_off_wild_samples(
     )
     # The noise is that of the clean recording: an outlier is what noise does not make.
     spoilt.noise, spoilt.starts = noisy_problem.noise, noisy_problem.starts
-    shooting = Shooting(spoilt, noisy_refined.shooting.length)
-    point = shooting.start(
-        noisy_refined.theta, noisy.latency_s, noisy_refined.shooting.states(noisy_refined.point)
-    )
-    plain = refine_windows(shooting, point, 6)
+    start, equal = (noisy_refined.theta, noisy.latency_s), Recipe(seconds=0.2)
+    clean, plain = (fit_output_error(p, *start, equal) for p in (noisy_problem, spoilt))
     assert kurtosis(plain.normal.residual) > 6.0
-    robust = refine_robust(plain)
-    scaled = [spoilt.space.to_scale(p.theta) for p in (noisy_refined, plain, robust)]
+    robust = fit_output_error(spoilt, *start, Recipe(seconds=0.2, robust=True))
+    scaled = [spoilt.space.to_scale(p.theta) for p in (clean, plain, robust)]
     assert np.linalg.norm(scaled[2] - scaled[0]) < 0.5 * np.linalg.norm(scaled[1] - scaled[0])
-    # What it leaves out of the loss it does not leave out of the verdict.
-    assert robust.chi2 > 1.3
