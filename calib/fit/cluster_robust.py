@@ -135,7 +135,7 @@ def _clustered(level: _Level, length: int) -> Clustered:
 def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> _Level:
     shifts, expected, follows = [], [], []
     for of_episode in rows:
-        J, normal = of_episode.eliminated()
+        J = of_episode.following
         W, R, P = J.shape
         S = of_episode.start.shape[2]
         channels = (R - S) // samples
@@ -150,7 +150,9 @@ def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: i
             information[:, p] = np.einsum("wrp,wrq->wpq", Jp, Jp)
             if S and parts > 1:
                 cross = np.einsum("wrs,wrp->wsp", jsp, Jp)
-                start[:, p] = np.einsum("wsp,wsq->wpq", cross, np.linalg.solve(normal, cross))
+                start[:, p] = np.einsum(
+                    "wsp,wsq->wpq", cross, np.linalg.solve(of_episode.start_normal, cross)
+                )
         blocks = [np.concatenate(list(x)) for x in (score, information, start)]
         if group > 1:
             edges = np.arange(0, max(W - group + 1, 1), group)

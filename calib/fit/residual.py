@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Point:
     velocity: tuple[FloatArray, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WindowRows:
     """Linearised residuals of one episode's windows; the last S rows are the prior of the start states.
 
@@ -74,27 +75,25 @@ class WindowRows:
     parameter: FloatArray
     start: FloatArray
 
-    def eliminated(self) -> tuple[FloatArray, FloatArray]:
-        """Eliminate the start states.
+    @cached_property
+    def start_normal(self) -> FloatArray:
+        """Normal matrices of the start states, (W, S, S)."""
+        return np.asarray(np.einsum("wri,wrj->wij", self.start, self.start))
 
-        Returns:
-            The derivatives by the parameters with following start states, (W, R, K + 1), and the start
-            states' normal matrices, (W, S, S).
-        """
-        js = self.start
-        normal = np.einsum("wri,wrj->wij", js, js)
-        gain = np.linalg.solve(normal, np.einsum("wri,wrj->wij", js, self.parameter))
-        return self.parameter - np.einsum("wrs,wsp->wrp", js, gain), normal
+    def without_starts(self, columns: FloatArray) -> FloatArray:
+        """Return columns, (W, R, n), without their projection on the start states."""
+        moved = np.linalg.solve(self.start_normal, np.einsum("wrs,wri->wsi", self.start, columns))
+        return np.asarray(columns - np.einsum("wrs,wsi->wri", self.start, moved))
 
-    def without_starts(self, normal: FloatArray, x: FloatArray | None = None) -> FloatArray:
-        """Return columns without their projection on the start states, whose normal matrices are given.
+    @property
+    def following(self) -> FloatArray:
+        """Derivatives by parameters and latency with start states that follow, (W, R, K + 1)."""
+        return self.without_starts(self.parameter)
 
-        Columns ``x`` are (W, R, n); by default the residual, (W, R).
-        """
-        columns = self.residual[..., None] if x is None else x
-        moved = np.linalg.solve(normal, np.einsum("wrs,wri->wsi", self.start, columns))
-        left = columns - np.einsum("wrs,wsi->wri", self.start, moved)
-        return np.asarray(left[..., 0] if x is None else left)
+    @property
+    def rest(self) -> FloatArray:
+        """The residual that no start state explains, (W, R)."""
+        return np.asarray(self.without_starts(self.residual[..., None])[..., 0])
 
 
 @dataclass(frozen=True, slots=True)

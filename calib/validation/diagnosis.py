@@ -197,31 +197,27 @@ class Evidence:
     names: Sequence[str]
 
     @cached_property
-    def _eliminated(self) -> list[tuple[FloatArray, FloatArray]]:
-        return [rows.eliminated() for rows in self.rows]
+    def _following(self) -> list[FloatArray]:
+        return [rows.following for rows in self.rows]
 
     @cached_property
     def _rest(self) -> list[FloatArray]:
-        """The residual without its projection on the start states, (W, R) per episode."""
-        return [
-            rows.without_starts(normal) for rows, (_, normal) in zip(self.rows, self._eliminated, strict=True)
-        ]
+        return [rows.rest for rows in self.rows]
 
     @cached_property
     def _columns(self) -> dict[int, list[FloatArray]]:
-        """Each signature's columns without theirs, by its identity; rows of the prior are 0."""
+        """Each signature's columns without what start states explain, by its identity."""
 
-        def left(rows: WindowRows, eliminated: tuple[FloatArray, FloatArray], x: FloatArray) -> FloatArray:
-            padded = np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0)))
-            return rows.without_starts(eliminated[1], padded)
+        def left(rows: WindowRows, x: FloatArray) -> FloatArray:
+            # Rows of the start states' prior are 0.
+            return rows.without_starts(np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0))))
 
-        return {id(s): list(map(left, self.rows, self._eliminated, s.columns)) for s in self.found}
+        return {id(s): list(map(left, self.rows, s.columns)) for s in self.found}
 
     def _design(self, taken: Sequence[Signature]) -> list[FloatArray]:
         """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
         columns = [self._columns[id(s)] for s in taken]
-        effective = (J for J, _ in self._eliminated)
-        return [np.concatenate(parts, axis=2) for parts in zip(effective, *columns, strict=True)]
+        return [np.concatenate(parts, axis=2) for parts in zip(self._following, *columns, strict=True)]
 
     def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return each window's normal matrix, (W, n, n), and vector, (W, n), squares, (W,), and the prior."""
@@ -249,7 +245,7 @@ class Evidence:
     def count(self) -> int:
         """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
         measured = sum(int(np.count_nonzero(r)) for r in self._rest)
-        return max(measured - sum(len(n) * int(n.shape[1]) for _, n in self._eliminated), 1)
+        return max(measured - sum(len(r.start) * int(r.start.shape[2]) for r in self.rows), 1)
 
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""

@@ -278,8 +278,7 @@ def _refitted(
     P = len(belief)
     cost, gradient, hessian = 0.0, np.zeros(P), np.diag(belief)
     for one in rows:
-        jacobian, normal = one.eliminated()
-        residual = one.without_starts(normal)
+        jacobian, residual = one.following, one.rest
         cost += float(np.sum(residual**2))
         gradient += np.einsum("wri,wr->i", jacobian, residual)
         hessian += np.einsum("wri,wrj->ij", jacobian, jacobian)

@@ -82,9 +82,9 @@ def test_blocks_grow_while_neighbours_hang_together() -> None:
 def test_start_states_are_eliminated() -> None:
     """What a window's own offset explains leaves no derivative: columns are centred inside each window."""
     design = np.random.default_rng(2).normal(size=(3, 6, 2))
-    left, normal = _rows(np.zeros((3, 6)), design, np.ones((3, 6, 1))).eliminated()
-    assert left[:, :6] == pytest.approx(design - design.mean(axis=1, keepdims=True), abs=1e-6)
-    assert normal == pytest.approx(np.full((3, 1, 1), 6.0))
+    rows = _rows(np.zeros((3, 6)), design, np.ones((3, 6, 1)))
+    assert rows.following[:, :6] == pytest.approx(design - design.mean(axis=1, keepdims=True), abs=1e-6)
+    assert rows.start_normal == pytest.approx(np.full((3, 1, 1), 6.0))
 
 
 def test_offsets_of_windows_do_not_bias_the_ratio_of_parts_of_windows() -> None:
@@ -92,7 +92,7 @@ def test_offsets_of_windows_do_not_bias_the_ratio_of_parts_of_windows() -> None:
     rng = np.random.default_rng(3)
     design = rng.normal(size=(4, 40, 2))
     start = np.ones((4, 40, 1))
-    effective = _rows(np.zeros((4, 40)), design, start).eliminated()[0][:, :40]
+    effective = _rows(np.zeros((4, 40)), design, start).following[:, :40]
     bread = np.linalg.inv(np.einsum("whp,whq->pq", effective, effective))
     ratios, blocks = [], 0
     for _ in range(400):
