@@ -20,7 +20,7 @@ from deal_hw.calib.fit.refinement import refine
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,6 +136,15 @@ def on_folds(
     return Choice(chosen, {n: tuple(v) for n, v in found.items()}, window_s)
 
 
+def fold_numbers(count: int, folds: int, rounds: int) -> IntArray:
+    """Return the fold that leaves out each of ``count`` items in a row, (count,).
+
+    Each fold leaves out ``rounds`` stretches of items that follow each other; one where items are too few.
+    """
+    rounds = rounds if count >= rounds * folds else 1
+    return np.asarray(np.arange(count) * folds * rounds // max(count, 1) % folds)
+
+
 def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each of ``count`` folds the samples of each recording that it leaves out, (T,) each.
 
@@ -147,13 +156,13 @@ def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.N
     unit = motion_numbers(episodes)
     if unit[-1] + 1 < count:
         unit = list(range(len(episodes)))
-    found: list[list[npt.NDArray[np.bool_]]] = [[] for _ in range(count)]
-    for number, episode in zip(unit, episodes, strict=True):
-        T = len(episode.sample)
-        block = np.arange(T) * count * SETTINGS.blocks // T if len(episodes) < count else np.full(T, number)
-        for fold in range(count):
-            found[fold].append(block % count == fold)
-    return found
+    left_out = [
+        fold_numbers(len(e.sample), count, SETTINGS.blocks)
+        if len(episodes) < count
+        else np.full(len(e.sample), number % count)
+        for number, e in zip(unit, episodes, strict=True)
+    ]
+    return [[of_episode == fold for of_episode in left_out] for fold in range(count)]
 
 
 def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]]:
@@ -163,9 +172,8 @@ def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]
     well. The use of a calibration comes later in time.
     """
     lengths = [len(episode.sample) for episode in problem.episodes]
-    fold = np.arange(sum(lengths)) * count // sum(lengths)
-    parts = np.split(fold, np.cumsum(lengths)[:-1])
-    return [[part == number for part in parts] for number in range(count)]
+    parts = np.split(fold_numbers(sum(lengths), count, 1), np.cumsum(lengths)[:-1])
+    return [[part == fold for part in parts] for fold in range(count)]
 
 
 def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:

@@ -22,7 +22,8 @@ from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
-from deal_hw.calib.validation.random_delay import FOLDS, random_delay
+from deal_hw.calib.validation.cross_validation import fold_numbers
+from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
 from deal_hw.calibration import Alarm, listed, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -35,6 +36,8 @@ class DiagnosisSettings:
     """Settings of :func:`diagnose`.
 
     Attributes:
+        folds: Number of folds over the windows.
+        rounds: Stretches of consecutive windows that each fold leaves out.
         noticed: Least share of the held-out squared residual that it explains [-].
         most: Most named causes.
         alike: Least explained share of a named body's mass, relative to the best one's [-].
@@ -50,6 +53,8 @@ class DiagnosisSettings:
         burst_size: Least squared residual of a burst over the median [-].
     """
 
+    folds: int = 4
+    rounds: int = 2
     noticed: float = 0.03
     most: int = 3
     alike: float = 0.8
@@ -250,9 +255,9 @@ class Evidence:
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
         matrix, vector, squares, prior = self._normal(taken)
-        fold = FOLDS.of(len(squares))
+        fold = fold_numbers(len(squares), SETTINGS.folds, SETTINGS.rounds)
         cost = 0.0
-        for k in range(FOLDS.parts):
+        for k in range(SETTINGS.folds):
             mine, others = fold == k, fold != k
             found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
             each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)

@@ -17,28 +17,7 @@ from scipy.optimize import Bounds, minimize
 
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation.signatures import SignatureResponse
-from deal_hw.types import FloatArray, IntArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Folds:
-    """Windows that are left out in turn.
-
-    Attributes:
-        parts: Number of turns.
-        rounds: Stretches of consecutive windows that each turn leaves out; one where windows are too few.
-    """
-
-    parts: int = 4
-    rounds: int = 2
-
-    def of(self, windows: int) -> IntArray:
-        """Return the turn in which each window is left out, (W,)."""
-        rounds = self.rounds if windows >= self.rounds * self.parts else 1
-        return np.asarray(np.arange(windows) * rounds * self.parts // max(windows, 1) % self.parts)
-
-
-FOLDS = Folds()
+from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,12 +25,14 @@ class RandomDelaySettings:
     """Settings of :func:`random_delay`.
 
     Attributes:
+        fewest: Fewest windows.
         windows: Most windows, spread over the recordings.
         rows: Residuals of each window, from its start.
         slow_s: Correlation time of the slow force [s].
         ratio: Least and largest ratio of the mean variances of a process and the noise [-].
     """
 
+    fewest: int = 4
     windows: int = 30
     rows: int = 240
     slow_s: float = 0.1
@@ -87,7 +68,7 @@ def random_delay(
     """
     every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
     chosen = every[:: max(-(-len(every) // SETTINGS.windows), 1)]
-    if len(chosen) < FOLDS.parts or not any(np.any(a.change) for a in answers):
+    if len(chosen) < SETTINGS.fewest or not any(np.any(a.change) for a in answers):
         return None
     windows = [_Window.of(rows[e], answers[e], w) for e, w in chosen]
     change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])

@@ -16,8 +16,10 @@ from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.checks import with_causes
+from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
-from deal_hw.calib.validation.random_delay import FOLDS, random_delay
+from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
+from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
@@ -193,14 +195,14 @@ def test_direction_is_kept_where_a_joint_is_still() -> None:
 
 
 @pytest.mark.parametrize("windows", range(4, 12))
-def test_no_turn_leaves_out_nothing(windows: int) -> None:
-    """A recording of 4 s has four or five windows: each turn leaves out at least one."""
-    assert set(FOLDS.of(windows)) == set(range(FOLDS.parts))
+def test_no_fold_leaves_out_nothing(windows: int) -> None:
+    """A recording of 4 s has four or five windows: each fold leaves out at least one."""
+    assert set(fold_numbers(windows, 4, 2)) == set(range(4))
 
 
 def test_every_window_is_left_out_once_in_stretches() -> None:
-    """16 windows in four turns, each of two stretches of two."""
-    assert FOLDS.of(16).tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 2
+    """16 windows in four folds, each of two stretches of two."""
+    assert fold_numbers(16, 4, 2).tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 2
 
 
 def _pushed(
@@ -242,7 +244,7 @@ def test_few_windows_end_in_an_answer_or_none(windows: int) -> None:
         answer, response=answer.response[:, :windows], change=answer.change[:windows]
     )
     found = random_delay([few], [answers], PERIOD_S)
-    assert (found is None) == (windows < FOLDS.parts)
+    assert (found is None) == (windows < RANDOM_DELAY.fewest)
 
 
 @pytest.mark.parametrize("slow", [False, True])
