@@ -19,10 +19,9 @@ from deal_hw.calib.data.innovations import (
     cut,
     is_noisy,
     linearise,
-    measurements,
     whitened_residual,
 )
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, measurements
 from deal_hw.calib.fit.intervals import uncertainty
 from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise

@@ -141,7 +141,7 @@ def compute_sensitivity(problem: Problem) -> Sensitivity:
     for change, data in _changes(problem, theta):
         change = change / data.std
         # A member that diverges at the end of its range does have an effect.
-        change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
+        change = np.where(np.isfinite(change), change, np.where(data.reported, np.inf, 0.0))
         effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
     return Sensitivity(space.names, effect)
 
@@ -165,7 +165,7 @@ def jumps(problem: Problem) -> dict[str, float]:
     values[1 + K :] += SETTINGS.push * np.diag(inwards)
     changes = []
     for change, data in _changes(problem, space.from_scale(values)):
-        largest = np.where(np.isfinite(data.std), change, 0.0).max(axis=(2, 3))
+        largest = np.where(data.reported, change, 0.0).max(axis=(2, 3))
         changes.append(np.nan_to_num(largest, nan=0.0, posinf=0.0))
     nudged, pushed = np.split(np.concatenate(changes, axis=1), 2)
     jumping = nudged > np.maximum(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
+from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, measurements
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints
@@ -217,8 +217,3 @@ def explained(problem: Problem, centre: Members, ticks: int) -> float:
     windows = cut(problem, ticks)
     chi2 = float(np.sum(whitened_residual(problem, centre, centre, windows) ** 2)) / measurements(windows)
     return chi2 if np.isfinite(chi2) else float("inf")
-
-
-def measurements(windows: Sequence[WindowData]) -> int:
-    """Return the number of measurements in windows; samples that filled a gap are none."""
-    return sum(int(np.isfinite(data.std).sum()) for data in windows)

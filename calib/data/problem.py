@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -35,6 +35,9 @@ from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.recordings.episode import SampledEpisode, fill_gaps
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray
+
+Member = tuple[FloatArray, float]
+"""Physical parameters, (K,), and latency [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,11 @@ class WindowData:
     prior_mean: FloatArray
     prior_std: FloatArray
     prior_counts: Mask
+
+    @property
+    def reported(self) -> Mask:
+        """Which samples were measured, (W, H, M); the others filled a gap."""
+        return np.asarray(np.isfinite(self.std))
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,13 +367,13 @@ class Problem:
         position: FloatArray | None = None,
         velocity: FloatArray | None = None,
     ) -> MemberPrediction:
-        """Predict windows with N parameter vectors, (N, K), and total latencies, (N,) [s].
+        """Predict windows with N parameter vectors, (N, K), and total latencies, (N,) [s], at least 0.
 
         Start positions and velocities are (W, C) or (N, W, C); the smoothed ones by default.
         """
         batch = self.batch(len(theta))
         batch.set_parameters(theta)
-        path = setpoints(batch, self.episodes[data.episode], latency_s)
+        path = setpoints(batch, self.episodes[data.episode], np.maximum(latency_s, 0.0))
         return self.predict_along(batch, path, data, position, velocity)
 
     def predict_along(
@@ -416,6 +424,23 @@ def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
             if length <= 4:
                 raise
             length = max(int(0.8 * length), 4)
+
+
+def prediction_errors(
+    problem: Problem, members: Sequence[Member], seconds: float
+) -> Iterator[tuple[WindowData, FloatArray]]:
+    """Yield windows as :func:`longest_windows` and the errors of predictions from smoothed states there.
+
+    Errors are (N, W, H, M) for N members.
+    """
+    theta, latency = np.stack([m[0] for m in members]), np.array([m[1] for m in members])
+    for data in longest_windows(problem, seconds):
+        yield data, problem.predict(theta, latency, data).observed - data.measured
+
+
+def measurements(windows: Sequence[WindowData]) -> int:
+    """Return the number of measurements in windows."""
+    return sum(int(np.count_nonzero(data.reported)) for data in windows)
 
 
 def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:

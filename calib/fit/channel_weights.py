@@ -109,7 +109,7 @@ def _fitted(problem: Problem, fit: Refined, scale: FloatArray, fine: Mask, secon
 
 def _rms(fit: Refined) -> FloatArray:
     """Return the root mean square of each channel's whitened residual, (M,)."""
-    reported = [np.isfinite(d.std) for d in fit.shooting.data]
+    reported = [d.reported for d in fit.shooting.data]
     return channel_scale(fit.shooting.residuals(fit.point), reported, robust=False)
 
 

@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, WindowData, longest_windows
+from deal_hw.calib.data.problem import Member, Problem, WindowData, longest_windows, prediction_errors
 from deal_hw.calib.fit.residual import Normal, Point, Shooting
 from deal_hw.calib.fit.solver import (
     SolverSettings,
@@ -169,26 +169,21 @@ def fit_output_error(
     )
 
 
-def prediction_rmse(
-    problem: Problem, members: Sequence[tuple[FloatArray, float]], seconds: float
-) -> FloatArray:
+def prediction_rmse(problem: Problem, members: Sequence[Member], seconds: float) -> FloatArray:
     """Return the root mean square errors of predictions from smoothed states, (N, M).
 
-    Windows last ``seconds``. Members are parameters, (K,), and latency [s].
+    Windows last ``seconds``.
     """
-    theta, latency = np.stack([m[0] for m in members]), np.array([m[1] for m in members])
     squares, count = np.zeros((len(members), len(problem.channels))), np.zeros(len(problem.channels))
-    for data in longest_windows(problem, seconds):
-        seen = np.isfinite(data.std)
-        error = problem.predict(theta, np.maximum(latency, 0.0), data).observed - data.measured
-        squares += np.sum(np.where(seen, error, 0.0) ** 2, axis=(1, 2))
-        count += np.sum(seen, axis=(0, 1))
+    for data, error in prediction_errors(problem, members, seconds):
+        squares += np.sum(np.where(data.reported, error, 0.0) ** 2, axis=(1, 2))
+        count += np.sum(data.reported, axis=(0, 1))
     return np.asarray(np.sqrt(np.where(np.isfinite(squares), squares, np.inf) / np.maximum(count, 1)))
 
 
 def _errors(data: WindowData, residual: FloatArray) -> FloatArray:
     """Return prediction minus measurement, (W, H, M), from whitened residuals; 0 for missing samples."""
-    return np.asarray(np.nan_to_num(residual) * np.where(np.isfinite(data.std), data.std, 0.0))
+    return np.asarray(np.nan_to_num(residual) * np.where(data.reported, data.std, 0.0))
 
 
 def _weighed(
@@ -205,7 +200,7 @@ def _weighed(
     """
     problem = plain.problem
     errors = [_errors(d, r) for d, r in zip(plain.data, plain.residuals(point), strict=True)]
-    seen = [np.isfinite(d.std) for d in plain.data]
+    seen = [d.reported for d in plain.data]
     scale = channel_scale(errors, seen, recipe.robust)
     correlation = 1.0
     if correlated:

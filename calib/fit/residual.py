@@ -279,8 +279,7 @@ class Shooting:
             hessian += np.einsum("wri,wrj->ij", jp, jp)
             gradient += np.einsum("wri,wr->i", jp, r_flat)
             cost += float(np.sum(r_flat**2))
-            # Samples that filled a gap have an infinite standard deviation: they are no measurements.
-            count += int(np.isfinite(data.std).sum())
+            count += int(np.count_nonzero(data.reported))
             if self.given:
                 back.append((np.zeros((W, 2 * C, K + 1)), np.zeros((W, 2 * C))))
                 if keep:
@@ -419,7 +418,7 @@ class Shooting:
         self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray
     ) -> MemberPrediction:
         theta = self.problem.space.from_scale(values[:, :-1])
-        return self.problem.predict(theta, np.maximum(values[:, -1], 0.0), data, x, v)
+        return self.problem.predict(theta, values[:, -1], data, x, v)
 
 
 def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:

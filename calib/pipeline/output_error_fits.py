@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import (
     MISMATCH,
     Uncertainty,
@@ -43,7 +43,6 @@ from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import Validation, unexplained, with_causes, with_step
 from deal_hw.calib.validation.cross_validation import (
     Choice,
-    Member,
     fold_masks,
     motion_numbers,
     on_folds,

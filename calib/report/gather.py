@@ -241,7 +241,7 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
     for data in windows:
         whitened = whitened_residual(problem, centre, centre, [data]).reshape(data.measured.shape)
         # A missing sample has weight zero: its zero is no residual.
-        whitened = np.where(np.isfinite(data.std) & np.isfinite(whitened), whitened, np.nan)
+        whitened = np.where(data.reported & np.isfinite(whitened), whitened, np.nan)
         episode = problem.episodes[data.episode]
         found.append(
             Residuals(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.problem import Problem, longest_windows
+from deal_hw.calib.data.problem import Member, Problem, prediction_errors
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -39,9 +39,6 @@ class CrossValidationSettings:
 
 
 SETTINGS = CrossValidationSettings()
-
-Member = tuple[FloatArray, float]
-"""Physical parameters, (K,), and latency [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,13 +191,10 @@ def prediction_error(problem: Problem, fits: Sequence[Member], seconds: float) -
 
     Predictions start from smoothed states and last ``seconds``, or less where no stretch is so long.
     """
-    theta, latency = np.stack([f[0] for f in fits]), np.array([f[1] for f in fits])
     total, count = np.zeros(len(fits)), 0
-    for data in longest_windows(problem, seconds):
-        observed = problem.predict(theta, np.maximum(latency, 0.0), data).observed
-        error = (observed - data.measured) / data.std
+    for data, error in prediction_errors(problem, fits, seconds):
         # A diverged member counts as an error of the whole range.
-        span = np.ptp(data.measured, axis=(0, 1)) / data.std
-        total += np.sum(np.where(np.isfinite(error), error, span) ** 2, axis=(1, 2, 3))
-        count += int(np.count_nonzero(np.isfinite(data.std)))
+        error = np.where(np.isfinite(error), error, np.ptp(data.measured, axis=(0, 1))) / data.std
+        total += np.sum(error**2, axis=(1, 2, 3))
+        count += int(np.count_nonzero(data.reported))
     return np.asarray(np.sqrt(total / max(count, 1)))

@@ -19,8 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from deal_hw.calib.data.innovations import measurements
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Problem, measurements, samples_in
 from deal_hw.calib.fit.intervals import MISMATCH
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calibration import Alarm
