@@ -47,34 +47,36 @@ SETTINGS = ClusterSettings()
 
 @dataclass(frozen=True, slots=True)
 class Clustered:
-    """Uncertainty of coordinates relative to independent residuals of unit variance.
+    """Blocks of one length, and the uncertainty of P coordinates that they show.
 
     Attributes:
-        ratio: Variance over that of independent residuals, (P,).
-        degrees: Effective number of blocks that determine each coordinate, (P,).
-        blocks: Number of blocks.
         block_samples: Samples of a block.
-    """
-
-    ratio: FloatArray
-    degrees: FloatArray
-    blocks: int
-    block_samples: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Level:
-    """Blocks of one length.
-
-    Attributes:
         shift: Shift of the estimate by each block's score, (B, P).
         expected: Its variance under independent residuals of unit variance, (B, P).
         follows: Blocks that come right after the one before them, (B - 1,).
     """
 
+    block_samples: int
     shift: FloatArray
     expected: FloatArray
     follows: npt.NDArray[np.bool_]
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks B."""
+        return len(self.shift)
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Variance over that of independent residuals of unit variance, (P,)."""
+        power, expected = np.sum(self.shift**2, axis=0), np.sum(self.expected, axis=0)
+        return np.asarray(np.divide(power, expected, out=np.ones_like(power), where=expected > 0))
+
+    @property
+    def degrees(self) -> FloatArray:
+        """Effective number of blocks that determine each coordinate, (P,)."""
+        square, spread = np.sum(self.expected, axis=0) ** 2, np.sum(self.expected**2, axis=0)
+        return np.asarray(np.divide(square, spread, out=np.ones_like(square), where=spread > 0))
 
     @property
     def autocorrelated(self) -> bool:
@@ -82,7 +84,7 @@ class _Level:
         power = np.sum(self.shift**2, axis=0)
         product = np.sum((self.shift[1:] * self.shift[:-1])[self.follows], axis=0)
         correlation = float(np.mean(product / np.maximum(power, 1e-300)))
-        return bool(correlation > 2.0 / np.sqrt(len(self.shift)))
+        return bool(correlation > 2.0 / np.sqrt(self.blocks))
 
 
 def clustered(
@@ -97,18 +99,15 @@ def clustered(
     if not rows:
         return None
     found: Clustered | None = None
-    correlated = True
     for parts, group in _levels(rows, samples):
         length = group * samples // parts
         if length < max(SETTINGS.shortest, 2 * correlation_samples) and parts > 1:
             continue
         level = _level(rows, bread, samples, parts, group)
-        blocks = len(level.shift)
-        if blocks < SETTINGS.fewest_blocks or (
-            found is not None and blocks < SETTINGS.enough_blocks and not correlated
-        ):
+        settled = found is not None and not found.autocorrelated
+        if level.blocks < (SETTINGS.enough_blocks if settled else SETTINGS.fewest_blocks):
             break
-        found, correlated = _clustered(level, length), level.autocorrelated
+        found = level
     return found
 
 
@@ -123,16 +122,7 @@ def _levels(rows: Sequence[WindowRows], samples: int) -> list[tuple[int, int]]:
     return levels
 
 
-def _clustered(level: _Level, length: int) -> Clustered:
-    power, expected = np.sum(level.shift**2, axis=0), np.sum(level.expected, axis=0)
-    seen = expected > 0
-    safe = np.where(seen, expected, 1.0)
-    spread = np.sum(level.expected**2, axis=0)
-    degrees = np.where(seen, safe**2 / np.where(seen & (spread > 0), spread, 1.0), 1.0)
-    return Clustered(np.where(seen, power / safe, 1.0), degrees, len(level.shift), length)
-
-
-def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> _Level:
+def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> Clustered:
     shifts, expected, follows = [], [], []
     for of_episode in rows:
         J = of_episode.following
@@ -163,4 +153,5 @@ def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: i
         shifts.append(g @ bread)
         expected.append(np.maximum(np.einsum("pi,bij,jp->bp", bread, spread, bread), 0.0))
         follows.append(np.concatenate([[False], np.ones(len(g) - 1, dtype=bool)]))
-    return _Level(np.concatenate(shifts), np.concatenate(expected), np.concatenate(follows)[1:])
+    length = group * samples // parts
+    return Clustered(length, np.concatenate(shifts), np.concatenate(expected), np.concatenate(follows)[1:])
