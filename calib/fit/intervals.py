@@ -103,7 +103,6 @@ class Uncertainty:
         covariance: Of the parameters in their own scale, (K, K).
         interval: 90 % intervals, physical, (K, 2).
         latency_interval_s: 90 % interval of the latency [s].
-        verdicts: One per parameter.
         null_directions: Combinations without effect on the recordings, in words.
         alarms: Signs that the model is wrong.
         inflation: Factor on the variance for model error.
@@ -119,7 +118,6 @@ class Uncertainty:
     covariance: FloatArray
     interval: FloatArray
     latency_interval_s: tuple[float, float]
-    verdicts: tuple[Identifiability, ...]
     null_directions: tuple[str, ...]
     alarms: tuple[Alarm, ...]
     inflation: float
@@ -128,17 +126,30 @@ class Uncertainty:
     clustered: Clustered | None
     widened: FloatArray
 
+    @property
+    def verdicts(self) -> tuple[Identifiability, ...]:
+        """How well the data determine each parameter, (K,)."""
+        unit, prior_std = _unit(self.space), self.space.width / np.sqrt(12.0)
+        found: list[Identifiability] = []
+        for k, std in enumerate(np.sqrt(np.diag(self.covariance))):
+            if self.blind[k]:
+                found.append("not identifiable")
+            elif std <= SETTINGS.identifiable_std * unit[k]:
+                found.append("identifiable")
+            else:
+                found.append("weak" if std <= SETTINGS.weak_share * prior_std[k] else "not identifiable")
+        return tuple(found)
+
     def with_alarms(self, *first: Alarm, last: Sequence[Alarm] = ()) -> Uncertainty:
         """Return it with more alarms, before and after its own."""
         return dataclasses.replace(self, alarms=(*first, *self.alarms, *last))
 
     def with_covariance(self, covariance: FloatArray) -> Uncertainty:
-        """Return it with another covariance, (K, K), and the intervals and verdicts that follow from it."""
+        """Return it with another covariance, (K, K), and the intervals that follow from it."""
         return dataclasses.replace(
             self,
             covariance=covariance,
             interval=intervals(self.space, self.theta, covariance, self.blind, self.bound),
-            verdicts=_verdicts(self.space, np.sqrt(np.diag(covariance)), self.blind),
         )
 
     def widened_to(self, std: FloatArray) -> Uncertainty:
@@ -227,7 +238,6 @@ def uncertainty(
         covariance=covariance[:K, :K],
         interval=intervals(space, theta, covariance[:K, :K], blind, bound),
         latency_interval_s=latency,
-        verdicts=_verdicts(space, std[:K], blind),
         null_directions=null_directions(space, unseen),
         alarms=_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
         inflation=inflation,
@@ -314,21 +324,6 @@ def intervals(
     low = np.where(bound < 0, space.low, np.where(whole, space.unnormalize(np.full(K, 0.05)), low))
     high = np.where(bound > 0, space.high, np.where(whole, space.unnormalize(np.full(K, 0.95)), high))
     return np.stack([low, high], axis=1)
-
-
-def _verdicts(
-    space: ParameterSpace, std: FloatArray, blind: npt.NDArray[np.bool_]
-) -> tuple[Identifiability, ...]:
-    unit, prior_std = _unit(space), space.width / np.sqrt(12.0)
-    found: list[Identifiability] = []
-    for k in range(len(space)):
-        if blind[k]:
-            found.append("not identifiable")
-        elif std[k] <= SETTINGS.identifiable_std * unit[k]:
-            found.append("identifiable")
-        else:
-            found.append("weak" if std[k] <= SETTINGS.weak_share * prior_std[k] else "not identifiable")
-    return tuple(found)
 
 
 def _alarms(

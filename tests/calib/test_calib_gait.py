@@ -48,7 +48,6 @@ def known_at(space: ParameterSpace, theta: np.ndarray) -> Uncertainty:
         covariance=SHARE**2 * np.eye(K),
         interval=np.stack([theta / half, theta * half], axis=1),
         latency_interval_s=(0.0, 0.01),
-        verdicts=tuple(["identifiable"] * K),
         null_directions=(),
         alarms=(),
         inflation=1.0,

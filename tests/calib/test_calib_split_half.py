@@ -20,7 +20,7 @@ from deal_hw.calib.validation.split_half import (
     half_of,
     widened_by_split_half,
 )
-from deal_hw.calibration import BEFORE_SEARCH, Identifiability, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 from deal_hw.types import FloatArray
 
@@ -56,9 +56,8 @@ def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
     """Its interval is the range's own 90 %, which need not hold the estimate: no value, and no comparison."""
     problem, K = noisy_problem, len(noisy_problem.space)
     known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
-    nothing: Identifiability = "not identifiable"
     ends = np.stack([problem.space.unnormalize(np.full(K, u)) for u in (0.05, 0.95)], axis=1)
-    blind = dataclasses.replace(known, interval=ends, verdicts=(nothing,) * K)
+    blind = dataclasses.replace(known, interval=ends, blind=np.ones(K, dtype=bool))
     low = problem.space.unnormalize(np.full(K, 0.01))
     split = agreement(known, [low, noisy_refined.theta], [blind, known], 0)
     assert all(row.first[0] is None and row.second[0] is not None for row in split.rows)
