@@ -28,7 +28,6 @@ from deal_hw.calib.data.innovations import (
     Members,
     cut,
     explained,
-    is_noisy,
     linearise,
     predict,
     samples_per_tick,
@@ -37,7 +36,7 @@ from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import KalmanStepper
-from deal_hw.calib.search.resume import State, Stateful
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -87,12 +86,7 @@ class _Deal(KalmanStepper):
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         settings = self.settings
-        self._noisy = is_noisy(self.problem)
-        self._lengths = settings.noisy_ticks if self._noisy else settings.clean_ticks
-        self._least_spread = settings.least_spread
-        if log.budget.brief:
-            self._lengths = self._lengths[:1]
-            self._least_spread = settings.near_spread
+        self._least_spread = settings.near_spread if self._brief else settings.least_spread
         self._most = min(settings.generations, log.budget.generations)
         self._view: _View
         self._enter_stage(0)
@@ -137,10 +131,6 @@ class _Deal(KalmanStepper):
             },
         )
 
-    def load(self, state: State) -> None:
-        self._enter_stage(state["_stage"])
-        super().load(state)
-
     @property
     def _last(self) -> bool:
         return self._stage + 1 == len(self._lengths)
@@ -157,9 +147,8 @@ class _Deal(KalmanStepper):
             self._enter_stage(self._stage + 1)
 
     def _enter_stage(self, stage: int) -> None:
-        self._stage, self._spread = stage, float("inf")
-        if stage:
-            self.kalman.widen(self.settings.widen)
+        super()._enter_stage(stage)
+        self._spread = float("inf")
         kind: type[_View] = _NoisyView if self._noisy else _CleanView
         self._view = kind(self.problem, self.settings, self._lengths[stage], self.rng, stage > 0)
 

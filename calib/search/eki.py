@@ -144,11 +144,28 @@ def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray,
 
 
 class KalmanStepper(Stepper):
-    """A run of ensemble Kalman inversion in logits; needs the setting ``step_clip`` [logits]."""
+    """A run of ensemble Kalman inversion in logits, in stages of windows; a brief run has the first stage.
+
+    It needs the settings ``step_clip`` and ``widen`` [logits], ``noisy_ticks`` and ``clean_ticks``.
+    """
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
+        self._noisy, self._brief = is_noisy(self.problem), log.budget.brief
+        lengths = self.settings.noisy_ticks if self._noisy else self.settings.clean_ticks
+        self._lengths = lengths[:1] if self._brief else lengths
         self.kalman = self.new_ensemble()
+
+    def _enter_stage(self, stage: int) -> None:
+        """Begin a stage; each but the first widens the ensemble."""
+        self._stage = stage
+        if stage:
+            self.kalman.widen(self.settings.widen)
+
+    def load(self, state: State) -> None:
+        """Begin the saved state's stage, and continue there."""
+        self._enter_stage(state["_stage"])
+        super().load(state)
 
     def new_ensemble(self) -> EnsembleKalman:
         """Return an ensemble drawn over the whole range."""
@@ -204,11 +221,6 @@ class _Eki(KalmanStepper):
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
-        problem, settings = self.problem, self.settings
-        self._lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
-        self._brief = log.budget.brief
-        if self._brief:
-            self._lengths = self._lengths[:1]
         self._near = False
         self._restarts = 0
         self._best: tuple[float, FloatArray] | None = None
@@ -261,10 +273,6 @@ class _Eki(KalmanStepper):
             extra={"restarts": self._restarts, "interval": "ensemble spread, uncalibrated"},
         )
 
-    def load(self, state: State) -> None:
-        self._enter_stage(state["_stage"])
-        super().load(state)
-
     @property
     def _stage_over(self) -> bool:
         return (
@@ -275,11 +283,11 @@ class _Eki(KalmanStepper):
         )
 
     def _enter_stage(self, stage: int) -> None:
-        self._stage, self._generation = stage, 0
+        super()._enter_stage(stage)
+        self._generation = 0
         self._windows = cut(self.problem, self._lengths[stage])
         self._offsets = None
         if stage:
-            self.kalman.widen(self.settings.widen)
             # From the second stage on the population is near enough to locate window starts better than a
             # smoother does: linearise around the last generation's most probable start states.
             self._offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self._windows]
