@@ -40,7 +40,15 @@ from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.no_data import nominal
-from deal_hw.calib.validation.checks import Validation, unexplained, with_causes, with_step
+from deal_hw.calib.validation.checks import (
+    SplitHalf,
+    Validation,
+    agreement,
+    unexplained,
+    widened_by_split_half,
+    with_causes,
+    with_step,
+)
 from deal_hw.calib.validation.cross_validation import (
     Choice,
     fold_masks,
@@ -48,7 +56,6 @@ from deal_hw.calib.validation.cross_validation import (
     on_folds,
     time_masks,
 )
-from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_split_half
 from deal_hw.calibration import Z90, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode

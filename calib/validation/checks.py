@@ -1,19 +1,37 @@
-"""Checks after a fit: which ones run, what they change of its uncertainty, and what they report."""
+"""Checks after a fit: which ones run, what they change of its uncertainty, and what they report.
+
+Split-half check: two halves of the data, each refined alone from the estimate on all, must agree. The halves
+are alternating blocks of the refinement's own windows. So no sample is predicted in both, and both hold every
+phase of the motion. It costs less than one stage of the refinement.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import MISMATCH, Uncertainty, correlation_time, names_at_bound
-from deal_hw.calib.fit.refinement import Refined
+import numpy as np
+from scipy.stats import chi2 as chi2_law
+from scipy.stats import norm
+
+from deal_hw.calib.data.problem import Problem, taken
+from deal_hw.calib.fit.intervals import (
+    MISMATCH,
+    Uncertainty,
+    correlation_time,
+    names_at_bound,
+    uncertainty_at,
+    with_rows,
+)
+from deal_hw.calib.fit.refinement import Refined, refine_windows
+from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.validation.diagnosis import PlayFit, diagnose
-from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
-from deal_hw.calibration import Alarm
-from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.calibration import Z90, Alarm, listed
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
+from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,10 +41,19 @@ class CheckSettings:
     Attributes:
         at_end: Distance to an end of the latency range, as a share of it, that counts as at the end [-].
         causes: Most causes of a residual that become alarms; all are in the provenance.
+        half_iterations: Most iterations of each half's fit.
+        most_half_steps: Most physics steps of the split-half check.
+        fewest_windows: Fewest windows that are halved.
+        false_alarms: Probability that the split-half check flags any parameter of a right model [-]: among
+            many parameters, intervals of some halves always miss each other.
     """
 
     at_end: float = 0.01
     causes: int = 2
+    half_iterations: int = 6
+    most_half_steps: float = 3e8
+    fewest_windows: int = 4
+    false_alarms: float = 0.05
 
 
 SETTINGS = CheckSettings()
@@ -134,3 +161,178 @@ def with_causes(
     found = diagnose(problem, refined, fitted)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
     return known.with_alarms(*alarms), [dataclasses.asdict(f) for f in found]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitHalfRow:
+    """One parameter's estimates from two halves of the data.
+
+    Attributes:
+        name: The parameter.
+        first: Estimate and 90 % interval (low, high) of one half. The estimate is None where that half does
+            not identify the parameter: the interval is then the range's own.
+        second: The same of the other half.
+    """
+
+    name: str
+    first: tuple[float | None, float, float]
+    second: tuple[float | None, float, float]
+
+    @property
+    def agree(self) -> bool | None:
+        """Whether the intervals overlap; None where a half does not identify the parameter."""
+        if self.first[0] is None or self.second[0] is None:
+            return None
+        return self.first[1] <= self.second[2] and self.second[1] <= self.first[2]
+
+
+@dataclass(frozen=True, slots=True)
+class SplitHalf:
+    """Result of the split-half check.
+
+    Attributes:
+        rows: One per parameter; empty without a comparison.
+        flagged: Parameters that differ by more than chance.
+        reach: Largest distance of a half's estimate from that on all data, in each parameter's own scale,
+            (K,).
+        scale: Factor on all standard deviations: the root mean square distance of the halves over that which
+            the intervals expect. 1 where chance explains the distance. Tables of particle data use the same
+            factor where measurements disagree.
+        steps: Physics steps used.
+        note: Why nothing was compared.
+    """
+
+    rows: tuple[SplitHalfRow, ...] = ()
+    flagged: tuple[str, ...] = ()
+    reach: FloatArray = field(default_factory=lambda: np.zeros(0))
+    scale: float = 1.0
+    steps: int = 0
+    note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        if not self.rows:
+            return {"note": self.note}
+        return {
+            "parameters": {
+                r.name: {"first": list(r.first), "second": list(r.second), "agree": r.agree}
+                for r in self.rows
+            },
+            "flagged": list(self.flagged),
+            "scale": self.scale,
+            "steps": self.steps,
+        }
+
+    def alarms(self, space: ParameterSpace) -> tuple[Alarm, ...]:
+        """Return one alarm that names all flagged parameters, if there are any."""
+        if not self.flagged:
+            return ()
+        both = {
+            r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g} {space[r.name].unit})"
+            for r in self.rows
+            if r.agree is not None
+        }
+        return (
+            Alarm(
+                "Two halves of the data disagree about "
+                f"{listed([name + both.get(name, '') for name in self.flagged])}.",
+                "A value that depends on the choice of data means that the model is incomplete. The "
+                "intervals were widened to hold both.",
+                "Find what the model lacks (see the other alarms), or fit only motion like that of the task.",
+            ),
+        )
+
+
+def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> SplitHalf:
+    """Refine two halves of the windows alone and compare with ``refined``; the latency stays.
+
+    Parameters that ``known`` calls unidentified are not compared.
+    """
+    shooting = refined.shooting
+    windows = sum(len(d.windows) for d in shooting.data)
+    if windows < SETTINGS.fewest_windows:
+        return SplitHalf(note=f"{windows} windows are too few to halve: record longer")
+    cost = _steps(problem, shooting)
+    if cost > SETTINGS.most_half_steps:
+        return SplitHalf(note=f"left out: it would take {cost:.1g} physics steps")
+    before = problem.steps
+    block = 1
+    if known.clustered is not None:
+        # Blocks as long as residuals are correlated, but at least two blocks in each half.
+        longest = windows // SETTINGS.fewest_windows
+        block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
+    estimates, halves = [], []
+    for half in range(2):
+        found = refine_windows(*half_of(shooting, refined.point, half, block), SETTINGS.half_iterations)
+        own = uncertainty_at(problem, with_rows(found), fixed_latency=True)
+        # A half holds few blocks: the clustering of all blocks holds for it, too.
+        std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
+        estimates.append(found.theta)
+        halves.append(own.widened_to(std))
+    return agreement(known, estimates, halves, problem.steps - before)
+
+
+def agreement(
+    known: Uncertainty, estimates: Sequence[FloatArray], halves: Sequence[Uncertainty], steps: int
+) -> SplitHalf:
+    """Return whether two halves agree, from their estimates, (K,), and from what is known of all data."""
+    space = known.space
+
+    def three(half: int, k: int) -> tuple[float | None, float, float]:
+        estimate, (low, high) = float(estimates[half][k]), map(float, halves[half].interval[k])
+        identified = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
+        return estimate if identified else None, low, high
+
+    rows = tuple(
+        SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
+    )
+    identified = ~known.blind
+    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
+    scaled = space.to_scale(np.stack(estimates))
+    expected = np.sqrt(sum(np.diag(h.covariance) for h in halves))
+    z = np.abs(scaled[0] - scaled[1]) / np.maximum(expected, 1e-300)
+    flagged = tuple(r.name for k, r in enumerate(rows) if z[k] > least and identified[k] and r.agree is False)
+    compared = z[identified & [r.agree is not None for r in rows]]
+    power, count = float(np.sum(compared**2)), len(compared)
+    by_chance = not count or power <= chi2_law.ppf(1 - SETTINGS.false_alarms, count)
+    scale = 1.0 if by_chance else float(np.sqrt(power / count))
+    reach = np.max(np.abs(scaled - space.to_scale(known.theta)), axis=0)
+    return SplitHalf(rows, flagged, reach, scale, steps)
+
+
+def widened_by_split_half(known: Uncertainty, split: SplitHalf) -> Uncertainty:
+    """Return ``known`` with all intervals wider by the scale of the halves' distance.
+
+    Those of flagged parameters hold the estimates of both halves.
+    """
+    if not split.flagged and split.scale == 1.0:
+        return known
+    flagged = np.array([name in split.flagged for name in known.space.names])
+    std = split.scale * np.sqrt(np.diag(known.covariance))
+    wider = known.widened_to(np.maximum(std, np.where(flagged, split.reach / Z90, 0.0)))
+    return wider.with_alarms(last=split.alarms(known.space))
+
+
+def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
+    """Return every other block of the windows, from block ``half``, and the point in them.
+
+    The count of windows continues over recordings. The latency is fixed.
+    """
+    data, position, velocity, first = [], [], [], 0
+    for e, of_episode in enumerate(shooting.data):
+        number = (first + np.arange(len(of_episode.windows))) // block
+        first += len(of_episode.windows)
+        mine = number % 2 == half
+        if mine.any():
+            data.append(taken(of_episode, mine))
+            position.append(point.position[e][mine])
+            velocity.append(point.velocity[e][mine])
+    return shooting.on(data, fixed_latency=True), Point(point.value, tuple(position), tuple(velocity))
+
+
+def _steps(problem: Problem, shooting: Shooting) -> float:
+    """Return the most physics steps that the comparison takes."""
+    substeps = problem.episodes[0].step_s / problem.robot.step_s
+    # One normal matrix and one line of damped steps per iteration.
+    members = 2 + len(problem.space) + 2 * problem.coordinates + 10
+    return float(SETTINGS.half_iterations * members * shooting.device_periods * substeps)

@@ -12,12 +12,13 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.stages import report_unidentifiable
-from deal_hw.calib.validation.checks import Validation, judge
-from deal_hw.calib.validation.split_half import (
+from deal_hw.calib.validation.checks import (
     SplitHalf,
+    Validation,
     agreement,
     check_split_half,
     half_of,
+    judge,
     widened_by_split_half,
 )
 from deal_hw.calibration import BEFORE_SEARCH, Progress
