@@ -90,6 +90,11 @@ class OutputErrorFit:
     central: bool
 
     @property
+    def member(self) -> Member:
+        """Parameters and latency, as a candidate among others."""
+        return self.theta, self.latency_s
+
+    @property
     def chi2(self) -> float:
         """Mean squared ratio of the residuals' scale to the sensors' noise, timing included."""
         problem = self.plain.problem

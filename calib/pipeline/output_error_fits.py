@@ -141,7 +141,7 @@ class OutputErrorFits(Fits):
         run.say("residual", "fits short windows from the model's own values")
         short = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
         run.offer("fit of short windows", short)
-        windows = self._windows(run, problem, _member(short))
+        windows = self._windows(run, problem, short.member)
         run.offer("fit of long windows", windows[-1])
         return dataclasses.replace(self, first=(short, *windows))
 
@@ -241,7 +241,7 @@ class OutputErrorFits(Fits):
             question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"
             run.say("cross-validation", question)
             first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, settings.first)
-            searched, start = None, _member(first)
+            searched, start = None, first.member
             if search:
                 rng = np.random.default_rng([seed, fold])
                 searched = run.attempts.search.run(self._reduced(train, first), run.budget, rng)
@@ -258,7 +258,7 @@ class OutputErrorFits(Fits):
 
     def _better_start(self, problem: Problem, first: OutputErrorFit, searched: CalibrationResult) -> bool:
         """Return whether the search's estimate predicts short windows better than the first fit."""
-        both = [_member(first), (searched.estimate, searched.latency_s)]
+        both = [first.member, (searched.estimate, searched.latency_s)]
         error = np.mean(np.log(prediction_rmse(problem, both, self.settings.compared_s)), axis=1)
         return bool(error[1] < error[0])
 
@@ -268,7 +268,7 @@ class OutputErrorFits(Fits):
         recipe, found = self.settings.recipe("long"), list[OutputErrorFit]()
         for seconds in windows_s:
             found.append(fit_output_error(problem, *start, dataclasses.replace(recipe, seconds=seconds)))
-            start = _member(found[-1])
+            start = found[-1].member
         return found
 
     def _members(
@@ -280,16 +280,16 @@ class OutputErrorFits(Fits):
         only: str | None = None,
     ) -> dict[str, Member]:
         """Return every candidate's estimate, or as many as ``only`` needs."""
-        settings, found = self.settings, {"short": _member(first)}
+        settings, found = self.settings, {"short": first.member}
         if searched is not None:
             found["search"] = searched.estimate, searched.latency_s
-        found |= {f"{fit.recipe.seconds:g} s": _member(fit) for fit in windows[:-1]}
-        found["long"] = _member(windows[-1])
+        found |= {f"{fit.recipe.seconds:g} s": fit.member for fit in windows[:-1]}
+        found["long"] = windows[-1].member
         for name, recipe in settings.variants.items():
             if only in (None, name):
                 theta, latency_s = found["long"]
                 latency_s = latency_s if recipe.latency else problem.first_latency_s
-                found[name] = _member(fit_output_error(problem, theta, latency_s, recipe))
+                found[name] = fit_output_error(problem, theta, latency_s, recipe).member
         return found
 
     def _split_half(
@@ -384,7 +384,3 @@ def _error(problem: Problem, rmse: FloatArray) -> float:
     if len(set(problem.channel_units)) == 1:
         return float(np.mean(rmse))
     return float(np.exp(np.mean(np.log(rmse))))
-
-
-def _member(fit: OutputErrorFit) -> Member:
-    return fit.theta, fit.latency_s
