@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior, information
+from deal_hw.calib.design.experiment_design import (
+    ExpectedInformation,
+    Experiment,
+    MakeBehaviour,
+    Prior,
+    information,
+)
 from deal_hw.calib.fit.intervals import SETTINGS as INTERVALS
 from deal_hw.calibration import CalibrationResult, std_words
-from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
     OF_FAMILY,
     ExcitationDesign,
@@ -155,7 +160,7 @@ def advise(
     result: CalibrationResult,
     seen: FloatArray,
     *,
-    balance: Callable[[], Behaviour] | None = None,
+    balance: MakeBehaviour | None = None,
     settings: AdviceSettings = SETTINGS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
@@ -194,7 +199,7 @@ def predict_menu(
     menu: Mapping[str, ExcitationPlan],
     prior: Prior,
     *,
-    balance: Callable[[], Behaviour] | None = None,
+    balance: MakeBehaviour | None = None,
     threads: int | None = None,
 ) -> dict[str, ExpectedInformation]:
     """Predict the information of each excitation of a menu at the estimate; all have one length."""
@@ -247,7 +252,7 @@ def next_recordings(
     result: CalibrationResult,
     episodes: Sequence[SampledEpisode],
     *,
-    balance: Callable[[], Behaviour] | None = None,
+    balance: MakeBehaviour | None = None,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
     """Return advice as :func:`advise` does, for the parameters that the result calls weak or unidentified.

@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, MakeBehaviour
-from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
     FAMILIES,
     ExcitationDesign,
@@ -80,7 +79,7 @@ def search_excitation(
     rng: np.random.Generator,
     settings: SearchSettings | None = None,
     *,
-    balance: Callable[[], Behaviour] | None = None,
+    balance: MakeBehaviour | None = None,
     references: Mapping[str, MakeBehaviour] | None = None,
     confirmation: Experiment | None = None,
     notify: Callable[[int, int, str], None] | None = None,
