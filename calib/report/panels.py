@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -55,6 +55,7 @@ class Panel:
         no_y: No ticks at y.
         linked: Zoom and cross-hair are shared with the group's other linked panels.
         style: Class of the figure, such as its width.
+        label: Text for screen readers; the title if empty.
     """
 
     title: str
@@ -68,8 +69,7 @@ class Panel:
     no_y: bool = False
     linked: bool = False
     style: str = ""
-    label: str = field(default="", kw_only=True)
-    """Text for screen readers; the title if empty."""
+    label: str = ""
 
     def html(self) -> Markup:
         """Return the panel as a figure."""
