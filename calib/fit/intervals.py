@@ -254,9 +254,8 @@ def _unit(space: ParameterSpace) -> FloatArray:
 
 def _at_bound(space: ParameterSpace, theta: FloatArray, slope: FloatArray) -> npt.NDArray[np.int64]:
     """Return -1 or 1 where a parameter ended at a bound that the data press, (K,)."""
-    unit = space.normalize(theta)
-    low, high = (unit < SETTINGS.at_bound) & (slope >= 0), (unit > 1 - SETTINGS.at_bound) & (slope <= 0)
-    return np.asarray(high.astype(np.int64) - low.astype(np.int64))
+    side = np.where(space.normalize(theta) < 0.5, -1, 1)
+    return np.asarray(side * (ended_at_bound(space, theta) & (side * slope <= 0)))
 
 
 def _covariance(precision: FloatArray, free: npt.NDArray[np.bool_]) -> FloatArray:
