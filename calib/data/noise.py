@@ -226,7 +226,7 @@ class StartStates:
 
 
 def smooth_states(
-    episode: SampledEpisode, noise_std: FloatArray, rotation: slice, settings: DataSettings = SETTINGS
+    episode: SampledEpisode, noise_std: FloatArray, rotation: slice, settings: DataSettings
 ) -> StartStates:
     """Estimate the state at every sample; ``noise_std`` is that of (position, velocity), (2 C,).
 

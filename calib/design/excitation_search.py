@@ -77,7 +77,7 @@ class Optimum:
 def search_excitation(
     experiment: Experiment,
     rng: np.random.Generator,
-    settings: SearchSettings | None = None,
+    settings: SearchSettings,
     *,
     balance: MakeBehaviour | None = None,
     references: Mapping[str, MakeBehaviour] | None = None,
@@ -100,19 +100,18 @@ def search_excitation(
     Raises:
         CalibrationError: No candidate keeps the limits.
     """
-    wanted = settings or SearchSettings()
     description = experiment.robot.description
     tried, tripped = 0, Counter[str]()
-    designer = _Designer(description, experiment.seconds, balance is not None, wanted)
-    designs = designer.usual() + [designer.draw(rng) for _ in range(wanted.candidates)]
-    total = len(designs) + wanted.rounds + (wanted.confirmed if confirmation is not None else 0)
+    designer = _Designer(description, experiment.seconds, balance is not None, settings)
+    designs = designer.usual() + [designer.draw(rng) for _ in range(settings.candidates)]
+    total = len(designs) + settings.rounds + (settings.confirmed if confirmation is not None else 0)
 
     def predict(
         design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment
     ) -> ExpectedInformation:
         nonlocal tried
         make = on.playing(make_plan(description, design), balance)
-        found = on.predict(make, lambda bound: score(bound, wanted) > bar)
+        found = on.predict(make, lambda bound: score(bound, settings) > bar)
         tried += 1
         tripped.update(filter(None, [found.tripped]))
         if notify is not None:
@@ -122,11 +121,11 @@ def search_excitation(
 
     finals: list[tuple[ExpectedInformation, ExcitationDesign]] = []
     for design in designs:
-        full = len(finals) >= wanted.finalists
-        found = predict(design, score(finals[-1][0], wanted) if full else -np.inf)
+        full = len(finals) >= settings.finalists
+        found = predict(design, score(finals[-1][0], settings) if full else -np.inf)
         if found.usable:
-            finals = sorted([*finals, (found, design)], key=lambda pair: -score(pair[0], wanted))
-            finals = finals[: wanted.finalists]
+            finals = sorted([*finals, (found, design)], key=lambda pair: -score(pair[0], settings))
+            finals = finals[: settings.finalists]
     if not finals:
         reasons = ", ".join(f"{n} x {why}" for why, n in tripped.items())
         raise CalibrationError(
@@ -134,22 +133,22 @@ def search_excitation(
             "draw from narrower ranges (--range-ratio, --calibration), or try more (--candidates)"
         )
     best, design = finals[0]
-    trace = [score(best, wanted)]
+    trace = [score(best, settings)]
     steps = [(best, design)]
-    for k in range(wanted.rounds):
+    for k in range(settings.rounds):
         other = designer.neighbour(design, k, rng)
-        found = predict(other, score(best, wanted))
-        if score(found, wanted) > score(best, wanted):
+        found = predict(other, score(best, settings))
+        if score(found, settings) > score(best, settings):
             best, design = found, other
             steps.append((best, design))
-        trace.append(score(best, wanted))
+        trace.append(score(best, settings))
     if confirmation is not None:
         # Half of them from the history of the best design, half other finalists.
-        chosen = steps[::-1][: (wanted.confirmed + 1) // 2]
+        chosen = steps[::-1][: (settings.confirmed + 1) // 2]
         there = [d for _, d in chosen]
-        chosen += [pair for pair in finals if pair[1] not in there][: wanted.confirmed - len(chosen)]
+        chosen += [pair for pair in finals if pair[1] not in there][: settings.confirmed - len(chosen)]
         again = [(predict(d, on=confirmation), d) for _, d in chosen]
-        best, design = max(again, key=lambda pair: score(pair[0], wanted))
+        best, design = max(again, key=lambda pair: score(pair[0], settings))
         if not best.usable:
             raise CalibrationError(
                 f"the best excitation for {len(experiment.scenario)} draws of {description.name!r} trips on "

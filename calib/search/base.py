@@ -101,10 +101,10 @@ class SearchLog:
         budget: Budget,
         progress: ProgressCallback | None,
         settings: Any,
-        coordinates: Coordinates | None = None,
+        coordinates: Coordinates,
     ) -> None:
         self.method, self.problem, self.budget, self._settings = method, problem, budget, settings
-        self.coordinates = coordinates or Coordinates(problem)
+        self.coordinates = coordinates
         self.trace: list[dict[str, float]] = []
         self._progress = progress
         self._steps = problem.steps
