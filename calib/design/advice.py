@@ -242,8 +242,8 @@ def _advice(
         )
         return Advice(name, before, after, "", sentence)
     unit = 1.0 if space.log_scale[k] else float(space.width[k])
-    rest = "" if after <= INTERVALS.identifiable_std * unit else ", which is still weak"
-    sentence = f"record {best}: {name} goes from {now} to {std_words(space.free[k], after)}{rest}"
+    rest = "" if after <= INTERVALS.identifiable_std * unit else _STILL_WEAK
+    sentence = f"{_record(best)}{name} goes from {now} to {std_words(space.free[k], after)}{rest}"
     return Advice(name, before, after, best, sentence)
 
 
@@ -328,6 +328,14 @@ def _pairs(low: FloatArray, high: FloatArray) -> tuple[tuple[float, float], ...]
     return tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
 
 
+_STILL_WEAK = ", which is still weak"
+
+
+def _record(excitation: str) -> str:
+    """Return how the advice to record an excitation begins."""
+    return f"record {excitation}: "
+
+
 def next_step(
     advice: Sequence[Mapping[str, Any]], robot: str = "", dataset: str = "runs/first/dataset"
 ) -> list[str]:
@@ -348,8 +356,8 @@ def next_step(
         return sum(math.log(row["std"] / row["std_after"]) for row in rows)
 
     best = max(groups, key=lambda name: gain(groups[name]))
-    helped = ", ".join(row["sentence"].split(": ", 1)[1].split(",")[0] for row in groups[best])
-    found = [f"record {best}: {helped}"]
+    parts = (row["sentence"].removeprefix(_record(best)).removesuffix(_STILL_WEAK) for row in groups[best])
+    found = [_record(best) + ", ".join(parts)]
     if robot and groups[best][0].get("command"):
         found += [
             f"    deal-hw design-excitation {robot} {groups[best][0]['command']} --out next.json",

@@ -100,6 +100,10 @@ def test_one_step_is_next_with_its_commands() -> None:
     assert next_step([*rows, row("d", 0.3, "steps")])[0] == (
         "record steps: a goes from 60 % to 30 %, c goes from 60 % to 50 %, d goes from 60 % to 30 %"
     )
+    # Punctuation of an excitation's description does not end what it helps.
+    assert next_step([row("a", 0.3, "steps: small, slow")])[0] == (
+        "record steps: small, slow: a goes from 60 % to 30 %"
+    )
     assert next_step(rows[3:]) == ["m is open at 60 %"]
     assert next_step([]) == []
 
