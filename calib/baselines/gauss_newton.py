@@ -22,7 +22,7 @@ from deal_hw.calib.data.innovations import (
     whitened_residual,
 )
 from deal_hw.calib.data.problem import Problem, measurements
-from deal_hw.calib.fit.intervals import uncertainty
+from deal_hw.calib.fit.intervals import kinks_of, uncertainty
 from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
@@ -246,6 +246,7 @@ class _MultiStart(Stepper):
             problem.latency_range_s,
             fixed_latency=problem.fixed_latency_s is not None,
             timing_std_s=problem.noise.timing_std_s,
+            kinks=kinks_of(problem),
         )
         return self.log.result(
             members_of(problem, value[None]),

@@ -191,9 +191,9 @@ def uncertainty(
     chi2: float,
     latency_range_s: tuple[float, float],
     *,
+    kinks: float,
     fixed_latency: bool = False,
     timing_std_s: float = 0.0,
-    kinks: float = SETTINGS.kinks,
 ) -> Uncertainty:
     """Turn normal equations at an estimate, (K,) and latency [s], into intervals.
 
@@ -429,7 +429,6 @@ def uncertainty_at(
     Residuals that a fit divides by their ``own_scale`` count as noise. The latency is fixed where the problem
     gives it, unless ``fixed_latency`` says otherwise.
     """
-    smooth = problem.robot.base is None or problem.noise_free
     return uncertainty(
         problem.space,
         fit.theta,
@@ -439,5 +438,11 @@ def uncertainty_at(
         problem.latency_range_s,
         fixed_latency=problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency,
         timing_std_s=0.0 if own_scale else problem.noise.timing_std_s,
-        kinks=SETTINGS.kinks if smooth else SETTINGS.contact_kinks,
+        kinks=kinks_of(problem),
     )
+
+
+def kinks_of(problem: Problem) -> float:
+    """Return the factor on standard deviations for nonlinearity, see `kinks` and `contact_kinks`."""
+    smooth = problem.robot.base is None or problem.noise_free
+    return SETTINGS.kinks if smooth else SETTINGS.contact_kinks

@@ -153,6 +153,7 @@ def _coverage(wild: float, windows: int, draws: int) -> tuple[float, float, floa
                 Normal(1.0, 1, hessian, nothing, (left[..., None],), nothing, rows=rows),
                 chi2,
                 (0.0, 0.04),
+                kinks=1.2,
                 fixed_latency=True,
             ).interval
             for rows in ((), (_rows(left, design),))

@@ -42,7 +42,15 @@ def _told(
     slope, known = (nothing if given is None else given for given in (gradient, prior))
     normal = Normal(1.0, 1, whole, slope, (white,), known)
     return uncertainty(
-        space, np.array(theta), 0.0, normal, 1.0, (0.0, 0.04), fixed_latency=True, timing_std_s=jitter_s
+        space,
+        np.array(theta),
+        0.0,
+        normal,
+        1.0,
+        (0.0, 0.04),
+        kinks=1.2,
+        fixed_latency=True,
+        timing_std_s=jitter_s,
     )
 
 

@@ -411,6 +411,7 @@ def test_a_parameter_at_its_bound_is_reported() -> None:
         Normal(1.0, 1, np.diag([1e4, 1e4, 1e8]), np.zeros(3), residual, np.zeros(3)),
         1.0,
         (0.0, 0.04),
+        kinks=1.2,
     )
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
     assert told.verdicts == ("identifiable", "identifiable")
