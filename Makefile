@@ -99,7 +99,7 @@ mutation: $(STAMP) ## change safety module and exit path, place by place; each c
 # published rows are in docs/measured/README.md. A stopped bench continues.
 BENCH := $(BIN)/deal-hw bench
 PAPER := --profile ideal --demonstration policy --population 60 --generations 15 --seeds 1010
-bench: $(STAMP) ## every bench but the Go2's loop in small (10 minutes); rows and figures in BENCH_OUT
+bench: $(STAMP) ## every bench but the Go2's loop in small (9 minutes); rows and figures in BENCH_OUT
 	@mkdir -p $(BENCH_OUT)
 	$(BENCH) paper $(PAPER) --methods midpoint,midpoint-linear,deal-paper,deal-paper-fn,deal-paper-pn,easi,bo-critic --range-ratio 10 --out $(BENCH_OUT)/paper.json
 	$(BENCH) paper $(PAPER) --methods deal-paper,ekf,ekf-one-pass,least-squares,least-squares-random --range-ratio 5 --out $(BENCH_OUT)/model_based.json
