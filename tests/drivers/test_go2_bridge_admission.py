@@ -376,10 +376,10 @@ def test_switching_the_old_sport_mode_off_is_no_hand_back(bench: Bench, paramete
 def test_damping_yields_to_a_program_on_the_robots_side(bench: Bench) -> None:
     """Two who command make the robot jump; a controller behind the bridge is not taken off for it."""
     bench.walk()
-    bench.judge.yield_to_robot_side()
+    bench.judge.yield_to_robot_side(bench.now_ns)
     assert bench.judge.control is Control.CONTROLLED
     bench.wait(52)
-    bench.judge.yield_to_robot_side()
+    bench.judge.yield_to_robot_side(bench.now_ns)
     assert bench.judge.control is Control.IDLE
     assert bench.wait(100) == 0
 

@@ -62,11 +62,19 @@ class Bench:
         """Let the bridge look every 2 ms and pass on what the robot said."""
         for _ in range(milliseconds // 2):
             self.bridge.step()
-            self.bridge.pass_one(0.0)
+            # More than the robot says in that time.
+            for _ in range(4):
+                self.bridge.pass_one(0.0)
 
     def heard(self, topic: str) -> list[Message]:
         """Return what clients heard of a topic."""
         return [message for message in self.network.sent if message.channel == topic]
+
+    def status(self) -> str:
+        """Return who controls the robot, as clients are told."""
+        told = read_note(self.heard(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
+        assert told is not None
+        return told["control"]
 
     def say(self, topic: str, payload: bytes, sequence: int) -> None:
         """Send as a client does that has heard the newest state."""
@@ -130,6 +138,102 @@ def test_it_yields_later_too_and_says_so(make_bench: Callable[[str], Bench]) -> 
     assert bench.told[-1] == "idle: another program on the robot's side commands the motors"
 
 
+def test_it_takes_charge_again_after_a_stray_command(make_bench: Callable[[str], Bench]) -> None:
+    """The robot holds its last command for ever; it is damped half a second to a second later, and why."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    for k in range(150):
+        bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.002 * k)
+    bench.run(300 + 490)
+    assert bench.status() == "idle"
+    assert kinds(bench.go2)[-1]
+    bench.run(520)
+    assert bench.status() == "damping"
+    assert bench.told[-1].startswith("damping: nobody has commanded the motors for")
+    assert bench.told[-1].endswith("and no mode is active")
+    count = len(bench.go2.heard)
+    bench.run(100)
+    assert kinds(bench.go2)[count:] == [False] * 50
+
+
+def test_it_stays_idle_while_another_program_commands_slowly(make_bench: Callable[[str], Bench]) -> None:
+    """Five commands a second, for ten seconds: two commanders would make the robot jump."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    for k in range(50):
+        bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.2 * k)
+    bench.run(10)
+    count = len(bench.go2.heard)
+    bench.run(9800)
+    assert len(bench.go2.heard) == count + 49
+
+
+def test_it_takes_charge_once_sport_mode_is_released(make_bench: Callable[[str], Bench]) -> None:
+    """By the vendor's app, or by a program that died before it commanded the motors."""
+    bench = make_bench("normal")
+    bench.bridge.open()
+    bench.run(3000)
+    assert bench.go2.heard == []
+    bench.go2.mode = ""
+    bench.run(1100)
+    assert bench.bridge.admission.control is Control.DAMPING
+    assert kinds(bench.go2)[-1] is False
+
+
+def test_it_leaves_a_robot_alone_that_another_program_gave_to_sport_mode(
+    make_bench: Callable[[str], Bench],
+) -> None:
+    """The newest answer counts, not what was known before; a switch in progress is no free robot."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    bench.go2.codes["motion_switcher", 1001] = [7002] * 4
+    bench.wire.say(topics.LOW_COMMAND, STIFF)
+    bench.run(1600)
+    assert bench.bridge.admission.control is Control.IDLE
+    bench.go2.mode = "ai"
+    count = len(bench.go2.heard)
+    bench.run(5000)
+    assert len(bench.go2.heard) == count
+
+
+def test_without_an_answer_it_damps_later(make_bench: Callable[[str], Bench]) -> None:
+    """It damped before, so no mode was active: 2.5 s after the last command of the other program."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    bench.go2.deaf.add("motion_switcher")
+    bench.wire.say(topics.LOW_COMMAND, STIFF)
+    bench.run(2480)
+    assert bench.status() == "idle"
+    bench.run(40)
+    assert bench.status() == "damping"
+    assert bench.told[-1].endswith("and motion_switcher does not answer")
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_a_robot_that_is_handed_back_keeps_its_damping_until_a_mode_has_it(
+    make_bench: Callable[[str], Bench], stubborn: bool
+) -> None:
+    """Damping would work against sport mode as it stands up; if no mode takes it, it is damped again."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    bench.say(topics.LOW_COMMAND, DAMPING, 0)
+    bench.run(4)
+    bench.go2.stubborn = stubborn
+    bench.say(topics.request("motion_switcher"), encode_request(Request(9, 1002, '{"name": "ai"}')), 1)
+    bench.run(4)
+    assert bench.bridge.admission.control is Control.IDLE
+    count = len(bench.go2.heard)
+    bench.run(9900)
+    assert len(bench.go2.heard) == count
+    bench.run(200)
+    assert bench.bridge.admission.control is (Control.DAMPING if stubborn else Control.IDLE)
+
+
 def test_a_robot_that_does_not_answer_is_not_damped(make_bench: Callable[[str], Bench]) -> None:
     """Sport mode may hold it, and then damping would throw it down; the operator is told."""
     bench = make_bench("")
@@ -137,6 +241,11 @@ def test_a_robot_that_does_not_answer_is_not_damped(make_bench: Callable[[str], 
     bench.bridge.open()
     assert bench.go2.heard == []
     assert "is unknown, so it is not damped yet" in bench.told[0]
+    bench.run(5000)
+    assert bench.go2.heard == []
+    bench.go2.deaf.clear()
+    bench.run(520)
+    assert bench.bridge.admission.control is Control.DAMPING
 
 
 def test_clients_hear_states_with_stamps_and_who_has_the_robot(make_bench: Callable[[str], Bench]) -> None:

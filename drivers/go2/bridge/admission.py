@@ -1,8 +1,10 @@
 """Who may command the robot through the bridge, and when the bridge damps it. It does no I/O.
 
     IDLE ----a controller's damping----> CONTROLLED ----silence----> DAMPING ----a controller's damping--> ...
-      ▲                                      │                          │
-      └--- handed back to sport mode --------┴--- or another program on the robot's side commands it
+     │ ▲                                     │                        ▲ │
+     │ └--- handed back to sport mode -------┴--- or another program  │ │
+     │                                           commands it ---------┼-┘
+     └--- nobody commands it and no mode is active -------------------┘
 
 A controller takes the robot over by a damping command, which no walking controller sends. The robot then
 belongs to its stream until it is silent for longer than the limit. A controller that lost the robot during a
@@ -18,6 +20,7 @@ from typing import Any, Final
 
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits, is_damping
+from deal_hw.drivers.go2.bridge.robot_side import RobotSide
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame
@@ -64,6 +67,7 @@ class Admission:
         admitted: Number of admitted commands.
         refused: Number of refused messages, by kind.
         last_refusal: Reason of the last refusal.
+        robot_side: What is known of the robot's own side.
 
     Args:
         config: Settings.
@@ -77,6 +81,7 @@ class Admission:
         self._silence_ns = self._age_ns - round(config.margin_s * 1e9)
         self._release_ns = round(config.release_s * 1e9)
         self.control, self.reason = Control.IDLE, "nobody controls the robot yet"
+        self.robot_side = RobotSide()
         self.admitted = 0
         self.refused: Counter[str] = Counter()
         self.last_refusal = self._refusal = ""  # The last of all, and the last since an admitted command.
@@ -118,6 +123,9 @@ class Admission:
                         "handover",
                         "the robot cannot return to its own controller while it is commanded: damp it first",
                     )
+                if self.control is not Control.IDLE:
+                    # Until its own controller has it, the robot holds the damping of its last commander.
+                    self.robot_side.left(now_ns, mode="", handed=True)
                 self._become(Control.IDLE, "the robot was handed back to its own controller")
         except RefusedMessageError as refusal:
             self._count(refusal)
@@ -129,13 +137,18 @@ class Admission:
         """Damp the robot until a controller takes it over."""
         self._become(Control.DAMPING, reason)
 
-    def yield_to_robot_side(self) -> None:
+    def yield_to_robot_side(self, now_ns: int) -> None:
         """Stop damping: another program on the robot's side commands it, and two commanders make it jump."""
         if self.control is Control.DAMPING:
+            # While the bridge damped, no mode was active.
+            self.robot_side.left(now_ns, mode="")
             self._become(Control.IDLE, "another program on the robot's side commands the motors")
+        self.robot_side.commanded(now_ns)
 
     def tick(self, now_ns: int) -> bool:
         """Check for silence; return whether a damping command must be sent now."""
+        if self.control is Control.IDLE and (why := self.robot_side.deserted(now_ns)):
+            self._become(Control.DAMPING, why)
         if self.control is not Control.CONTROLLED:
             return self.control is Control.DAMPING
         silent_ns = now_ns - self._last_ns

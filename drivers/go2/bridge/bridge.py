@@ -15,12 +15,13 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.go2.bridge.admission import Admission, Control
 from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits
+from deal_hw.drivers.go2.bridge.mode_question import ModeQuestion
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
-from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, ServiceClient
+from deal_hw.drivers.go2.motion_switcher import SWITCHER, MotionSwitcher, ServiceClient
 from deal_hw.drivers.transports.zenoh_stamps import Stamp
 from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
@@ -90,6 +91,7 @@ class Go2Bridge:
         self._damping = np.array(DESCRIPTION.passive_damping)
         self._frame: LowStateFrame | None = None
         self._services: ServiceClient | None = None
+        self._question = ModeQuestion()
         self._foreign = 0
         self._told = self.admission.control
         self._status_ns = self._due_ns = 0
@@ -184,7 +186,9 @@ class Go2Bridge:
     def _tick(self, now_ns: int) -> None:
         foreign, self._foreign = self._foreign, 0
         if foreign:
-            self.admission.yield_to_robot_side()
+            self.admission.yield_to_robot_side(now_ns)
+        if self.admission.control is Control.IDLE:
+            self._ask_for_the_mode(now_ns)
         if self.admission.tick(now_ns):
             self._damp()
         if self.admission.control is not self._told:
@@ -194,6 +198,14 @@ class Go2Bridge:
         if now_ns >= self._status_ns:
             self._status_ns = now_ns + round(self._config.status_s * 1e9)
             self._say_status()
+
+    def _ask_for_the_mode(self, now_ns: int) -> None:
+        """Take the last answer, and ask again if it is time; an answer is never waited for."""
+        side = self.admission.robot_side
+        if (mode := self._question.answer()) is not None:
+            side.answered(mode)
+        if side.to_ask(now_ns):
+            self._to_robot(topics.request(SWITCHER), self._question.ask(now_ns))
 
     def _say_status(self) -> None:
         payload = encode_note(self.admission.status())
@@ -231,6 +243,8 @@ class Go2Bridge:
             self._foreign += 1
         elif self._services is not None:
             self._services.take(message)
+        else:
+            self._question.take(message)
         return message
 
     # At the beginning.
@@ -248,15 +262,20 @@ class Go2Bridge:
             self._listen(_ASK_S, lambda: self._frame is not None)
             mode = switcher.active(_ASK_S)
         except DealHwError as error:
-            self._tell(f"the robot's active controller is unknown, so it is not damped yet: {error}")
+            self._tell(
+                f"the robot's active controller is unknown, so it is not damped yet: {error}. The bridge "
+                "asks again twice a second"
+            )
             return
         finally:
             self._services = None
+        self.admission.robot_side.left(self._clock.now_ns(), mode=mode)
         if mode:
             self._tell(f"idle: the robot's own controller {mode!r} has it")
             return
         self._listen(self._config.listen_s, lambda: self._foreign > 0)
         if self._foreign:
+            self.admission.robot_side.commanded(self._clock.now_ns())
             self._tell("idle: another program on the robot's side commands the motors")
             return
         self.admission.take_charge("the bridge started, and the robot's own controller is released")
