@@ -88,14 +88,15 @@ class Go2Rig(Rig):
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
         """Phases by the robot's commands; the later ones by their time after the first stiff command."""
-        before_s, total_s = POSTURE.before_s, POSTURE.added_s + self._seconds
+        before_s = POSTURE.before_s
+        total_s = before_s + self._seconds + POSTURE.after_s(slows=False)
         return {
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (REQUEST, 0.0, self.typical_s[TAKING_OVER]),
             ARMING: (DAMPING, 0.0, 0.02),
             RISING: (STIFF, 0.0, before_s),
             RUNNING: (STIFF, before_s, min(self._seconds, SECONDS)),
-            LYING_DOWN: (STIFF, before_s + self._seconds, POSTURE.lie_s - 0.1),
+            LYING_DOWN: (STIFF, total_s - POSTURE.lie_s, POSTURE.lie_s - 0.1),
             ENDING: (STIFF, total_s - 0.12, 0.12),
         }[phase]
 

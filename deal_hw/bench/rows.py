@@ -37,13 +37,16 @@ class Cells:
     runs: Sequence[tuple[tuple[Any, ...], Callable[[], Row]]]
 
 
-def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], None]) -> list[Row]:
+def run_cells(
+    cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], None], program: str = "deal-hw"
+) -> list[Row]:
     """Run the cells without a valid row in a file, writing the file after each; return all rows.
 
     Args:
         cells: The cells.
         out: File of the rows; the CSV is beside it.
         after: Called after each cell with its number, such as "2/10", its row and all rows.
+        program: Name of the command, for the file's head.
 
     Raises:
         DatasetError: The file holds something else.
@@ -59,7 +62,7 @@ def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], No
             continue
         row = run()
         rows = [r for r in rows if key(r) != cell] + [row]
-        save_rows(out, rows)
+        save_rows(out, rows, program)
         after(f"{number}/{len(cells.runs)}", row, rows)
     return rows
 
@@ -97,9 +100,9 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with their machine, as JSON and as CSV."""
-    write_rows(path, rows)
+def save_rows(path: Path, rows: Sequence[Mapping[str, Any]], program: str = "deal-hw") -> None:
+    """Write rows with their machine and command, as JSON and as CSV."""
+    write_rows(path, rows, program)
     names = sorted({k for row in rows for k, v in row.items() if not isinstance(v, dict | list)})
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore")

@@ -63,6 +63,9 @@ class PolicyBehaviour:
     Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on. A requested velocity
     is clipped to the policy's training range, if its spec contains one.
 
+    Attributes:
+        follows_velocity: Whether it observes a requested velocity.
+
     Args:
         policy: The policy.
         description: The robot that it will run on.
@@ -91,6 +94,7 @@ class PolicyBehaviour:
         self._source = source or FixedVelocity()
         self._slowest, self._fastest = np.array(spec.command_range or ((-np.inf, np.inf),) * 3).T
         self._observes_base = spec.observes_base
+        self.follows_velocity = "command" in observed
         self._policy = policy
         self._observations = ObservationBuilder(spec)
         self._scale = np.array(spec.action_scale)

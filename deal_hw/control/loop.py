@@ -13,6 +13,7 @@ from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
 from deal_hw.control.loop_timing import LoopTiming, LoopTimingReport
 from deal_hw.control.passive import make_passive
+from deal_hw.control.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.control.process_channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
 from deal_hw.control.repeater import Repeater
 from deal_hw.control.safety import CycleInput, Safety, SafetyDecision, SafetyState
@@ -51,6 +52,7 @@ class ControlLoop:
         config: Settings.
         progress: The heartbeat: called with the phase's name and the longest time until the next call [s].
         scheduling: Scheduling granted by the operating system, for the report.
+        end: The behaviour's planned end, which may come before ``config.duration_s``; None: it has none.
     """
 
     def __init__(
@@ -64,10 +66,11 @@ class ControlLoop:
         *,
         progress: Callable[[str, float], None] = lambda phase, silence_s: None,
         scheduling: str = "default",
+        end: PlannedEnd | None = None,
     ) -> None:
         self._robot, self._behaviour, self._safety = robot, behaviour, safety
         self._clock, self._sink, self._config, self._progress = clock, sink, config, progress
-        self._scheduling = scheduling
+        self._scheduling, self._end = scheduling, end or PlannedEnd()
         self._loop_timing = LoopTiming(clock, robot.description.control_rate_hz)
         self._repeater = Repeater(robot, clock)
         self._stop_reason = ""
@@ -165,7 +168,7 @@ class ControlLoop:
         count = round(self._config.duration_s * self._robot.description.control_rate_hz)
         while True:
             self._collect_until(self._loop_timing.deadline_ns)
-            if self._loop_timing.next_index >= count:
+            if self._loop_timing.next_index >= count or self._end.over:
                 break
             index, deadline_ns = self._loop_timing.begin()
             self._phase(RUNNING, self._robot.description.limits.silence_s)
@@ -176,6 +179,8 @@ class ControlLoop:
             if self._config.dry_run and self._stop_reason:
                 return Outcome.STOPPED, self._stop_reason
         self._safety.stop("the run is over")
+        if self._end.reason:
+            return Outcome.STOPPED, self._end.reason
         return Outcome.FINISHED, "the run is over"
 
     def _cycle(self, index: int, deadline_ns: int) -> SafetyDecision:
@@ -191,6 +196,8 @@ class ControlLoop:
         if state is not None and _is_finite(state):
             with self._loop_timing.section("behaviour"):
                 wanted = self._behaviour.command(state, index * self._loop_timing.period_ns * 1e-9)
+            for step in self._end.steps():
+                self.note(ENDING_EVENT, step)
         computed_ns = self._clock.now_ns()
         age_ns = computed_ns - state.receive_ns if state is not None else -1
         if age_ns >= 0:

@@ -30,6 +30,8 @@ KEYS = {
     " ": (0.0, 0.0, 0.0),
 }
 """Keys and the velocities that they request while held."""
+END_KEY = "p"
+"""Ends the run as planned: the robot comes to a stand and lies down."""
 _DEAD_ZONE = 0.05
 
 
@@ -135,6 +137,35 @@ class KeyboardVelocity:
         """Return the lowest and highest velocity of the keys, (2, 3)."""
         keys = np.array(list(KEYS.values()))
         return np.stack([keys.min(axis=0), keys.max(axis=0)])
+
+
+class SlowedVelocity:
+    """A source that can be slowed to zero for good.
+
+    Args:
+        source: The source; it is not asked any more once it is slowed.
+    """
+
+    def __init__(self, source: VelocitySource) -> None:
+        self._source = source
+        self._last: FloatArray = np.zeros(3)
+        self._begin_s, self._seconds = math.inf, 1.0
+
+    def slow(self, time_s: float, seconds: float) -> None:
+        """Go from the last velocity to zero, evenly.
+
+        Args:
+            time_s: When this begins, on the source's time [s].
+            seconds: Its duration [s].
+        """
+        self._begin_s, self._seconds = time_s, seconds
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return the source's velocity, or what is left of the last one."""
+        if time_s < self._begin_s:
+            self._last = self._source.velocity(state, time_s)
+            return self._last
+        return self._last * max(0.0, 1.0 - (time_s - self._begin_s) / self._seconds)
 
 
 class NotedVelocity:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.control.planned_end import ENDING_EVENT
 from deal_hw.control.velocity import AXES
 from deal_hw.types import Event, FloatArray, Trajectory
 
@@ -93,14 +94,16 @@ def wanted_in(events: Sequence[Event], start_ns: int, seconds: float) -> Wanted 
     Args:
         events: The events.
         start_ns: Host time of the recording's time 0 [ns].
-        seconds: How long the policy ran [s].
+        seconds: How long the policy ran, without slowing down [s]; a planned end in the events shortens it.
     """
     told = [event for event in events if event.kind == VELOCITY_EVENT]
     if not told:
         return None
     times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in told])
     velocity = np.array([[float(event.data[axis]) for axis in AXES] for event in told])
-    return Wanted(times, velocity, float(times[0]) + seconds)
+    # While the robot slows down, no velocity is requested that it should keep.
+    ended = [(event.stamp_ns - start_ns) * 1e-9 for event in events if event.kind == ENDING_EVENT]
+    return Wanted(times, velocity, min([float(times[0]) + seconds, *ended]))
 
 
 def wanted_velocity(trajectory: Trajectory) -> Wanted | None:

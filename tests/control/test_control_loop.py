@@ -15,6 +15,7 @@ from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.passive import PassiveConfig
+from deal_hw.control.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.control.safety import Safety
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole import protocol
@@ -383,3 +384,35 @@ def test_settings_that_cannot_be_are_refused() -> None:
     """A run of no time."""
     with pytest.raises(ConfigurationError, match="a length above 0 s"):
         LoopConfig(duration_s=0.0)
+
+
+@pytest.mark.parametrize(
+    ("reason", "outcome", "told"),
+    [
+        ("", Outcome.FINISHED, "the run is over"),
+        ("the battery is low", Outcome.STOPPED, "the battery is low"),
+    ],
+)
+def test_a_planned_end_may_come_before_the_time_is_up(
+    rig: Any, reason: str, outcome: Outcome, told: str
+) -> None:
+    """The cycle that is over is the last; its parts are events; it makes the robot passive like every end."""
+    end = PlannedEnd()
+
+    class Ends(HoldBehaviour):
+        def command(self, state: RobotState, time_s: float) -> JointCommand:
+            if abs(time_s - 0.2) < 1e-6:
+                end.reason = reason
+                end.note("it lies down")
+            end.over = time_s > 0.39
+            return super().command(state, time_s)
+
+    settings = LoopConfig(duration_s=2.0)
+    loop = ControlLoop(
+        rig.robot, Ends(DESCRIPTION), Safety(DESCRIPTION), rig.clock, rig.sink, settings, end=end
+    )
+    report = loop.run()
+    assert (report.outcome, report.reason, report.passive_confirmed) == (outcome, told, True)
+    # Cycles 0 to 20 at 50 Hz; the last one, at 0.4 s, says that it is over.
+    assert report.cycles_sent == 21
+    assert [message for kind, message in rig.events if kind == ENDING_EVENT] == ["it lies down"]

@@ -186,7 +186,7 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     said = report.episodes[-1]
     assert said.replay is not None and said.replay.position[0] < 0.05
     lines = said.lines()
-    assert lines[1].startswith("  ran for 0.5 of 0.5 s")
+    assert lines[1].startswith("  ran for 0.5 s")
     assert any(line.startswith("  difference from the recording at most ") for line in lines)
 
 

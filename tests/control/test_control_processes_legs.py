@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import pty
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 from deal_hw.control.loop import Outcome
+from deal_hw.control.planned_end import ENDING_EVENT
 from deal_hw.control.posture import PostureConfig
 from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
@@ -46,7 +49,9 @@ class Rig:
     process: EmulatorProcess
     truth: Path
 
-    def run(self, folder: Path, at_beat: int = -1, act: Callable[[], None] = lambda: None) -> RunReport:
+    def run(
+        self, folder: Path, at_beat: int = -1, act: Callable[[], None] = lambda: None, plan: RunPlan = PLAN
+    ) -> RunReport:
         """Record an episode and act once, so many heartbeats into it."""
         beats = 0
 
@@ -58,7 +63,7 @@ class Rig:
                     act()
 
         return run_episodes(
-            PLAN,
+            plan,
             port=self.process.port,
             dataset=folder,
             episodes=1,
@@ -132,8 +137,8 @@ def test_a_go2_stands_up_holds_and_lies_down(rig: Rig, tmp_path: Path) -> None:
     (episode,) = report.episodes
     assert (episode.outcome, episode.error) == (Outcome.FINISHED, ""), episode.reason
     assert episode.passive_confirmed
-    # 0.4 + 0.8 + 0.2 s up, 1 s held, 0.8 s down: 3.2 s at 50 Hz.
-    assert episode.cycles_sent <= 160
+    # 0.4 + 0.8 + 0.2 s up, 1 s held, 0.3 + 0.3 s (at most 3.3 s) until it stands still, 0.8 s down, at 50 Hz.
+    assert 160 + 30 - 5 <= episode.cycles_sent <= 160 + 165
     assert kinds(told)[-3:] == [DAMPING, STIFF, DAMPING]
     assert told["commands"]["last_kind"] == DAMPING
     assert told["commands"]["refused"] == 0
@@ -168,3 +173,26 @@ def test_a_killed_control_process_leaves_the_robot_damped(rig: Rig, tmp_path: Pa
     read = Dataset.open(tmp_path / "dataset").read(0)
     assert len(read.trajectory.sent_s) > 40
     assert read.trajectory.body is not None
+
+
+def test_the_end_key_lays_the_robot_down(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of a minute ends 30 cycles after it stands, by a key on a terminal: stand, lie down, damping."""
+    operator, program = pty.openpty()
+    plan = dataclasses.replace(PLAN, seconds=60.0, velocity="keyboard")
+    with os.fdopen(operator, "wb", buffering=0) as keys, os.fdopen(program) as stdin:
+
+        def press() -> None:
+            keys.write(b"p")
+
+        monkeypatch.setattr("sys.stdin", stdin)
+        report = rig.run(tmp_path / "dataset", at_beat=100, act=press, plan=plan)
+    (episode,) = report.episodes
+    assert (episode.outcome, episode.reason) == (Outcome.STOPPED, "ended by the operator's key")
+    assert episode.passive_confirmed
+    events = Dataset.open(tmp_path / "dataset").read(0).trajectory.events
+    assert [event.message for event in events if event.kind == ENDING_EVENT] == [
+        "ended by the operator's key",
+        "it comes to its default pose",
+        "it stands still, and lies down",
+    ]
+    assert kinds(rig.finish())[-3:] == [DAMPING, STIFF, DAMPING]

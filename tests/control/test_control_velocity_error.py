@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deal_hw.control.planned_end import ENDING_EVENT
 from deal_hw.control.velocity_error import (
     VELOCITY_EVENT,
     Track,
@@ -84,3 +85,18 @@ def test_events_tell_what_was_wanted_and_when() -> None:
     np.testing.assert_array_equal(wanted.velocity, [[1.0, 0.0, 0.0], [0.0, 0.5, -1.0]])
     assert wanted.end_s == 13.0
     assert wanted_in(events[1:2], 0, 10.0) is None
+
+
+def test_a_planned_end_cuts_the_requested_velocities() -> None:
+    """It comes 4 s after the walk began, which was to last 10 s: slowing down is no part of the walk."""
+    events = [
+        Event(5 * SECOND_NS, VELOCITY_EVENT, "", velocity_data(np.array([1.0, 0.0, 0.0]))),
+        Event(9 * SECOND_NS, ENDING_EVENT, "ended by the operator's key", {}),
+        Event(10 * SECOND_NS, ENDING_EVENT, "it comes to its default pose", {}),
+    ]
+    wanted = wanted_in(events, 2 * SECOND_NS, 10.0)
+    assert wanted is not None
+    assert wanted.end_s == pytest.approx(7.0)
+    late = wanted_in([events[0]], 2 * SECOND_NS, 10.0)
+    assert late is not None
+    assert late.end_s == pytest.approx(13.0)

@@ -107,8 +107,9 @@ class Rig:
             Safety(self.robot.description),
             self.clock,
             lambda record: True,
-            LoopConfig(duration_s=whole.duration_s),
+            LoopConfig(duration_s=whole.longest_s),
             progress=progress,
+            end=whole.end,
         ).run()
 
 

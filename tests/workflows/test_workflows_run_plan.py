@@ -75,9 +75,14 @@ def test_every_field_of_the_full_plan_is_tested() -> None:
 
 
 def test_standing_up_and_lying_down_are_not_counted_in_the_seconds() -> None:
-    """1 + 2 + 0.5 before, 1.5 after; nothing for a robot that does not stand up."""
-    assert FULL.total_s == pytest.approx(7.5 + 3.5 + 1.5)
-    assert dataclasses.replace(FULL, stand=False).total_s == 7.5
+    """1 + 2 + 0.5 before, 0.6 + 1.5 after; a walk is slowed for 1 s; nothing without standing up."""
+    hold = dataclasses.replace(FULL, motion="hold")
+    assert hold.total_s == pytest.approx(7.5 + 3.5 + 0.6 + 1.5)
+    assert dataclasses.replace(FULL, motion="balance").total_s == pytest.approx(hold.total_s + 1.0)
+    # It is waited for 3 s until it is still, instead of 0.3 s.
+    assert hold.longest_s == pytest.approx(hold.total_s + 2.7)
+    lying = dataclasses.replace(FULL, stand=False)
+    assert lying.total_s == lying.longest_s == 7.5
 
 
 @pytest.mark.parametrize(
@@ -111,7 +116,11 @@ def test_standing_up_is_wrapped_around_the_profile() -> None:
     assert behaviour.duration_s == plan.total_s
     lying = np.array(DRIVER.rest_position)
     state = RobotState(lying, np.zeros(12), np.zeros(12), 0, 0, 0, -1, -1, Status.ARMED)
-    for time_s, wanted in ((0.0, lying), (4.0, np.array(DRIVER.default_position)), (plan.total_s, lying)):
+    standing = np.array(DRIVER.default_position)
+    # At 5.8 s it has come to its default pose; with no motion in between, it lies down from 6.1 s on.
+    for time_s, wanted in ((0.0, lying), (4.0, standing), (5.5, standing), (5.8, standing), (6.1, standing)):
+        np.testing.assert_allclose(behaviour.command(state, time_s).position_target, wanted, atol=1e-12)
+    for time_s, wanted in ((plan.total_s, lying),):
         np.testing.assert_allclose(behaviour.command(state, time_s).position_target, wanted, atol=1e-12)
     assert isinstance(make_behaviour(dataclasses.replace(plan, stand=False), DRIVER), HoldBehaviour)
 

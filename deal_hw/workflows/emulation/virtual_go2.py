@@ -14,9 +14,10 @@ import numpy as np
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.planned_end import PlannedEnd
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.safety import Safety
-from deal_hw.control.velocity import NotedVelocity, VelocitySource
+from deal_hw.control.velocity import NotedVelocity, SlowedVelocity, VelocitySource
 from deal_hw.control.velocity_error import VELOCITY_EVENT, Track, Wanted, velocity_data, wanted_in
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.recording.record import CycleRecord
@@ -47,13 +48,10 @@ class _Watched:
         self._device.receive(topic, payload, stamp_ns)
 
     def tick(self) -> list[tuple[str, bytes]]:
-        x, y, _ = self._device.base_position
-        self.rows.append((self._device.device_ns * 1e-9, float(x), float(y), self._device.heading))
-        return self._device.tick()
-
-    def track(self) -> Track:
-        rows = np.array(self.rows)
-        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
+        device = self._device
+        x, y, _ = device.base_position
+        self.rows.append((device.device_ns * 1e-9, float(x), float(y), device.heading, device.tilt))
+        return device.tick()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,12 +63,14 @@ class VirtualWalk:
         trajectory: The recording, as read back from its file; None without a recording.
         wanted: The requested velocities, on the robot's clock; None if the policy never began.
         track: True positions of the base, on the robot's clock.
+        tilt: True angle between the base's z axis and the vertical, at the track's times, (T,) [rad].
     """
 
     report: LoopReport
     trajectory: Trajectory | None
     wanted: Wanted | None
     track: Track
+    tilt: FloatArray
 
 
 def walk(
@@ -82,8 +82,9 @@ def walk(
     metadata: Mapping[str, Any] | None = None,
     *,
     record: bool = True,
+    end: PlannedEnd | None = None,
 ) -> VirtualWalk:
-    """Make a new robot stand up, walk and lie down.
+    """Make a new robot stand up, walk, come to a stand and lie down.
 
     Args:
         truth: Its hidden parameters, profile and seed.
@@ -93,6 +94,7 @@ def walk(
         path: File to write; a temporary one by default.
         metadata: For the recording.
         record: Whether to record; recording takes a third of the time.
+        end: Takes requests for an earlier end.
     """
     clock = VirtualClock(_START_NS)
     watched = _Watched(Go2Device(truth))
@@ -102,8 +104,9 @@ def walk(
         loop.note(VELOCITY_EVENT, "wanted velocity", **velocity_data(velocity))
         told.append(Event(watched.device_ns, VELOCITY_EVENT, "", velocity_data(velocity)))
 
-    inner = PolicyBehaviour(policy, DRIVER, NotedVelocity(source, note))
-    whole = PostureBehaviour(inner, DRIVER, seconds, PostureConfig())
+    slowed = SlowedVelocity(NotedVelocity(source, note))
+    inner = PolicyBehaviour(policy, DRIVER, slowed)
+    whole = PostureBehaviour(inner, DRIVER, seconds, PostureConfig(), slowed=slowed, end=end)
     trajectory = None
     with contextlib.ExitStack() as folder, contextlib.ExitStack() as recording:
 
@@ -117,9 +120,12 @@ def walk(
             recorder = EpisodeRecorder(file, DRIVER.to_json(), metadata or {}, clock)
             recording.enter_context(recorder)
         robot = Go2Robot(VirtualTopics(watched, clock), clock)
-        loop = ControlLoop(robot, whole, Safety(DRIVER), clock, keep, LoopConfig(duration_s=whole.duration_s))
+        config = LoopConfig(duration_s=whole.longest_s)
+        loop = ControlLoop(robot, whole, Safety(DRIVER), clock, keep, config, end=whole.end)
         report = loop.run()
         recording.close()
         if record:
             trajectory = read_episode(file).trajectory
-    return VirtualWalk(report, trajectory, wanted_in(told, 0, seconds), watched.track())
+    rows = np.array(watched.rows)
+    track = Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
+    return VirtualWalk(report, trajectory, wanted_in(told, 0, seconds), track, rows[:, 4])

@@ -93,8 +93,9 @@ def _run(
     # Imported here, so that a stop signal during these imports is handled, too.
     from deal_hw.control.loop import ControlLoop, LoopConfig
     from deal_hw.control.passive import PassiveConfig
+    from deal_hw.control.planned_end import PlannedEnd
     from deal_hw.control.safety import Safety
-    from deal_hw.control.velocity import KeyboardVelocity, NotedVelocity
+    from deal_hw.control.velocity import END_KEY, KeyboardVelocity, NotedVelocity
     from deal_hw.control.velocity_error import VELOCITY_EVENT, velocity_data
     from deal_hw.drivers import adopt_robot, make_robot
     from deal_hw.workflows.running.plan import RunPlan, make_behaviour
@@ -113,7 +114,8 @@ def _run(
     noted = NotedVelocity(
         source, lambda wanted: loop.note(VELOCITY_EVENT, "wanted velocity", **velocity_data(wanted))
     )
-    behaviour = make_behaviour(plan, robot.description, noted)
+    end = PlannedEnd()
+    behaviour = make_behaviour(plan, robot.description, noted, end=end)
     sink = RecordSender(socket.socket(fileno=orders["record_fd"])) if "record_fd" in orders else _discard
 
     main = threading.get_ident()
@@ -122,7 +124,11 @@ def _run(
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)
         for key in vigil.messages():
-            if isinstance(source, KeyboardVelocity):
+            if key == END_KEY and plan.stand:
+                end.request("ended by the operator's key")
+            elif key == END_KEY:
+                loop.request_stop("stopped by the operator's key")
+            elif isinstance(source, KeyboardVelocity):
                 source.press(key)
 
     granted = become_realtime() if plan.realtime else Granted("default", ())
@@ -134,7 +140,7 @@ def _run(
         clock,
         sink,
         LoopConfig(
-            duration_s=plan.total_s,
+            duration_s=plan.longest_s,
             dry_run=plan.dry_run,
             home=plan.home,
             record_wire=plan.record_wire,
@@ -143,6 +149,7 @@ def _run(
         ),
         progress=progress,
         scheduling=granted.scheduling,
+        end=end,
     )
     for warning in granted.warnings:
         loop.note("warning", warning)

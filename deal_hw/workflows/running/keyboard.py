@@ -11,12 +11,16 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 
+from deal_hw.control.velocity import END_KEY
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.say import Say, aloud
 
-STOP_KEYS = ("\x1b", "p")
-"""Escape and p make the robot passive."""
-HELP = "keys: w s ahead, back; a d left, right; q e turn; space stand still; p or Esc passive"
+STOP_KEY = "\x1b"
+"""Escape makes the robot passive at once."""
+HELP = (
+    "keys: w s ahead, back; a d left, right; q e turn; space stand still; "
+    f"{END_KEY} stop and lie down; Esc passive at once"
+)
 
 
 def check_terminal() -> None:
@@ -33,7 +37,7 @@ def check_terminal() -> None:
 
 @contextlib.contextmanager
 def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = aloud) -> Iterator[None]:
-    """Call ``pressed`` for each key, and ``stop`` for those that make the robot passive, from a thread.
+    """Call ``pressed`` for each key, and ``stop`` for the one that makes the robot passive, from a thread.
 
     ``stop`` is called once: a held key repeats, and a second stop would kill the control process. It is also
     called when the terminal goes away, since then nobody could stop the robot.
@@ -53,8 +57,8 @@ def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = al
             if end_read in ready:
                 return
             text = _read(fd)
-            for key in text or STOP_KEYS[:1]:
-                if key not in STOP_KEYS:
+            for key in text or STOP_KEY:
+                if key != STOP_KEY:
                     pressed(key)
                 elif not stopped:
                     stopped = True

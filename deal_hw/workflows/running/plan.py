@@ -23,8 +23,15 @@ from deal_hw.control.excitation_plan import (
     make_plan,
     read_plan,
 )
+from deal_hw.control.planned_end import PlannedEnd
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.velocity import BoundedSource, VelocitySource, limited_axes, make_source
+from deal_hw.control.velocity import (
+    BoundedSource,
+    SlowedVelocity,
+    VelocitySource,
+    limited_axes,
+    make_source,
+)
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.policy import VERDICT, Policy
@@ -112,8 +119,15 @@ class RunPlan:
 
     @property
     def total_s(self) -> float:
-        """Length of the run with standing up and lying down [s]."""
-        return self.seconds + (self.posture.added_s if self.stand else 0.0)
+        """Length of the run with standing up, slowing down, standing still and lying down [s]."""
+        if not self.stand:
+            return self.seconds
+        return self.posture.before_s + self.seconds + self.posture.after_s(slows=self.motion == "balance")
+
+    @property
+    def longest_s(self) -> float:
+        """Most time that the run may take: a robot is waited for until it stands still [s]."""
+        return self.total_s + (self.posture.patience_s if self.stand else 0.0)
 
     def velocity_source(self) -> BoundedSource:
         """Return the source of the requested velocity.
@@ -205,6 +219,7 @@ def make_behaviour(
     description: RobotDescription,
     source: VelocitySource | None = None,
     load: Callable[[RunPlan], Policy] = _open_policy,
+    end: PlannedEnd | None = None,
 ) -> Behaviour:
     """Return the behaviour that the plan describes.
 
@@ -213,15 +228,21 @@ def make_behaviour(
         description: The robot.
         source: The requested velocity of a walking policy; by default from the plan.
         load: Called for the plan's policy, if its motion needs one.
+        end: The planned end of a robot that lies down.
 
     Raises:
         PolicyError: The policy is missing or cannot run.
         PolicyMismatchError: It was made for another robot.
         DatasetError: The recording cannot be replayed.
     """
-    source = source or plan.velocity_source()
+    source = SlowedVelocity(source or plan.velocity_source())
     inner = _inner_behaviour(plan, description, source, lambda: _loaded(plan, load))
-    return PostureBehaviour(inner, description, plan.seconds, plan.posture) if plan.stand else inner
+    if not plan.stand:
+        return inner
+    walks = isinstance(inner, PolicyBehaviour) and inner.follows_velocity
+    return PostureBehaviour(
+        inner, description, plan.seconds, plan.posture, slowed=source if walks else None, end=end
+    )
 
 
 def _inner_behaviour(

@@ -83,7 +83,8 @@ class EpisodeReport:
         lines = [self.outcome.value if failed else f"{self.outcome.value}: {self.reason}"]
         if self.planned_s and self.cycles_sent:
             hit = "" if self.clipped or self.outcome is Outcome.TRIPPED else "; no limit was hit"
-            lines.append(f"  ran for {self.ran_s:.1f} of {self.planned_s:.1f} s{hit}")
+            of = "" if self.outcome is Outcome.FINISHED else f" of {self.planned_s:.1f}"
+            lines.append(f"  ran for {self.ran_s:.1f}{of} s{hit}")
         if self.loop_timing is not None and self.loop_timing.cycles:
             lines += ["  " + line for line in self.loop_timing.lines()]
         for limit, cycles in self.clipped.items():
