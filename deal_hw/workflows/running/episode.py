@@ -21,7 +21,7 @@ from deal_hw.control.process_channel import (
     Beat,
 )
 from deal_hw.control.replay_error import ReplayError, replay_error
-from deal_hw.control.supervisor import OPERATOR, Supervisor
+from deal_hw.control.supervisor import Supervisor
 from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
@@ -29,6 +29,7 @@ from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.drivers import BALANCE, ODOMETRY, balanced, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
+from deal_hw.signals import OPERATOR
 from deal_hw.version import __version__
 from deal_hw.workflows.running.episode_end import account
 from deal_hw.workflows.running.keyboard import keys
@@ -100,7 +101,7 @@ class EpisodeRun:
             module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
-            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, supervisor, on_beat),
+            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, on_beat),
             recorder=recorder,
             on_beat=on_beat,
             keep_fds=self._keep_fds,
@@ -161,9 +162,7 @@ class EpisodeRun:
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
         return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
 
-    def _make_passive(
-        self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]
-    ) -> bool:
+    def _make_passive(self, phase: str, in_vain: bool, on_beat: Callable[[Beat], None]) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""
         untouched = (
             STARTING,
@@ -180,4 +179,4 @@ class EpisodeRun:
             on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
 
         config = _IN_VAIN if in_vain else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
-        return make_passive(self._robot, clock, config, progress=tell, abandoned=lambda: supervisor.abandoned)
+        return make_passive(self._robot, clock, config, progress=tell)
