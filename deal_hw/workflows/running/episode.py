@@ -64,6 +64,8 @@ class EpisodeRun:
         self._keep_fds, self._say = keep_fds, say
         self.signal = ""
         """Name of the signal by which the operator ended it, or ""."""
+        self._supervisor: Supervisor | None = None
+        self._stop_cause = ""
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
         self._path = store.next_episode_path() if store is not None else None
         self._metadata = {
@@ -97,7 +99,7 @@ class EpisodeRun:
                 recorder.finish()
                 raise
         port_fd = self._robot.fileno()
-        supervisor = Supervisor(
+        self._supervisor = supervisor = Supervisor(
             module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
@@ -106,6 +108,8 @@ class EpisodeRun:
             on_beat=on_beat,
             keep_fds=self._keep_fds,
         )
+        if self._stop_cause:
+            supervisor.stop(self._stop_cause)
         listening = (
             keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say)
             if self._plan.velocity == "keyboard"
@@ -141,6 +145,12 @@ class EpisodeRun:
                 # Such as a full disk. The report matters more, and the next open indexes the recording.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
+
+    def stop(self, cause: str) -> None:
+        """Make the robot passive and end the episode, or one that begins later; safe from another thread."""
+        self._stop_cause = cause
+        if self._supervisor is not None:
+            self._supervisor.stop(cause)
 
     def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""

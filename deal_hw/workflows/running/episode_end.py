@@ -10,6 +10,7 @@ from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.supervisor import ChildEnd
 from deal_hw.signals import OPERATOR, name
 from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.running.sleep_lock import ASLEEP
 
 _LINK_WARNING = 0.01
 """Share of corrupt and missing state frames above which the operator gets a warning."""
@@ -56,13 +57,15 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
 
 def _verdict(end: ChildEnd, result: dict[str, Any]) -> tuple[Outcome, str, str]:
     """Return the outcome, its reason as text, and the error's class."""
-    operator = bool(end.signal) or end.stop_cause == OPERATOR
+    operator = bool(end.signal) or end.stop_cause in (OPERATOR, ASLEEP)
     if end.killed and not operator:
         return Outcome.FAILED, f"the control process was killed: {end.killed}", "SafetyError"
     if end.stop_cause and not operator:
         return Outcome.FAILED, end.stop_cause, "DatasetError"
     if result:
-        return Outcome(result["outcome"]), result["reason"], result["error"]
+        # The control process knows the signal that asked it to end, and not always why it was sent.
+        reason = end.stop_cause or OPERATOR if result["reason"] == OPERATOR else result["reason"]
+        return Outcome(result["outcome"]), reason, result["error"]
     if operator:
         return Outcome.STOPPED, end.stop_cause, ""
     code = end.exit_code
