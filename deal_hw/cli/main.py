@@ -157,6 +157,11 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             help="send a recording's commands again, through the safety filter",
             example="replay runs/first/dataset/episodes/000000.mcap --port /dev/ttyUSB0",
         ),
+        "stop": _verb(
+            "stop",
+            help="make a robot passive at once, from any terminal, whoever of deal-hw commands it",
+            example="stop go2",
+        ),
         "doctor": _verb(
             "doctor",
             help="check this computer, the connection and the robot",

@@ -21,6 +21,7 @@ from deal_hw.control.process_channel import (
     Beat,
 )
 from deal_hw.control.replay_error import ReplayError, replay_error
+from deal_hw.control.run_note import RunNote
 from deal_hw.control.supervisor import Supervisor
 from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.recording.excitation import Excitation
@@ -60,8 +61,10 @@ class EpisodeRun:
         attempt: int = 0,
         keep_fds: tuple[int, ...] = (),
         say: Say = silent,
+        note: RunNote | None = None,
     ) -> None:
-        self._keep_fds, self._say = keep_fds, say
+        self._note, self._say = note, say
+        self._keep_fds = keep_fds if note is None else (*keep_fds, note.fileno())
         self.signal = ""
         """Name of the signal by which the operator ended it, or ""."""
         self._supervisor: Supervisor | None = None
@@ -116,7 +119,9 @@ class EpisodeRun:
             else contextlib.nullcontext()
         )
         with listening:
+            self._say_passive(None)
             end = supervisor.run()
+            self._say_passive(end.passive_confirmed)
         self.signal = end.signal
         report = dataclasses.replace(
             account(end, self._path, self._robot.watchdog_s), planned_s=self._plan.total_s
@@ -151,6 +156,10 @@ class EpisodeRun:
         self._stop_cause = cause
         if self._supervisor is not None:
             self._supervisor.stop(cause)
+
+    def _say_passive(self, passive: bool | None) -> None:
+        if self._note is not None:
+            self._note.say_passive(passive)
 
     def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""

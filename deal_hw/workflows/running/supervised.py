@@ -18,7 +18,7 @@ from deal_hw.control.process_channel import Beat
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
 from deal_hw.workflows.options import File
-from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
+from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun
 from deal_hw.workflows.running.keyboard import check_terminal
 from deal_hw.workflows.running.plan import RunPlan, check_plan
@@ -156,6 +156,7 @@ def run_episodes(
     with (
         _suspended_last(view.warn),
         claimed(plan) as claim,
+        noted(plan) as note,
         awake(before_sleep, view.note) if holds_last_command else contextlib.nullcontext(),
         connected(robot),
         _open_dataset(dataset, robot.description, view.warn) as store,
@@ -164,7 +165,7 @@ def run_episodes(
             store.keep_policy(Path(plan.policy), plan.policy_digest)
 
         def run_one(episode: RunPlan, number: int, attempt: int) -> EpisodeReport:
-            run = EpisodeRun(episode, robot, port, store, purpose, task, attempt, claim, view.warn)
+            run = EpisodeRun(episode, robot, port, store, purpose, task, attempt, claim, view.warn, note)
             current.append(run)
             if sleeping.is_set():
                 run.stop(ASLEEP)
