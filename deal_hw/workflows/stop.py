@@ -66,7 +66,7 @@ class StopSettings(Checked):
         default_transport(self.robot)
         refuse_others(self, "stop", self.robot)
         if not self.port:
-            default = StopSettings(self.robot)
+            default = StopSettings(self.robot, port="any")
             names = ("transport", "state_check", "simulator", "seconds", "wire")
             refuse(given(self, default, names), "without --port only runs on this computer are stopped")
 
