@@ -12,7 +12,7 @@ from deal_hw.workflows.stop import StopReport, StopSettings, run_stop
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stop(StopSettings):
+class StopRobot(StopSettings):
     """Make a robot passive at once, from any terminal: motor off, or damping. Nothing is asked.
 
     A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
@@ -23,7 +23,7 @@ class Stop(StopSettings):
     robot: tyro.conf.Positional[str]
 
 
-def stop(config: Stop) -> StopReport:
+def stop(config: StopRobot) -> StopReport:
     """Run the verb; see :func:`deal_hw.workflows.stop.stop`."""
     report = run_stop(config, aloud)
     print(report.words, file=sys.stdout if report.passive else sys.stderr)

@@ -181,7 +181,7 @@ def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig, number: signal
 def test_stop_damps_through_the_bridge_and_fights_nobody(
     rig: BridgeRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the bridge damps is passive, also for an observer. Nothing is sent to what another one controls."""
+    """What the bridge damps is passive, also for an observer. Where another one controls, nothing is sent."""
     monkeypatch.setattr(stop_workflow, "FREE_S", 0.5)
 
     def stop(name: str) -> StopReport:
