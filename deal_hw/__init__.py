@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from deal_hw.workflows.running.settings import LegOptions as LegOptions
     from deal_hw.workflows.running.settings import LinkOptions as LinkOptions
     from deal_hw.workflows.running.simulated import SimulationOptions as SimulationOptions
+    from deal_hw.workflows.stop import StopReport as StopReport
+    from deal_hw.workflows.stop import stop as stop
     from deal_hw.workflows.train import Training as Training
     from deal_hw.workflows.train import train as train
 
@@ -56,6 +58,7 @@ _EXPORTS = {
     "workflows.running.report": ("RunReport",),
     "workflows.running.settings": ("LinkOptions", "LegOptions"),
     "workflows.running.simulated": ("SimulationOptions",),
+    "workflows.stop": ("stop", "StopReport"),
     "workflows.train": ("train", "Training"),
     "transport": ("WireOptions",),
 }

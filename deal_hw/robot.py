@@ -86,6 +86,18 @@ class Robot(abc.ABC):
     def repeat(self) -> None:  # noqa: B027
         """Send the current command again, as ``description.repeat_rate_hz`` requires. Never waits."""
 
+    def require_free(self, timeout_s: float) -> None:  # noqa: B027
+        """Check that nobody else commands the robot; needed before ``passive`` without ``home`` and ``arm``.
+
+        Does nothing by default: the port itself is exclusive.
+
+        Args:
+            timeout_s: How long the robot's services may take to answer [s].
+
+        Raises:
+            SafetyError: Another program or the robot's own controller has it; the text names it.
+        """
+
     def hand_back(self, timeout_s: float) -> None:  # noqa: B027
         """Return the robot to its own controller, after ``passive``; does nothing by default.
 

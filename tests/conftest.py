@@ -13,9 +13,10 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("deal_hw", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("deal_hw")
 
-# A shell starts background jobs with SIGINT ignored; children inherit this, and tests of Ctrl-C would wait.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell starts background jobs with SIGINT ignored, nohup with SIGHUP. Tests would wait for them.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 REAL_TIME = (
     "cli/",

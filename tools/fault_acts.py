@@ -38,6 +38,35 @@ def signal_control(number: signal.Signals) -> Callable[[Rig], None]:
     return lambda rig: rig.signal(rig.control_pid(), number)
 
 
+def processes(rig: Rig) -> dict[str, int]:
+    """Return the pids of a run's processes; -1 where the run ended before."""
+    return {
+        "supervisor": rig.run.pid,
+        "control process": rig.control_pid(),
+        "recorder": rig.until(lambda: rig.child("recorder_process")) or -1,
+    }
+
+
+def signal_each(target: str, *numbers: int) -> Callable[[Rig], None]:
+    """Return an act: signals to one process of a run or to all, one after the other, as a session ends.
+
+    Args:
+        target: "supervisor", "control process", "recorder" or "all processes".
+        numbers: The signals.
+    """
+
+    def act(rig: Rig) -> None:
+        found = processes(rig)
+        pids = [pid for name, pid in found.items() if target in (name, "all processes")]
+        for number in numbers:
+            for pid in pids:
+                rig.signal(pid, number)
+        if signal.SIGTSTP in numbers and rig.run.pid in pids:
+            _go_on(rig)
+
+    return act
+
+
 def kill_control_sometime(rig: Rig) -> None:
     """The control process is killed at a random time: a dry run has no phases in the emulator's log."""
     pid = rig.control_pid()
@@ -64,6 +93,11 @@ def stop_supervisor(rig: Rig) -> None:
 def suspend(rig: Rig) -> None:
     """Ctrl-Z: the robot must be passive before the process stops; then `fg`."""
     rig.signal(rig.run.pid, signal.SIGTSTP)
+    _go_on(rig)
+
+
+def _go_on(rig: Rig) -> None:
+    """Wait until the run has stopped, check that the motors do not obey, and let it go on."""
     stopped = rig.until(lambda: process_state(rig.run.pid) == "T", 20.0)
     if not stopped:
         rig.notes.append("it ended instead of stopping")

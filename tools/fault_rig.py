@@ -278,9 +278,10 @@ class Rig(ABC):
 
     def control_pid(self) -> int:
         """Return the control process's pid once it exists; -1 where the run ended before."""
-        return self.until(lambda: self._child("control_process")) or -1
+        return self.until(lambda: self.child("control_process")) or -1
 
-    def _child(self, module: str) -> int:
+    def child(self, module: str) -> int:
+        """Return the pid of the run's child with this module; 0: there is none."""
         with contextlib.suppress(OSError):
             for pid in Path(f"/proc/{self.run.pid}/task/{self.run.pid}/children").read_text().split():
                 self._pids.add(int(pid))
@@ -303,7 +304,7 @@ class Rig(ABC):
         if self.fault_ns < 0:
             self.fault_ns = time.monotonic_ns()
 
-    def signal(self, pid: int, number: signal.Signals) -> None:
+    def signal(self, pid: int, number: int) -> None:
         """Send a signal, which is the fault; to a process that has just ended, nothing."""
         self.fault()
         if pid > 0:
@@ -312,7 +313,7 @@ class Rig(ABC):
 
     def finish(self) -> None:
         """Wait until the run and its children have ended; kill what hangs."""
-        self._child("")
+        self.child("")
         deadline = time.monotonic() + PATIENCE_S
         try:
             self.run.wait(PATIENCE_S)

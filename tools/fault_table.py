@@ -17,6 +17,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -383,8 +384,10 @@ def main(
     if given.list:
         print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
         return 0
-    # A shell makes a background program ignore Ctrl-C, and all its children would inherit this.
+    # A shell makes a background program ignore Ctrl-C, and nohup SIGHUP; all its children would inherit this.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGQUIT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     calls, rows = earlier(given.out)
     calls.append(describe_call(f"tools/{Path(sys.argv[0]).name}"))
     bad = 0
@@ -415,9 +418,11 @@ def line(row: Mapping[str, Any]) -> str:
     good = row["as_expected"] == row["count"]
     times = "" if row["median_ms"] is None else f"{row['median_ms']:.0f} / {row['worst_ms']:.0f} ms"
     codes = sorted({r["exit_code"] for r in row["repetitions"]})
+    data = Counter(r["dataset"].partition(":")[0] for r in row["repetitions"])
+    kept = ", ".join(f"{count} {word}" for word, count in data.items())
     text = (
         f"{'ok ' if good else 'BAD'} {row['fault']:62} {times:>16} {row['as_expected']}/{row['count']} "
-        f"exit {codes} load {row['load'][0]:.1f}"
+        f"exit {codes} dataset: {kept} load {row['load'][0]:.1f}"
     )
     for r in row["repetitions"]:
         if r["complaints"]:

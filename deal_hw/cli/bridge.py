@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,8 +25,9 @@ from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpo
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.ranges import Checked, Range
+from deal_hw.signals import reason, taken
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.emulation.common import run_until, signalled
+from deal_hw.workflows.emulation.common import run_until
 from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.options import given, refuse
 
@@ -38,7 +40,8 @@ SWITCH_S = 0.0005
 class Bridge(Checked):
     """Carry a Go2's messages between its DDS and Zenoh, admit one controller, and damp the robot without one.
 
-    Runs on the robot's own computer until Ctrl-C or SIGTERM, which damp the robot first.
+    Runs on the robot's own computer until Ctrl-C, or any other signal that ends a program. It damps the robot
+    first.
     """
 
     robot: tyro.conf.Positional[str]
@@ -103,7 +106,13 @@ def bridge(config: Bridge) -> int:
     """
     if config.robot not in ROBOTS:
         raise UnknownNameError("robot with a bridge", config.robot, ROBOTS)
-    with signalled() as (stop, _):
+    stop, signals = threading.Event(), list[int]()
+
+    def signalled(number: int) -> None:
+        signals.append(number)
+        stop.set()
+
+    with taken(signalled):
         port = free_port(config.end_point)
         clock = MonotonicClock()
         options = WireOptions(domain=config.domain)
@@ -131,6 +140,8 @@ def bridge(config: Bridge) -> int:
                     run_until(step, stop, config.duration_s, config.parent)
                 finally:
                     made.close()
+    if signals:
+        _tell(f"the bridge ended: {reason(signals[0])}")
     for line in summary(made):
         print(line, file=sys.stderr)
     return 0

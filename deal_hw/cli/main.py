@@ -56,12 +56,19 @@ class Verb:
 
 
 def _verb(
-    name: str, *, help: str, example: str, extra: str = "", module: str = "", function: str = ""
+    name: str,
+    *,
+    help: str,
+    example: str,
+    extra: str = "",
+    module: str = "",
+    function: str = "",
+    config: str = "",
 ) -> Verb:
     plain = name.replace("-", "_")
     return Verb(
         module=f"deal_hw.cli.{module or plain}",
-        config="".join(part.capitalize() for part in name.split("-")),
+        config=config or "".join(part.capitalize() for part in name.split("-")),
         function=function or plain,
         help=help,
         example=example,
@@ -156,6 +163,12 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             "replay",
             help="send a recording's commands again, through the safety filter",
             example="replay runs/first/dataset/episodes/000000.mcap --port /dev/ttyUSB0",
+        ),
+        "stop": _verb(
+            "stop",
+            help="make a robot passive at once, from any terminal, whoever of deal-hw commands it",
+            example="stop go2",
+            config="StopRobot",
         ),
         "doctor": _verb(
             "doctor",

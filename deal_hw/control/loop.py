@@ -86,6 +86,7 @@ class ControlLoop:
         """End the run; may be called from a signal handler and from the behaviour."""
         self._stop_reason = self._stop_reason or reason
         if self._raise_on_stop:
+            # Once: a second exception could interrupt the passive route that the first one began.
             self._raise_on_stop = False
             raise OperatorStop(reason)
 
@@ -98,11 +99,15 @@ class ControlLoop:
         outcome, reason, error, confirmed = Outcome.FAILED, "", "", False
         running = False
         try:
-            self._raise_on_stop = True
-            if self._stop_reason:
-                raise OperatorStop(self._stop_reason)
-            self._prepare()
-            self._raise_on_stop = False
+            # In a block of its own: a stop that comes while an error is on its way out of it is still caught
+            # below.
+            try:
+                self._raise_on_stop = True
+                if self._stop_reason:
+                    raise OperatorStop(self._stop_reason)
+                self._prepare()
+            finally:
+                self._raise_on_stop = False
             running = self._commanding
             outcome, reason = self._cycles()
         except (OperatorStop, KeyboardInterrupt):
@@ -116,7 +121,6 @@ class ControlLoop:
                 self.note("passive", reason, flags=["link_lost"])
         finally:
             # The robot comes first, before any step that might fail.
-            self._raise_on_stop = False
             confirmed = self._make_passive()
             if confirmed and outcome in (Outcome.FINISHED, Outcome.STOPPED):
                 self._hand_back()

@@ -57,7 +57,6 @@ def make_passive(
     config: PassiveConfig | None = None,
     *,
     progress: Callable[[str, float], None] = _nothing,
-    abandoned: Callable[[], bool] = lambda: False,
 ) -> bool:
     """Send the passive command until the robot reports that its motors no longer follow commands.
 
@@ -69,15 +68,15 @@ def make_passive(
         clock: For the waiting.
         config: Settings.
         progress: Called after each failed attempt, with a text for the operator, which changes once a second,
-        and with the longest time until the next call [s].
-        abandoned: Whether the operator gave up; asked after each attempt.
+        and with the longest time until the next call [s]. What it raises, such as for a closed terminal, is
+        ignored.
 
     Returns:
         Whether the robot confirmed it.
     """
     try_hard = _Endeavour(robot, clock, config or PassiveConfig(), progress)
     while not try_hard.attempt():
-        if try_hard.over or abandoned():
+        if try_hard.over:
             return False
         try_hard.prepare_next()
     return True
@@ -147,7 +146,8 @@ class _Endeavour:
             else "the robot does not confirm it"
         )
         text = f"{why}; passive command repeated for {passed_s} s, {left_s} s left"
-        self._progress(text, silence_s)
+        with contextlib.suppress(Exception):
+            self._progress(text, silence_s)
 
     def _drained(self) -> bool:
         """Drop the waiting samples; return whether the next one is newer than the command.

@@ -61,7 +61,7 @@ class RecordSender:
             DatasetError: The recorder has ended, or has taken no record for a second.
         """
         try:
-            self._socket.send(encode(record))
+            self._socket.send(encode(record), socket.MSG_NOSIGNAL)
         except (BlockingIOError, ConfigurationError):
             self._refused_in_a_row += 1
             if self._refused_in_a_row >= _MOST_REFUSED:
@@ -114,7 +114,8 @@ class StatusSender:
         self._count = self._count + 1 if phase == self._phase else 0
         self._phase = phase
         try:
-            self._socket.send(_BEAT.pack(b"H", stamp_ns, silence_s, self._count) + phase.encode())
+            beat = _BEAT.pack(b"H", stamp_ns, silence_s, self._count) + phase.encode()
+            self._socket.send(beat, socket.MSG_NOSIGNAL)
         except OSError:
             return
 
@@ -136,7 +137,7 @@ class StatusSender:
         """Send the run's result as JSON; may wait a second, since the robot is already passive."""
         self._socket.settimeout(1.0)
         try:
-            self._socket.send(b"R" + json.dumps(values).encode())
+            self._socket.send(b"R" + json.dumps(values).encode(), socket.MSG_NOSIGNAL)
         except OSError:
             return
 

@@ -8,19 +8,23 @@ import gc
 import os
 import resource
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
-"""Signal that the kernel sends when the parent dies; nothing else sends it, so the cause is certain."""
+"""Signal that the kernel sends when the parent dies. Another program may send it, too: see
+:func:`parent_is_gone`."""
 FIFO_PRIORITY = 50
 SUPERVISOR_PRIORITY = FIFO_PRIORITY + 1
 """Above the control process, since it must be able to kill one that blocks a processor."""
 TRANSPORT_PRIORITY = FIFO_PRIORITY - 10
 """Priority of the supervisor's transport threads, because damping must be sent on a busy machine, too."""
 _MCL_ONFAULT = 4
+_PF_EXITING = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +139,54 @@ def die_with_parent(parent_pid: int) -> None:
         raise ProcessLookupError(f"the parent process {parent_pid} has ended")
 
 
+def parent_is_gone(parent_pid: int) -> bool:
+    """Return whether the parent has ended, or is ending at this moment.
+
+    A parent with several threads still has its process id when the kernel sends ``PARENT_DIED``. The kernel
+    then shows that it is exiting, or has SIGKILL pending.
+
+    Args:
+        parent_pid: The parent's process id, as the parent gave it.
+    """
+    if os.getppid() != parent_pid:
+        return True
+    try:
+        words = Path(f"/proc/{parent_pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return Path("/proc/self/stat").exists()
+    state, flags, pending = words[0], int(words[6]), int(words[28])
+    return state in "ZX" or bool(flags & _PF_EXITING) or bool(pending & 1 << signal.SIGKILL - 1)
+
+
+class _Event(ctypes.Structure):
+    """``struct sigevent``, 64 bytes."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("rest", ctypes.c_byte * 48),
+    )
+
+
+class _Times(ctypes.Structure):
+    """``struct itimerspec``: interval, then time left, each in seconds and nanoseconds."""
+
+    _fields_ = (("interval", ctypes.c_long * 2), ("left", ctypes.c_long * 2))
+
+
 def kill_self_after(seconds: float) -> None:
-    """Have the kernel kill this process after a time [s]: the last resort of an orphan."""
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+    """Have the kernel kill this process after a time [s]: the last resort of an orphan.
+
+    The timer sends SIGKILL, which nothing holds back. SIGALRM would need its default action, and the SIGALRM
+    of another program would then end this process before the robot is passive.
+    """
+    timer = ctypes.c_void_p()
+    event, times = _Event(signal=signal.SIGKILL), _Times(left=(int(seconds), round(seconds % 1 * 1e9)))
+    for library in (None, "librt.so.1"):
+        with contextlib.suppress(OSError, AttributeError):
+            libc = ctypes.CDLL(library, use_errno=True)
+            # Before glibc 2.34 these are in librt.
+            libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer))
+            libc.timer_settime(timer, 0, ctypes.byref(times), None)
+            return

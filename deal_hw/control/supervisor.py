@@ -8,7 +8,6 @@ command the robot. The control process also watches the supervisor ( :mod:`deal_
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import select
@@ -16,10 +15,8 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import FrameType
 from typing import Any
 
 from deal_hw.child_process import own_process_group
@@ -34,14 +31,15 @@ from deal_hw.control.process_channel import (
 )
 from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
 from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
+from deal_hw.signals import held_back, name, reason, taken
 
 START_SILENCE_S = 30.0
 """How long a new control process may take to import and load before its first heartbeat [s]."""
-OPERATOR = "stopped by the operator"
-SUSPENDED = "suspended by the operator (Ctrl-Z)"
+PATIENCE_S = 1.0
+"""A control process that was asked to end is killed by a further request only after this time [s]. It needs
+0.25 s at most (measured). A session that ends sends SIGTERM and SIGHUP to each process, and a key that is
+held repeats."""
 _POLL_S = 0.05
-_MOST_STOPS = 3
-"""After this many stop requests of the operator, the next one ends the repeating of the passive command."""
 _GRACE_S = 3.0
 """How long a control process may take to exit after it closed its end of the channel [s]."""
 
@@ -107,12 +105,12 @@ class Supervisor:
         self._status: StatusReceiver | None = None
         self._result: dict[str, Any] | None = None
         self._killed = self._stop_cause = self._signal = ""
-        self._stops = self._beat_ns = 0
+        self._asked_ns = self._beat_ns = 0
         self._phase = STARTING
 
     def run(self) -> ChildEnd:
         """Run the control process to its end, then make the robot passive and close the recording."""
-        with self._operator_stops(), priority(SUPERVISOR_PRIORITY, lock=True):
+        with taken(self._signalled), priority(SUPERVISOR_PRIORITY, lock=True):
             child, status = self._start()
             try:
                 self._watch(child, status)
@@ -130,22 +128,28 @@ class Supervisor:
             self._result, exit_code, self._killed, self._stop_cause, confirmed, outcome, self._signal
         )
 
-    @property
-    def abandoned(self) -> bool:
-        """Whether the operator has asked so often that even the passive command ends."""
-        return self._stops > _MOST_STOPS
+    def stop(self, cause: str, number: int = signal.SIGTERM) -> None:
+        """Ask the control process to end by its passive route; a request much later kills it.
 
-    def stop(self, cause: str) -> None:
-        """Ask the control process to end by its passive route; the operator's second request kills it."""
-        self._stops += 1
+        Args:
+            cause: Why; the first one counts.
+            number: The signal by which it is asked.
+        """
         again, self._stop_cause = bool(self._stop_cause), self._stop_cause or cause
+        if not again:
+            self._asked_ns = self._clock.now_ns()
         child = self._child
         if child is None or child.returncode is not None:
             return
         if not again:
-            child.send_signal(signal.SIGTERM)
-        elif cause in (OPERATOR, SUSPENDED):
-            self._kill(child, "the operator asked twice")
+            child.send_signal(number)
+        elif self._clock.now_ns() - self._asked_ns >= round(PATIENCE_S * 1e9):
+            self._kill(child, "it did not end when it was asked, and was asked again")
+
+    def _signalled(self, number: int) -> None:
+        """Ask the control process to end, by the same signal, so that it knows the reason, too."""
+        self._signal = self._signal or name(number)
+        self.stop(reason(number), number)
 
     def tell(self, text: str) -> None:
         """Pass a message of the operator to the control process, such as a key; safe from another thread."""
@@ -166,13 +170,16 @@ class Supervisor:
             record.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
             inherited.append(record.fileno())
             plan["record_fd"] = record.fileno()
-        with sender:
+        # A file, not a pipe: no signal of a broken pipe, and no wait for a child that does not read.
+        with sender, open(os.memfd_create("orders"), "w+b") as orders, held_back():
+            orders.write(json.dumps(plan).encode())
+            orders.seek(0)
             # In its own process group: Ctrl-C in the terminal reaches only the supervisor, which passes it
             # on.
             child = subprocess.Popen(
                 [sys.executable, "-m", self._module],
                 pass_fds=inherited,
-                stdin=subprocess.PIPE,
+                stdin=orders,
                 **own_process_group(),
             )
         self._child = child
@@ -181,9 +188,6 @@ class Supervisor:
         if self._stop_cause:
             child.send_signal(signal.SIGTERM)
         self._stale_ns = self._clock.now_ns() + round(START_SILENCE_S * 1e9)
-        assert child.stdin is not None
-        with contextlib.suppress(BrokenPipeError), child.stdin as orders:
-            orders.write(json.dumps(plan).encode())
         self._status = StatusReceiver(receiver)
         return child, self._status
 
@@ -226,22 +230,3 @@ class Supervisor:
         except subprocess.TimeoutExpired:
             self._kill(child, "it did not end after its last message")
             return child.wait()
-
-    @contextlib.contextmanager
-    def _operator_stops(self) -> Iterator[None]:
-        """Pass on Ctrl-C, SIGTERM and Ctrl-Z as the operator's stop."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def handler(number: int, frame: FrameType | None) -> None:
-            self._signal = self._signal or signal.Signals(number).name
-            self.stop(SUSPENDED if number == signal.SIGTSTP else OPERATOR)
-
-        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGTSTP)
-        before = {number: signal.signal(number, handler) for number in numbers}
-        try:
-            yield
-        finally:
-            for number, old in before.items():
-                signal.signal(number, old)

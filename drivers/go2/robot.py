@@ -177,6 +177,16 @@ class Go2Robot(Robot):
         self._homed = True
         self._states.clear()
 
+    def require_free(self, timeout_s: float) -> None:
+        """Check that nobody commands the motors, neither on the robot's side nor through a bridge."""
+        self._check_connected()
+        self._in_charge = True
+        try:
+            self._takeover.require_free(timeout_s)
+        finally:
+            # The passive command that follows is the first one.
+            self._in_charge = False
+
     def hand_back(self, timeout_s: float) -> None:
         """Return the robot to the mode that ``home`` released, if any; the robot stands up.
 

@@ -87,6 +87,25 @@ class Takeover:
                 )
         self._await_silence(deadline_ns)
 
+    def require_free(self, timeout_s: float) -> None:
+        """Check that neither the robot's own controller nor another program commands the motors.
+
+        Services that do not answer are no proof of a controller: an active one sends commands, which are
+        heard.
+
+        Raises:
+            SafetyError: One of them does; the text names it.
+        """
+        name = ""
+        with contextlib.suppress(TransportTimeoutError):
+            name = self._active(self._clock.now_ns() + round(timeout_s * 1e9))
+        if name:
+            raise SafetyError(
+                f"go2: the robot's own controller {name!r} has it, and a second commander would make it "
+                "jump, so nothing was sent; lay it down or damp it by its remote"
+            )
+        self._await_silence(self._clock.now_ns())
+
     def hand_back(self, timeout_s: float) -> None:
         """Return the robot to the released mode; do nothing if none was released.
 

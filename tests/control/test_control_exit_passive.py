@@ -335,19 +335,18 @@ def test_a_robot_that_sends_faster_than_it_is_read_is_told_again() -> None:
     assert armed.told[0][1].startswith("the robot does not confirm it; passive")
 
 
-def test_the_operator_may_give_up() -> None:
-    """Asked after each attempt that failed, never before the first."""
+def test_a_display_that_fails_stops_nothing() -> None:
+    """The terminal is gone, as after SIGHUP: each line of progress raises, and the command is repeated."""
     armed = Armed()
-    armed.wire.unplug()
-    asked: list[float] = []
+    armed.wire.silent = True
 
-    def abandoned() -> bool:
-        asked.append(armed.passed_s)
-        return len(asked) == 3
+    def then() -> None:
+        armed.wire.silent = armed.passed_s < 2.0
+        raise OSError(5, "Input/output error")
 
-    assert not make_passive(armed.robot, armed.clock, abandoned=abandoned)
-    assert len(armed.stops()) == 3
-    assert asked == pytest.approx([0.0, 0.05, 0.1])
+    armed.then = then
+    assert armed.make_passive()
+    assert armed.passed_s > 2.0 and armed.motor_off()
 
 
 def test_a_driver_that_fails_in_every_way_is_survived() -> None:

@@ -23,11 +23,12 @@ from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError
+from deal_hw.signals import reason
 from deal_hw.types import Status
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
-from deal_hw.workflows.running.supervised import run_episodes
+from deal_hw.workflows.running.supervised import InterruptedRunError, run_episodes
 
 pytestmark = pytest.mark.slow
 
@@ -196,3 +197,27 @@ def test_the_end_key_lays_the_robot_down(rig: Rig, tmp_path: Path, monkeypatch: 
         "it stands still, and lies down",
     ]
     assert kinds(rig.finish())[-3:] == [DAMPING, STIFF, DAMPING]
+
+
+@pytest.mark.parametrize("numbers", [(signal.SIGHUP,), (signal.SIGTERM, signal.SIGHUP)])
+def test_a_session_that_ends_leaves_the_robot_damped(
+    rig: Rig, tmp_path: Path, numbers: tuple[signal.Signals, ...]
+) -> None:
+    """A lost ssh connection, under systemd: to all processes. On befe5678 it stood stiff for ever, 6 of 6."""
+
+    def hang_up() -> None:
+        children = Path(f"/proc/self/task/{threading.get_native_id()}/children").read_text().split()
+        for number in numbers:
+            for pid in (os.getpid(), *map(int, children)):
+                # The emulator in its process of its own is no part of the session.
+                if pid != rig.process.pid:
+                    os.kill(pid, number)
+
+    with pytest.raises(InterruptedRunError) as raised:
+        rig.run(tmp_path / "dataset", at_beat=80, act=hang_up)
+    told = rig.finish()
+    assert kinds(told) == [DAMPING, STIFF, DAMPING]
+    (episode,) = raised.value.report.episodes
+    assert episode.passive_confirmed
+    assert episode.reason in [reason(number) for number in numbers]
+    assert len(Dataset.open(tmp_path / "dataset").read(0).trajectory.sent_s) > 40

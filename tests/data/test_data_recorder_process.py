@@ -92,12 +92,15 @@ def wait_until_drained(sender: socket.socket) -> None:
 def test_ctrl_c_does_not_end_the_recorder(
     recorder: RecorderHandle, tmp_path: Path, make_cycle: MakeCycle
 ) -> None:
-    """SIGINT is the supervisor's business; cycles after it are still recorded."""
+    """The supervisor hears of it and ends the run; cycles after it are still recorded."""
     feed(recorder, [encode(make_cycle(0))])
-    os.kill(recorder.process.pid, signal.SIGINT)
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE, signal.SIGALRM):
+        os.kill(recorder.process.pid, number)
     feed(recorder, [encode(make_cycle(1))])
     outcome = recorder.finish()
     assert outcome.complete and outcome.cycles == 2
+    (told,) = outcome.errors
+    assert told.startswith("it was told to end by SIG")
 
 
 def test_sigterm_ends_it_with_a_whole_file(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from random import SystemRandom
@@ -13,12 +15,15 @@ import pytest
 from bridge_client import BridgeClient
 from bridge_rig import BridgeRig
 
+import deal_hw
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports import zenoh_session
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError, SafetyError, TransportTimeoutError
 from deal_hw.types import JointCommand
+from deal_hw.workflows import stop as stop_workflow
+from deal_hw.workflows.stop import StopReport
 
 pytestmark = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("cyclonedds", "cryptography", "mujoco")),
@@ -160,15 +165,36 @@ def test_a_killed_bridge_damps_when_it_is_back(rig: BridgeRig) -> None:
         rig.await_commands([*told, "damping", "stiff"])
 
 
-def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig) -> None:
-    """SIGTERM while it walks."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGALRM])
+def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig, number: signal.Signals) -> None:
+    """While a controller holds the robot; on befe5678 all but SIGTERM ended or stopped it without damping."""
     with BridgeClient(rig.port, rig.options("controller")) as client:
         client.take_over()
         told = rig.commands()
-        _, said = rig.bridge.stop()
+        os.kill(rig.bridge.pid, number)
         rig.await_commands([*told, "damping"])
-        assert "commands passed" in said
+        _, said = rig.bridge.stop()
+        assert "the bridge ended: " in said and "commands passed" in said
     rig.start_bridge()
+
+
+def test_stop_damps_through_the_bridge_and_fights_nobody(
+    rig: BridgeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the bridge damps is passive, also for an observer. Where another one controls, nothing is sent."""
+    monkeypatch.setattr(stop_workflow, "FREE_S", 0.5)
+
+    def stop(name: str) -> StopReport:
+        return deal_hw.stop("go2", port=rig.port, transport="zenoh", wire=rig.options(name), seconds=0.5)
+
+    assert stop("observer").passive and stop("controller").passive
+    with BridgeClient(rig.port, rig.options("controller")) as client:
+        client.take_over()
+        told = rig.commands()
+        for name in ("observer", "controller"):
+            found = stop(name)
+            assert not found.passive and "another controller commands the robot" in found.words
+        assert client.in_charge and rig.commands() == told
 
 
 @pytest.mark.parametrize(

@@ -295,3 +295,28 @@ def test_body_and_remote_reach_the_state() -> None:
     wire.device.remote = None
     body = wire.robot.read_state(0.1).body
     assert body is not None and body.buttons == -1 and not body.sticks.any()
+
+
+@pytest.mark.parametrize(
+    ("mode", "deaf", "words"),
+    [
+        ("", False, ""),
+        ("", True, ""),
+        ("normal", False, "the robot's own controller 'normal' has it"),
+        ("normal", True, "another program commands the robot's motors"),
+    ],
+)
+def test_a_robot_is_free_if_nobody_commands_it(mode: str, deaf: bool, words: str) -> None:
+    """Then it is damped by the first command; otherwise nothing is sent."""
+    bench = FakeBench(mode=mode)
+    bench.device.deaf = {"motion_switcher"} if deaf else set()
+    bench.robot.connect()
+    if words:
+        with pytest.raises(SafetyError, match=words):
+            bench.robot.require_free(2.0)
+        assert bench.device.heard == []
+        return
+    bench.robot.require_free(2.0)
+    bench.robot.passive()
+    (_, command), *_ = bench.device.heard
+    assert not command.stiffness.any() and command.damping.all()

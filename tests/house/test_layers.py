@@ -22,6 +22,7 @@ VOCABULARY = (
     "install",
     "ranges",
     "child_process",
+    "signals",
     "version",
 )
 CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")

@@ -16,6 +16,7 @@ from typing import Any
 from deal_hw.child_process import own_process_group
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.errors import DatasetError
+from deal_hw.signals import held_back
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,9 +136,10 @@ def start_recorder(path: Path, description: Mapping[str, Any], metadata: Mapping
     command += ["--path", str(path), "--config-fd", str(config), "--status-fd", str(status_write)]
     try:
         # A process group of its own keeps the terminal's Ctrl-C away even while the interpreter starts.
-        process = subprocess.Popen(
-            command, pass_fds=inherited, stdin=subprocess.DEVNULL, **own_process_group()
-        )
+        with held_back():
+            process = subprocess.Popen(
+                command, pass_fds=inherited, stdin=subprocess.DEVNULL, **own_process_group()
+            )
     finally:
         recorder_end.close()
         os.close(config)

@@ -14,14 +14,13 @@ import argparse
 import json
 import os
 import select
-import signal
 import socket
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
+from deal_hw import signals
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.data.recording.record import MAX_DATAGRAM_BYTES, decode
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -29,8 +28,8 @@ from deal_hw.errors import DealHwError, ProtocolError
 
 EXIT_OK, EXIT_INCOMPLETE = 0, 3
 TERM_GRACE_S = 2.0
-"""How long the peer may still send after SIGTERM [s]: the control process ends by the same signal, and its
-last records follow."""
+"""How long the peer may still send after a signal [s]: the supervisor is told, so the run ends, and its last
+records follow."""
 
 
 class RecorderProcess:
@@ -52,9 +51,11 @@ class RecorderProcess:
         self._stop_at_ns: int | None = None
         self.unreadable = 0
 
-    def terminate(self, number: int, frame: FrameType | None) -> None:
-        """Signal handler: finish soon even if the peer does not close."""
-        self._stop_at_ns = self._clock.now_ns() + round(TERM_GRACE_S * 1e9)
+    def terminate(self, number: int) -> None:
+        """Take a signal: report it, which ends the run, and finish soon even if the peer does not close."""
+        if self._stop_at_ns is None:
+            self._stop_at_ns = self._clock.now_ns() + round(TERM_GRACE_S * 1e9)
+            self._report({"kind": "error", "message": f"it was told to end by {signals.name(number)}"})
 
     def run(self) -> int:
         """Write until the peer closes; return the exit code."""
@@ -76,7 +77,7 @@ class RecorderProcess:
             if left_s <= 0:
                 return False
             wait_s = left_s if wait_s is None else min(wait_s, left_s)
-        # Python resumes select after a signal handler, so an endless wait would never see SIGTERM.
+        # Python resumes select after a signal handler, so an endless wait would never see the signal.
         ready, _, _ = select.select([self._peer], [], [], 0.5 if wait_s is None else wait_s)
         if ready:
             try:
@@ -156,15 +157,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--status-fd", type=int, default=-1, help="write end of a pipe for reports")
     options = parser.parse_args(arguments)
-    # Ctrl-C is for the supervisor, which ends the recorder last of all, by closing the socket.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     clock = MonotonicClock()
     with open(options.config_fd, encoding="utf-8") as file:
         config = json.load(file)
     recorder = EpisodeRecorder(options.path, config["description"], config["metadata"], clock)
     with socket.socket(fileno=options.fd) as peer:
         process = RecorderProcess(peer, recorder, Report(options.status_fd), clock)
-        signal.signal(signal.SIGTERM, process.terminate)
+        signals.take(process.terminate)
         return process.run()
 
 

@@ -16,6 +16,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
+from deal_hw.signals import ENDING, taken
 from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.options import File
 from deal_hw.workflows.say import Say
@@ -28,20 +29,17 @@ _FIFO_PRIORITY = 40
 
 @contextlib.contextmanager
 def signalled() -> Iterator[tuple[threading.Event, threading.Event]]:
-    """Yield two events: SIGINT and SIGTERM set the first one (stop), SIGUSR1 the second one (cut the wire).
+    """Yield two events, set by signals: by those that end a program (stop), and by SIGUSR1 (cut the wire).
 
-    Afterwards the program's own handlers are restored.
+    Ctrl-Z suspends an emulator, as any program. Afterwards the program's own handlers are restored.
     """
     stop, cut = threading.Event(), threading.Event()
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        for number, event in ((signal.SIGINT, stop), (signal.SIGTERM, stop), (signal.SIGUSR1, cut)):
-            before[number] = signal.signal(number, lambda *_, event=event: event.set())
-    try:
+
+    def handle(number: int) -> None:
+        (cut if number == signal.SIGUSR1 else stop).set()
+
+    with taken(handle, ENDING - {signal.SIGTSTP}):
         yield stop, cut
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from pathlib import Path
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.claim import LocalClaim
 from deal_hw.control.realtime import TRANSPORT_PRIORITY, priority
+from deal_hw.control.run_note import RunNote
 from deal_hw.drivers import claim_name, wire_claim
 from deal_hw.robot import Robot
 from deal_hw.workflows.running.plan import RunPlan
@@ -41,14 +42,31 @@ def claimed(plan: RunPlan) -> Iterator[tuple[int, ...]]:
     with contextlib.ExitStack() as held:
         local = held.enter_context(LocalClaim(claim_name(plan.transport, plan.port, plan.wire)))
         with priority(TRANSPORT_PRIORITY, children=True):
-            wire = wire_claim(plan.robot, plan.transport, plan.port, MonotonicClock(), _who(), plan.wire)
+            wire = wire_claim(plan.robot, plan.transport, plan.port, MonotonicClock(), who(), plan.wire)
             if wire is not None:
                 wire.acquire()
                 held.callback(wire.release)
         yield (local.fileno(),)
 
 
-def _who() -> str:
+@contextlib.contextmanager
+def noted(plan: RunPlan) -> Iterator[RunNote | None]:
+    """Keep a note of the run, by which ``deal-hw stop`` finds it; none of a run that sends nothing."""
+    if plan.dry_run:
+        yield None
+        return
+    facts = {
+        "port": plan.port,
+        "transport": plan.transport,
+        "wire": plan.wire.to_json(),
+        "settings": {k: v for k, v in plan.robot_settings.items() if k in ("state_check", "simulator")},
+        "claim": claim_name(plan.transport, plan.port, plan.wire),
+    }
+    with RunNote(plan.robot, facts) as note:
+        yield note
+
+
+def who() -> str:
     """Return a description of this commander for other programs."""
     words = [Path(sys.argv[0]).name, *sys.argv[1:2]]
     return f"{' '.join(words)[:60]} (process {os.getpid()} on {socket.gethostname()})"

@@ -8,17 +8,22 @@ writes neither to disk nor to the terminal, and imports neither torch, mujoco no
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
 import sys
 import threading
-from types import FrameType
 from typing import Any
 
+from deal_hw import signals
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process_channel import LOADING, RecordSender, StatusSender
-from deal_hw.control.realtime import PARENT_DIED, Granted, become_realtime, die_with_parent, kill_self_after
+from deal_hw.control.realtime import (
+    Granted,
+    become_realtime,
+    die_with_parent,
+    kill_self_after,
+    parent_is_gone,
+)
 from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 
 _START_SILENCE_S = 30.0
@@ -35,23 +40,32 @@ class _Stopper:
         self._parent_pid = parent_pid
         self.loop: Any = None
         self.passive_s = 0.0
-        for number in (signal.SIGINT, signal.SIGTERM, PARENT_DIED, _SUPERVISOR_SILENT):
-            signal.signal(number, self._handle)
+        self.supervisor_silent = False
+        """Whether the vigil found so: another program may send its signal, too."""
+        self.reason = ""
+        """Of the first signal; "" before it."""
+        signals.take(self._handle)
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        reason = "stopped by the operator"
-        if number == PARENT_DIED or os.getppid() != self._parent_pid:
-            # No supervisor is left to kill this process if its passive route hangs.
+    def _handle(self, number: int) -> None:
+        again, self.reason = bool(self.reason), self.reason or self._why(number)
+        if self.loop is not None:
+            self.loop.request_stop(self.reason)
+        elif not again:
+            # Once: a second exception could come out where the first one is being answered.
+            raise KeyboardInterrupt
+
+    def _why(self, number: int) -> str:
+        """Return the reason, and see to it that a process which its supervisor cannot kill does end."""
+        if parent_is_gone(self._parent_pid):
             kill_self_after(self.passive_s + _ORPHAN_S)
-            reason = "the supervisor died"
-        elif number == _SUPERVISOR_SILENT:
-            reason = (
+            return "the supervisor died"
+        if number == _SUPERVISOR_SILENT and self.supervisor_silent:
+            kill_self_after(self.passive_s + _ORPHAN_S)
+            return (
                 f"no heartbeat from the supervisor for {SUPERVISOR_SILENCE_S:g} s: it is stopped, swapped "
                 "out or blocked, so the operator cannot stop the run"
             )
-        if self.loop is None:
-            raise KeyboardInterrupt
-        self.loop.request_stop(reason)
+        return signals.reason(number)
 
 
 def main() -> int:
@@ -68,7 +82,7 @@ def main() -> int:
         status.result(
             {
                 "outcome": "stopped",
-                "reason": "stopped by the operator",
+                "reason": stopper.reason or signals.OPERATOR,
                 "error": "",
                 "passive_confirmed": True,
             }
@@ -119,7 +133,12 @@ def _run(
     sink = RecordSender(socket.socket(fileno=orders["record_fd"])) if "record_fd" in orders else _discard
 
     main = threading.get_ident()
-    vigil = SupervisorVigil(status, clock, lambda: signal.pthread_kill(main, _SUPERVISOR_SILENT))
+
+    def supervisor_is_silent() -> None:
+        stopper.supervisor_silent = True
+        signal.pthread_kill(main, _SUPERVISOR_SILENT)
+
+    vigil = SupervisorVigil(status, clock, supervisor_is_silent)
 
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)
@@ -154,6 +173,9 @@ def _run(
     for warning in granted.warnings:
         loop.note("warning", warning)
     stopper.loop, stopper.passive_s = loop, passive.timeout_s
+    if stopper.reason:
+        # Its exception was lost in a callback of a library.
+        loop.request_stop(stopper.reason)
     vigil.start()
     return {**loop.run().to_json(), "warnings": list(granted.warnings)}
 

@@ -21,7 +21,8 @@ from deal_hw.control.process_channel import (
     Beat,
 )
 from deal_hw.control.replay_error import ReplayError, replay_error
-from deal_hw.control.supervisor import OPERATOR, Supervisor
+from deal_hw.control.run_note import RunNote
+from deal_hw.control.supervisor import Supervisor
 from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
@@ -29,6 +30,7 @@ from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.drivers import BALANCE, ODOMETRY, balanced, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
+from deal_hw.signals import OPERATOR
 from deal_hw.version import __version__
 from deal_hw.workflows.running.episode_end import account
 from deal_hw.workflows.running.keyboard import keys
@@ -59,10 +61,14 @@ class EpisodeRun:
         attempt: int = 0,
         keep_fds: tuple[int, ...] = (),
         say: Say = silent,
+        note: RunNote | None = None,
     ) -> None:
-        self._keep_fds, self._say = keep_fds, say
+        self._note, self._say = note, say
+        self._keep_fds = keep_fds if note is None else (*keep_fds, note.fileno())
         self.signal = ""
         """Name of the signal by which the operator ended it, or ""."""
+        self._supervisor: Supervisor | None = None
+        self._stop_cause = ""
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
         self._path = store.next_episode_path() if store is not None else None
         self._metadata = {
@@ -96,22 +102,26 @@ class EpisodeRun:
                 recorder.finish()
                 raise
         port_fd = self._robot.fileno()
-        supervisor = Supervisor(
+        self._supervisor = supervisor = Supervisor(
             module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
-            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, supervisor, on_beat),
+            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, on_beat),
             recorder=recorder,
             on_beat=on_beat,
             keep_fds=self._keep_fds,
         )
+        if self._stop_cause:
+            supervisor.stop(self._stop_cause)
         listening = (
             keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say)
             if self._plan.velocity == "keyboard"
             else contextlib.nullcontext()
         )
         with listening:
+            self._say_passive(None)
             end = supervisor.run()
+            self._say_passive(end.passive_confirmed)
         self.signal = end.signal
         report = dataclasses.replace(
             account(end, self._path, self._robot.watchdog_s), planned_s=self._plan.total_s
@@ -141,6 +151,16 @@ class EpisodeRun:
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
 
+    def stop(self, cause: str) -> None:
+        """Make the robot passive and end the episode, or one that begins later; safe from another thread."""
+        self._stop_cause = cause
+        if self._supervisor is not None:
+            self._supervisor.stop(cause)
+
+    def _say_passive(self, passive: bool | None) -> None:
+        if self._note is not None:
+            self._note.say_passive(passive)
+
     def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""
         if self._plan.robot not in ODOMETRY:
@@ -161,9 +181,7 @@ class EpisodeRun:
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
         return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
 
-    def _make_passive(
-        self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]
-    ) -> bool:
+    def _make_passive(self, phase: str, in_vain: bool, on_beat: Callable[[Beat], None]) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""
         untouched = (
             STARTING,
@@ -180,4 +198,4 @@ class EpisodeRun:
             on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
 
         config = _IN_VAIN if in_vain else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
-        return make_passive(self._robot, clock, config, progress=tell, abandoned=lambda: supervisor.abandoned)
+        return make_passive(self._robot, clock, config, progress=tell)

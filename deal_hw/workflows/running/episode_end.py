@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Any
 
 from deal_hw.control.loop import Outcome
 from deal_hw.control.loop_timing import LoopTimingReport
-from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd
+from deal_hw.control.supervisor import ChildEnd
+from deal_hw.signals import OPERATOR, name
 from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.running.sleep_lock import ASLEEP
 
 _LINK_WARNING = 0.01
 """Share of corrupt and missing state frames above which the operator gets a warning."""
@@ -56,15 +57,17 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
 
 def _verdict(end: ChildEnd, result: dict[str, Any]) -> tuple[Outcome, str, str]:
     """Return the outcome, its reason as text, and the error's class."""
-    operator = end.stop_cause in (OPERATOR, SUSPENDED)
+    operator = bool(end.signal) or end.stop_cause in (OPERATOR, ASLEEP)
     if end.killed and not operator:
         return Outcome.FAILED, f"the control process was killed: {end.killed}", "SafetyError"
     if end.stop_cause and not operator:
         return Outcome.FAILED, end.stop_cause, "DatasetError"
     if result:
-        return Outcome(result["outcome"]), result["reason"], result["error"]
+        # The control process knows the signal that asked it to end, and not always why it was sent.
+        reason = end.stop_cause or OPERATOR if result["reason"] == OPERATOR else result["reason"]
+        return Outcome(result["outcome"]), reason, result["error"]
     if operator:
         return Outcome.STOPPED, end.stop_cause, ""
     code = end.exit_code
-    how = f"by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"with exit code {code}"
+    how = f"by signal {-code} ({name(-code)})" if code < 0 else f"with exit code {code}"
     return Outcome.FAILED, f"the control process died {how} without a report", "SafetyError"

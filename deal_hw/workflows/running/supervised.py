@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +18,12 @@ from deal_hw.control.process_channel import Beat
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
 from deal_hw.workflows.options import File
-from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
+from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun
 from deal_hw.workflows.running.keyboard import check_terminal
 from deal_hw.workflows.running.plan import RunPlan, check_plan
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.sleep_lock import ASLEEP, awake
 from deal_hw.workflows.running.view import OnBeat, RunView, ignore
 from deal_hw.workflows.say import Say
 
@@ -136,15 +138,26 @@ def run_episodes(
     ExcitationLevelSearch(plan.excitation_level, attempts)
     plan = check_plan(plan, robot.description, view)
     reports: list[EpisodeReport] = []
+    current: list[EpisodeRun] = []
+    sleeping = threading.Event()
+
+    def before_sleep() -> None:
+        sleeping.set()
+        for run in current[-1:]:
+            run.stop(ASLEEP)
+
+    holds_last_command = not robot.watchdog_s and not plan.dry_run
     if robot.notice:
         view.note(robot.notice)
-    elif not robot.watchdog_s and not plan.dry_run:
+    elif holds_last_command:
         view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot))
     # The supervisor connects to the robot itself, so that a wrong port is reported before a process starts.
     # Then it only keeps the port open, until the control process is dead.
     with (
         _suspended_last(view.warn),
         claimed(plan) as claim,
+        noted(plan) as note,
+        awake(before_sleep, view.note) if holds_last_command else contextlib.nullcontext(),
         connected(robot),
         _open_dataset(dataset, robot.description, view.warn) as store,
     ):
@@ -152,7 +165,10 @@ def run_episodes(
             store.keep_policy(Path(plan.policy), plan.policy_digest)
 
         def run_one(episode: RunPlan, number: int, attempt: int) -> EpisodeReport:
-            run = EpisodeRun(episode, robot, port, store, purpose, task, attempt, claim, view.warn)
+            run = EpisodeRun(episode, robot, port, store, purpose, task, attempt, claim, view.warn, note)
+            current.append(run)
+            if sleeping.is_set():
+                run.stop(ASLEEP)
             with view.progress(f"{purpose} {plan.robot} {number + 1}/{episodes}", plan.total_s) as show:
                 reports.append(run.run(_both(show, on_beat)))
             view.ended(reports[-1])

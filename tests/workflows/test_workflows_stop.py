@@ -1,0 +1,206 @@
+"""``deal-hw stop``: against real runs on emulated robots, hung ones too, and without a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from deal_hw.cli.main import main
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.run_note import RunNote, find_runs
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.workflows import stop as module
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.stop import StopSettings, stop
+
+PATIENCE_S = 60.0
+HOLDER = """
+import sys, time
+from deal_hw.control.run_note import RunNote
+
+with RunNote("go2", {"claim": "x"}) as note:
+    note.say_passive(None)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    note.say_passive(False)
+    print("said", flush=True)
+    sys.stdin.readline()
+"""
+
+
+def until(ready: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    clock = MonotonicClock()
+    end_ns = clock.now_ns() + round(PATIENCE_S * 1e9)
+    while not ready():
+        assert clock.now_ns() < end_ns
+        clock.sleep_until_ns(clock.now_ns() + 10_000_000)
+
+
+class Rig:
+    """An emulated robot, and runs on it as programs of their own."""
+
+    def __init__(self, folder: Path, robot: str, *options: str) -> None:
+        self.folder, self.robot = folder, robot
+        self._events = folder / "events"
+        self._events.touch()
+        own = ("--nominal", "--profile", "sensor", "--events-to", str(self._events))
+        self.emulator = EmulatorProcess(robot, *own, *options)
+        self.runs: list[subprocess.Popen[bytes]] = []
+
+    def run(self, *options: str) -> subprocess.Popen[bytes]:
+        """Start a run of a minute; return when the robot obeys it."""
+        before = len(self.told())
+        words = ["collect", self.robot, "--port", self.emulator.port, "--out", str(self.folder / "run")]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "deal_hw", *words, "--seconds", "60", *options],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            process_group=0,
+        )
+        self.runs.append(process)
+        until(lambda: bool({STIFF, "armed"} & {*self.told()[before:]}) or process.poll() is not None)
+        assert process.poll() is None
+        return process
+
+    def told(self) -> list[str]:
+        """Return the robot's log: kinds of command, or what happened to it."""
+        return [json.loads(line)[2] for line in self._events.read_text().splitlines()]
+
+    def processes(self) -> list[int]:
+        """Return the processes of the only run."""
+        (found,) = find_runs()
+        with found:
+            return [found.pid, *(pid for pid in found.holders() if pid != found.pid)]
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Callable[..., Rig]]:
+    """Make emulated robots; runs that are left end with the test."""
+    made: list[Rig] = []
+
+    def make(robot: str, *options: str) -> Rig:
+        made.append(Rig(tmp_path, robot, *options))
+        made[-1].emulator.start()
+        return made[-1]
+
+    yield make
+    for one in made:
+        for run in one.runs:
+            run.kill()
+            run.wait()
+        one.emulator.stop()
+
+
+def test_a_note_is_found_while_its_run_lives() -> None:
+    """By other programs; it follows what the run says, and goes with it."""
+    before = len(find_runs())
+    with RunNote("go2", {}):
+        assert len(find_runs()) == before, "one's own run is none to stop"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdin is not None and holder.stdout is not None
+        assert holder.stdout.readline() == "ready\n"
+        (found,) = [run for run in find_runs() if run.pid == holder.pid]
+        with found:
+            assert (found.facts["robot"], found.facts["claim"], found.passive) == ("go2", "x", None)
+            assert found.holders() == [holder.pid]
+            holder.stdin.write("\n")
+            holder.stdin.flush()
+            assert holder.stdout.readline() == "said\n"
+            assert found.passive is False
+            holder.communicate("\n")
+            assert found.holders() == []
+            assert found.passive is False, "what it said last is kept"
+
+
+@pytest.mark.parametrize("target", ["a note that is just being written", "[]", '{"pid": 1}'])
+def test_a_note_that_is_none_is_passed_over(target: str) -> None:
+    """Another program may give a file this name."""
+    program = (
+        "import os, sys; fd = os.memfd_create('deal-hw-run:go2'); os.write(fd, sys.argv[1].encode()); "
+        "print(flush=True); sys.stdin.readline()"
+    )
+    before = len(find_runs())
+    with subprocess.Popen(
+        [sys.executable, "-c", program, target], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        assert len(find_runs()) == before
+        holder.communicate("\n")
+
+
+def test_what_cannot_work_is_refused() -> None:
+    """A robot that is none, options without effect; without a run and a port it says what to do."""
+    with pytest.raises(UnknownNameError, match="go3"):
+        stop("go3")
+    with pytest.raises(ConfigurationError, match="--transport would have no effect: without --port"):
+        stop("go2", transport="zenoh")
+    with pytest.raises(ConfigurationError, match="--state-check"):
+        StopSettings("cartpole", port="x", state_check="length")
+
+
+def test_without_a_run_and_a_port_nothing_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+    """The exit code is 1, for nobody confirmed anything."""
+    assert main(["stop", "go2_on_stand"]) == 1
+    assert "no run of go2_on_stand of this user on this computer" in capsys.readouterr().err
+
+
+def test_a_cartpole_is_stopped_with_and_without_a_run(
+    rig: Callable[..., Rig], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run ends as for Ctrl-C; afterwards the port is free, and the motor is off already."""
+    robot = rig("cartpole")
+    run = robot.run("--motion", "chirp")
+    assert main(["stop", "cartpole"]) == 0
+    assert "the run of process" in capsys.readouterr().out
+    assert run.wait(PATIENCE_S) == 130
+    assert main(["stop", "cartpole", "--port", robot.emulator.port]) == 0
+    assert "no run commanded it" in capsys.readouterr().out
+    assert main(["stop", "cartpole", "--port", "/dev/ttyNOPE"]) == 1
+    assert "was NOT made passive" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_go2_is_damped_whoever_holds_it(
+    rig: Callable[..., Rig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its run; by this program after all of the run was killed; and after it hung, which kills it."""
+    wire = ("--transport", "zenoh")
+    robot = rig("go2", *wire, "--port", "tcp/127.0.0.1:0", "--sport", "off")
+    motion = ("--motion", "hold", *wire)
+    run = robot.run(*motion)
+    assert stop("go2").passive
+    assert run.wait(PATIENCE_S) == 130
+    assert robot.told()[-1] == DAMPING
+
+    run = robot.run(*motion)
+    for pid in robot.processes():
+        os.kill(pid, signal.SIGKILL)
+    run.wait()
+    assert robot.told()[-1] == STIFF
+    assert stop("go2").passive is False, "without a run and a port nobody is found"
+    assert robot.told()[-1] == STIFF
+    assert main(["stop", "go2", "--port", robot.emulator.port, *wire]) == 0
+    assert robot.told()[-1] == DAMPING
+
+    monkeypatch.setattr(module, "OBEY_S", 0.5)
+    monkeypatch.setattr(module, "TAKE_OVER_S", 0.5)
+    run = robot.run(*motion)
+    for pid in robot.processes():
+        os.kill(pid, signal.SIGSTOP)
+    assert main(["stop", "go2"]) == 0
+    assert "no run commanded it, and it has confirmed it" in capsys.readouterr().out
+    assert run.wait(PATIENCE_S) == -signal.SIGKILL
+    assert robot.told()[-1] == DAMPING
