@@ -239,7 +239,8 @@ def errors_page(table: str) -> str:
 
 
 def shortened(text: str) -> str:
-    """Return text with an ellipsis for each value that is known at run time only."""
+    """Return text with an ellipsis for each value that is known at run time only, and with pages by name."""
+    text = re.sub(r"\{page\('([^']+)'\)\}", r"docs/\1", text)
     out, depth = [], 0
     for sign in text:
         depth += sign == "{"

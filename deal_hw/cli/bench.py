@@ -75,9 +75,8 @@ class Bench:
     first fit to the fitted recordings."""
 
     real: Annotated[Path | None, Only(("first-answer",))] = None
-    """Folder with so101/ and go2/: the recordings and the columns.yaml of each. Pages 'SO-101 arm'
-    and 'Go2 on a stand, public recording' of the documentation make them. Without it these two are
-    skipped."""
+    """Folder with so101/ and go2/: the recordings and the columns.yaml of each. docs/results/example-so101.md
+    and docs/results/example-go2-suspended.md make them. Without it these two are skipped."""
 
     problems: Annotated[str, Only(("first-answer", "verdict"))] = ""
     """Robots, comma separated; by default all. first-answer: double-pendulum,

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TextIO, cast
 
+from deal_hw.documentation import page
 from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError, short
 from deal_hw.version import __version__
 
@@ -192,6 +193,7 @@ def help_text() -> str:
         f"with every verb: --help; --traceback (or {TRACEBACK_VARIABLE}=1) shows the code that raised an "
         "error",
         "without a verb: --help, --version",
+        f"documentation: {page('index.md')}; messages and help texts name its pages",
     ]
     return "\n".join(lines)
 

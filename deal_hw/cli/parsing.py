@@ -19,6 +19,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from deal_hw.documentation import with_places
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.options import OWN_ROBOT, Only
 
@@ -81,7 +82,9 @@ class Rules:
         text = field.helptext() if callable(field.helptext) else field.helptext
         annotated = (field.type, *marks)
         kind: Any = Annotated[annotated]
-        return dataclasses.replace(field, type=kind, helptext=" ".join(text.split()) if text else text)
+        return dataclasses.replace(
+            field, type=kind, helptext=with_places(" ".join(text.split())) if text else text
+        )
 
 
 def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:

@@ -33,7 +33,7 @@ DEFAULT = "default"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recordings(Checked):
-    """Any robot: its MuJoCo model and its recordings (page 'Your own robot' of the documentation)."""
+    """Any robot: its MuJoCo model and its recordings (docs/tutorials/your-robot.md)."""
 
     model: Path | None = None
     """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
@@ -42,7 +42,7 @@ class Recordings(Checked):
     """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
 
     columns: Path | None = None
-    """Column map (YAML; page 'Use your recordings' of the documentation). Without one, the meaning of the
+    """Column map (YAML; docs/how-to/import.md). Without one, the meaning of the
     channels is guessed from their names."""
 
     parameters: Path | None = None
@@ -119,8 +119,8 @@ class CalibrateSettings(Checked):
     simulator; by default the copy in the dataset."""
 
     space: str = ""
-    """Named parameter set of a robot with a driver, such as k9 or k11; by default the first. Page
-    'Parameters' of the documentation lists them."""
+    """Named parameter set of a robot with a driver, such as k9 or k11; by default the first.
+    docs/reference/parameters.md lists them."""
 
     free: tuple[str, ...] = ()
     """Search exactly these parameters; all others keep their nominal values."""
