@@ -110,9 +110,13 @@ class CalibrateSettings(Checked):
     """Held-out predictions restart from the measured state after this time [s]."""
 
     method: str = DEFAULT
-    """Search method: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
-    default is eki with refinement. For a walk it is gait. With --model, for servos on a fixed base, it is
-    output-error, unless --residual-std or --no-refine is given."""
+    """How to calibrate. default is eki with refinement; for a walk it is gait; with --model, for servos on a
+    fixed base, it is output-error, unless --residual-std or --no-refine is given. Fits without a search:
+    output-error, local, gait. Searches: eki, deal. The DEAL paper's Algorithm 1 and its variants: deal-paper,
+    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay. Baselines: easi,
+    easi-log, bo, bo-critic, cma, gauss-newton, least-squares, least-squares-random,
+    least-squares-multistart, ekf, ekf-one-pass, mujoco-sysid, random. Without data: midpoint,
+    midpoint-linear, nominal."""
 
     policy: File | None = None
     """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
