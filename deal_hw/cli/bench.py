@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from deal_hw.calibration import Budget
+from deal_hw.cli.json_output import only_document
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.ranges import Range, check_ranges
@@ -139,6 +141,10 @@ class Bench:
     threads: Annotated[Threads, ROWS] = None
     """Simulation threads; by default all CPUs."""
 
+    json: bool = False
+    """Print one JSON document: the contents of the file of rows. Everything else that is printed goes to the
+    error output."""
+
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -198,14 +204,22 @@ def parse_ratios(text: str) -> tuple[float, ...]:
 
 def bench(config: Bench) -> int:
     """Run the cells that are not done yet, writing the files after each; return 1 if any cell failed."""
+    out = config.out or Path(f"{config.bench}.json")
+    with only_document(config.json) as write:
+        code = _run(config, out)
+        if config.json:
+            write(json.loads(out.read_text(encoding="utf-8")))
+    return code
+
+
+def _run(config: Bench, out: Path) -> int:
     try:
         if config.bench == "go2-codec":
             from deal_hw.bench.go2_codec import bench_codec
 
-            return bench_codec(config.out, quiet=config.quiet)
+            return bench_codec(out if config.json else config.out, quiet=config.quiet)
         from deal_hw.bench.rows import run_cells
 
-        out = config.out or Path(f"{config.bench}.json")
         table = _TABLES.get(config.bench, _calibration)(config, out)
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "bench") from err
