@@ -104,8 +104,8 @@ class Bench:
     """Seeds, comma separated; ranges as 1000-1009. 0-99 are for tuning, 1000 and up for reporting."""
 
     methods: Annotated[str, METHODS] = ""
-    """Methods, comma separated (`deal-hw calibrate --help` lists them); by default the default with training,
-    and each search without refinement."""
+    """Methods, comma separated, as for `deal-hw calibrate --method`; by default the default with training, and
+    each search without refinement."""
 
     range_ratio: Annotated[str, METHODS] = "5"
     """Ratios of the search range, comma separated; for loop, speed and real one."""

@@ -10,6 +10,7 @@ import check_site
 import docs_pages
 import pytest
 
+import deal_hw
 from deal_hw import documentation
 from deal_hw.cli.main import VERBS
 
@@ -168,10 +169,24 @@ def test_no_site_is_a_complaint(tmp_path: Path) -> None:
 
 def test_the_reference_has_the_arguments_of_each_function() -> None:
     """A function of settings shows in a signature that it takes settings; its arguments are the class's."""
-    page = docs_pages.api_page()
+    text = "\n".join(docs_pages.api_pages().values())
     for name in ("collect", "deploy", "train", "emulate", "inspect", "replay", "design_excitation"):
-        assert f"heading: Arguments of deal_hw.{name}\n" in page
-    assert "::: deal_hw.workflows.collect.CollectSettings\n" in page
+        assert f"heading: Arguments of deal_hw.{name}\n" in text
+    assert "::: deal_hw.workflows.collect.CollectSettings\n" in text
+
+
+def test_each_public_name_is_on_one_page_of_the_api() -> None:
+    """The start page lists all of them; no page has everything."""
+    pages = docs_pages.api_pages()
+    start = pages.pop("reference/api.md")
+    assert "::: " not in start and len(pages) >= 8
+    described = [line for text in pages.values() for line in text.splitlines() if line.startswith("::: ")]
+    assert len(described) == len(set(described))
+    names = docs_pages.public_names(deal_hw)
+    assert {f"::: {name}" for name in names} <= set(described)
+    for name in names:
+        assert f"#{name})" in start
+    assert max(text.count("::: ") for text in pages.values()) <= 12
 
 
 def test_names_in_docstrings_are_names() -> None:
