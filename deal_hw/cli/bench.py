@@ -104,7 +104,7 @@ class Bench:
     """Seeds, comma separated; ranges as 1000-1009. 0-99 are for tuning, 1000 and up for reporting."""
 
     methods: Annotated[str, METHODS] = ""
-    """Methods, comma separated, as for `deal-hw calibrate --method`; by default the default with training, and
+    """Methods, comma separated, as for `deal-hw calibrate`; by default the default with training, and
     each search without refinement."""
 
     range_ratio: Annotated[str, METHODS] = "5"
