@@ -208,7 +208,7 @@ def help_text() -> str:
         "No robot at hand? `deal-hw demo` needs none; `deal-hw emulate cartpole` prints a port to use.",
         "with every verb: --help explains its options; --help-all rare ones, too",
         f"with every verb: --traceback (or {TRACEBACK_VARIABLE}=1) shows the code that raised an error",
-        "without a verb: --help, --version",
+        "without a verb: --help, --version; --completion bash (or zsh) prints a script for the Tab key",
         f"documentation: {page('index.md')}; messages and help texts name its pages",
     ]
     return "\n".join(lines)
@@ -407,6 +407,11 @@ def _answer(given: list[str]) -> int:
             return EXIT_OK
         if given[0] == "--version":
             print(f"deal-hw {__version__}")
+            return EXIT_OK
+        if given[0] == "--completion":
+            from deal_hw.cli.completion import completion
+
+            print(completion(given[1] if len(given) > 1 else "", VERBS), end="")
             return EXIT_OK
         return run(given[0], given[1:])
     except KeyboardInterrupt:

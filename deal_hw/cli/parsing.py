@@ -41,9 +41,12 @@ class Rules:
     Args:
         words: The arguments, which may contain --help, and name a robot or a bench.
         common: Fields that --help explains; all where empty.
+        choices: Whether the parser knows the choices, to complete them; it then refuses others by itself.
     """
 
-    def __init__(self, words: Sequence[str] = (), common: Collection[str] = ()) -> None:
+    def __init__(
+        self, words: Sequence[str] = (), common: Collection[str] = (), *, choices: bool = False
+    ) -> None:
         self._named = set(words)
         self._common = common
         self._helps = bool({"-h", "--help"} & self._named)
@@ -56,7 +59,8 @@ class Rules:
         self.rare: list[str] = []
         """Options that the help page only names."""
         self.registry = ConstructorRegistry()
-        self.registry.primitive_rule(_choice)
+        if not choices:
+            self.registry.primitive_rule(_choice)
         self.registry.primitive_rule(_path)
         self.registry.primitive_rule(_number)
         self.registry.struct_rule(self._struct)
