@@ -245,11 +245,13 @@ def api_start(full: Mapping[str, str]) -> str:
         lines.append(f"| [{title}]({place}) | {links} |")
     for title, modules in API_MODULES.items():
         place = Path(api_place(title)).name
-        links = []
+        summaries = []
         for module in modules:
             source = importlib.import_module(f"deal_hw.{module}").__doc__ or ""
-            links.append(f"[`deal_hw.{module}`]({place}#deal_hw.{module}): {cell(source.splitlines()[0])}")
-        lines.append(f"| [{title}]({place}) | {'<br>'.join(links)} |")
+            summaries.append(
+                f"[`deal_hw.{module}`]({place}#deal_hw.{module}): {cell(source.splitlines()[0])}"
+            )
+        lines.append(f"| [{title}]({place}) | {'<br>'.join(summaries)} |")
     return "\n".join(lines)
 
 
