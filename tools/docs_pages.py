@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
-import json
 import re
 import sys
 import warnings
@@ -363,18 +362,13 @@ def moved(name: str) -> str:
 
 
 def examples_page() -> str:
-    """Return the page of examples: each script and the notebook's cells, as they are run by the tests."""
+    """Return the page of examples: each script, and a link to each notebook's page."""
     lines = ["# Examples", "", "The files of `examples/`. The tests run all of them.", ""]
     for path in sorted((ROOT / "examples").glob("*.py")):
         lines += [f"## {path.name}", "", "```python", path.read_text(encoding="utf-8").rstrip(), "```", ""]
     for path in sorted((ROOT / "examples").glob("*.ipynb")):
-        lines += [f"## {path.name}", ""]
-        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-            text = "".join(cell["source"]).rstrip()
-            if cell["cell_type"] == "code":
-                text = f"```python\n{text}\n```"
-            # Headings of the notebook are one level below the file's own.
-            lines += [re.sub(r"^(#+) ", r"##\1 ", text) if text.startswith("#") else text, ""]
+        name = path.stem.replace("_", "-")
+        lines += [f"## {path.name}", "", f"[The notebook with its output](../tutorials/{name}.md).", ""]
     return "\n".join(lines)
 
 
