@@ -22,9 +22,9 @@ from deal_hw.viz.body_log import LEG_COLORS, SUPPLY, supply, tilt
 from deal_hw.viz.columns import DEVICE_TIMELINE, command_device_times
 from deal_hw.viz.scales import Curve, clear_corner, time_columns, visible_range
 
-FROM_CAMERA = np.array([0.08, -1.45, 0.32])
+FROM_CAMERA = np.array([0.1, -1.7, 0.37])
 """From the robot's middle to the camera, in multiples of its reach. Rerun shows 0.6 of the distance up and
-down, so 0.9 of the reach, and more to the sides."""
+down, so the whole reach, and more to the sides."""
 BESIDE = 0.25
 """Part of the measured range that predictions may take to either side of it."""
 SMALLEST_M = 0.1
