@@ -154,7 +154,7 @@ class InterruptedTrainingError(KeyboardInterrupt):
 def train(settings: TrainSettings) -> Training:
     """Train a policy under a calibrated distribution, as ``deal-hw train``.
 
-    :class:`TrainSettings` and ``deal-hw train --help`` describe the arguments: ``train("cartpole",
+    :class:`TrainSettings` and ``deal-hw train --help-all`` describe the arguments: ``train("cartpole",
     distribution=deal_hw.calibrate(...), out="runs/first")``.
 
     Returns:
