@@ -1,8 +1,9 @@
 # One command for people and for CI. `make` alone lists the targets.
 #
-# PIP_ARGS goes to every `pip install`: it chooses the source of wheels. Without an NVIDIA GPU, name PyTorch's CPU
-# index (its install page shows the address) to avoid 2 GB of CUDA libraries:
-#     make demo PIP_ARGS="--extra-index-url <PyTorch's CPU index>"
+# PIP_ARGS goes to every `pip install`: it chooses the source of wheels. Without an NVIDIA GPU, name the place of
+# PyTorch's CPU build, to avoid 2 GB of CUDA libraries. PyTorch's page "Start locally" shows the ADDRESS, at the end of
+# its command for Linux, Pip, CPU:
+#     make demo PIP_ARGS="--extra-index-url ADDRESS"
 
 PYTHON ?= python3
 PIP_ARGS ?=

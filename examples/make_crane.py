@@ -1,6 +1,6 @@
 """Make an example of your own robot: an MJCF and three CSV recordings, from plain MuJoCo.
 
-python examples/make_crane.py crane     (then: page 'Your own robot' of the documentation)
+python examples/make_crane.py crane     (then: docs/tutorials/your-robot.md)
 """
 
 import sys

@@ -1,7 +1,8 @@
 """Pages of the site that are made from the sources while `mkdocs build` runs (a hook of mkdocs.yml).
 
 - ``reference/cli.md``: every verb and option, from the parser of the command line;
-- ``reference/api.md``: every public name of ``deal_hw``, then the contracts, for mkdocstrings;
+- ``reference/api.md`` and ``reference/api-*.md``: every public name of ``deal_hw``, then the contracts, for
+  mkdocstrings;
 - ``reference/alarms.md``: every alarm of a calibration, from the calls that make one;
 - ``reference/errors.md``: every refusal, from tests/house/refusals.txt;
 - ``how-to/examples.md``: the files of examples/;
@@ -13,11 +14,10 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
-import json
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -31,17 +31,43 @@ ROOT = Path(__file__).resolve().parents[1]
 ALARM_FOLDERS = ("calib", "deal_hw")
 REFUSALS = ROOT / "tests" / "house" / "refusals.txt"
 
-CONTRACTS = {
-    "Vocabulary": ("types", "errors", "clock"),
-    "Contracts": ("robot", "transport", "description", "policy", "parameters", "calibration", "training"),
-    "Suites that a new robot, transport, method or trainer inherits": (
+API_NAMES = {
+    "Calibrate": ("calibrate", "Calibration", "design_excitation"),
+    "Run a robot": (
+        "collect",
+        "deploy",
+        "replay",
+        "RunReport",
+        "LinkOptions",
+        "LegOptions",
+        "SimulationOptions",
+        "WireOptions",
+    ),
+    "Emulate and check a robot": (
+        "emulate",
+        "EmulatedRobot",
+        "doctor",
+        "new_robot",
+        "check_robot",
+        "RobotCheck",
+    ),
+    "Train and inspect": ("train", "Training", "inspect", "Inspection"),
+}
+"""Pages of the API with names of ``deal_hw`` itself."""
+
+API_MODULES = {
+    "Types, errors, clock": ("types", "errors", "clock"),
+    "Robot contracts": ("robot", "transport", "description"),
+    "Policy contracts": ("policy", "training"),
+    "Calibration contracts": ("parameters", "calibration"),
+    "Test suites": (
         "testing.robot_suite",
         "testing.transport_suite",
         "testing.method_suite",
         "testing.trainer_suite",
     ),
 }
-"""Modules of the API page, below the functions of ``deal_hw`` itself."""
+"""Pages of the API with modules: what a new robot, transport, method or trainer uses and inherits."""
 
 PLAIN = {"", "required"}
 """Defaults that are no values."""
@@ -134,7 +160,8 @@ def cli_page() -> str:
     lines = [
         "# Command line",
         "",
-        "This page is made from the command line's own parser. `deal-hw VERB --help` prints the same.",
+        "This page is made from the command line's own parser. `deal-hw VERB --help-all` prints "
+        "the same; `--help` explains the common options and names the others.",
         "",
         "| verb | what it does | extra |",
         "|---|---|---|",
@@ -169,44 +196,75 @@ def public_names(package: ModuleType) -> list[str]:
     return [f"{value.__module__}.{value.__qualname__}" for value in (*functions, *classes)]
 
 
-def api_page() -> str:
-    """Return the reference of the Python API, for mkdocstrings."""
+def api_place(title: str) -> str:
+    """Return the place of a page of the API in the site."""
+    return f"reference/api-{re.sub('[^a-z]+', '-', title.lower())}.md"
+
+
+def api_pages() -> dict[str, str]:
+    """Return the reference of the Python API, for mkdocstrings: a start page, and a page a subject."""
     import deal_hw
 
+    full = {name.rpartition(".")[2]: name for name in public_names(deal_hw)}
+    found = {"reference/api.md": api_start(full)}
+    for title, names in API_NAMES.items():
+        lines = [f"# {title}", "", "[All pages of the API](api.md)", ""]
+        for name in names:
+            lines += reference(full[name], f"deal_hw.{name}")
+            settings = getattr(getattr(deal_hw, name), "settings", None)
+            if isinstance(settings, type):
+                heading = f"Arguments of deal_hw.{name}"
+                lines += reference(f"{settings.__module__}.{settings.__qualname__}", heading, inherited=True)
+        found[api_place(title)] = "\n".join(lines)
+    for title, modules in API_MODULES.items():
+        lines = [f"# {title}", "", "[All pages of the API](api.md)", ""]
+        for module in modules:
+            lines += [f"::: deal_hw.{module}", "    options:", "      heading_level: 2", ""]
+        found[api_place(title)] = "\n".join(lines)
+    return found
+
+
+def api_start(full: Mapping[str, str]) -> str:
+    """Return the start page of the API: what is on which page.
+
+    Args:
+        full: The full name of each public name of ``deal_hw``.
+    """
     lines = [
         "# Python API",
         "",
-        "[From Python](../how-to/python.md) shows how to use it. This page is made from the docstrings.",
+        "[From Python](../how-to/python.md) shows how to use it. These pages are made from the docstrings.",
         "",
-        "## deal_hw",
+        "| page | has |",
+        "|---|---|",
+    ]
+    for title, names in API_NAMES.items():
+        place = Path(api_place(title)).name
+        links = ", ".join(f"[`deal_hw.{name}`]({place}#{full[name]})" for name in names)
+        lines.append(f"| [{title}]({place}) | {links} |")
+    for title, modules in API_MODULES.items():
+        place = Path(api_place(title)).name
+        summaries = []
+        for module in modules:
+            source = importlib.import_module(f"deal_hw.{module}").__doc__ or ""
+            summaries.append(
+                f"[`deal_hw.{module}`]({place}#deal_hw.{module}): {cell(source.splitlines()[0])}"
+            )
+        lines.append(f"| [{title}]({place}) | {'<br>'.join(summaries)} |")
+    return "\n".join(lines)
+
+
+def reference(name: str, heading: str, *, inherited: bool = False) -> list[str]:
+    """Return the lines by which mkdocstrings describes a function or class."""
+    return [
+        f"::: {name}",
+        "    options:",
+        f"      heading: {heading}",
+        f"      toc_label: {heading}",
+        "      heading_level: 2",
+        *(["      members_order: source", "      inherited_members: true"] if inherited else []),
         "",
     ]
-    for name in public_names(deal_hw):
-        heading = f"deal_hw.{name.rpartition('.')[2]}"
-        lines += [
-            f"::: {name}",
-            "    options:",
-            f"      heading: {heading}",
-            f"      toc_label: {heading}",
-            "",
-        ]
-        settings = getattr(getattr(deal_hw, heading.rpartition(".")[2]), "settings", None)
-        if isinstance(settings, type):
-            title = f"Arguments of {heading}"
-            lines += [
-                f"::: {settings.__module__}.{settings.__qualname__}",
-                "    options:",
-                f"      heading: {title}",
-                f"      toc_label: {title}",
-                "      members_order: source",
-                "      inherited_members: true",
-                "",
-            ]
-    for title, modules in CONTRACTS.items():
-        lines += [f"## {title}", ""]
-        for module in modules:
-            lines += [f"::: deal_hw.{module}", ""]
-    return "\n".join(lines)
 
 
 def errors_page(table: str) -> str:
@@ -239,7 +297,8 @@ def errors_page(table: str) -> str:
 
 
 def shortened(text: str) -> str:
-    """Return text with an ellipsis for each value that is known at run time only."""
+    """Return text with an ellipsis for each value that is known at run time only, and with pages by name."""
+    text = re.sub(r"\{page\('([^']+)'\)\}", r"docs/\1", text)
     out, depth = [], 0
     for sign in text:
         depth += sign == "{"
@@ -303,18 +362,13 @@ def moved(name: str) -> str:
 
 
 def examples_page() -> str:
-    """Return the page of examples: each script and the notebook's cells, as they are run by the tests."""
+    """Return the page of examples: each script, and a link to each notebook's page."""
     lines = ["# Examples", "", "The files of `examples/`. The tests run all of them.", ""]
     for path in sorted((ROOT / "examples").glob("*.py")):
         lines += [f"## {path.name}", "", "```python", path.read_text(encoding="utf-8").rstrip(), "```", ""]
     for path in sorted((ROOT / "examples").glob("*.ipynb")):
-        lines += [f"## {path.name}", ""]
-        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-            text = "".join(cell["source"]).rstrip()
-            if cell["cell_type"] == "code":
-                text = f"```python\n{text}\n```"
-            # Headings of the notebook are one level below the file's own.
-            lines += [re.sub(r"^(#+) ", r"##\1 ", text) if text.startswith("#") else text, ""]
+        name = path.stem.replace("_", "-")
+        lines += [f"## {path.name}", "", f"[The notebook with its output](../tutorials/{name}.md).", ""]
     return "\n".join(lines)
 
 
@@ -322,7 +376,7 @@ def pages() -> dict[str, str]:
     """Return every page that is made: its place in the site and its Markdown."""
     return {
         "reference/cli.md": cli_page(),
-        "reference/api.md": api_page(),
+        **api_pages(),
         "reference/alarms.md": alarms_page(),
         "reference/errors.md": errors_page(REFUSALS.read_text(encoding="utf-8")),
         "how-to/examples.md": examples_page(),

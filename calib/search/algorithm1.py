@@ -2,8 +2,8 @@
 
 Generation t: roll pi_0 out in every simulator (line 3), train the critic (eq. 5), score each member's own
 rollout, turn scores into probabilities and take one denoising step (eqs. 1, 2, 9, 10:
-:mod:`deal_hw.calib.search.diffusion_evolution`). The range is linear and no latency is searched. Page
-'The paper, line by line' of the documentation lists our choices.
+:mod:`deal_hw.calib.search.diffusion_evolution`). The range is linear and no latency is searched.
+docs/explanation/deal-paper.md lists our choices.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Comparing the two channels does not show them. The model can: by gravity, coupling between joints, and how
 fast masses move. So each error is undone in turn, and the model is fitted to the corrected recordings. An
 error is named if the corrected recordings are predicted well on unseen motion and the original ones are not.
-Many errors cannot be found: parameters or a symmetry compensate for them. Page 'Calibration' of the
-documentation lists them.
+Many errors cannot be found: parameters or a symmetry compensate for them.
+docs/explanation/calibration.md lists them.
 """
 
 from __future__ import annotations

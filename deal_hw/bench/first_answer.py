@@ -22,6 +22,7 @@ import numpy as np
 
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.calibration import Budget, Progress
+from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
@@ -61,7 +62,7 @@ parameters:
   - {kind: dof_armature, elements: "*"}
   - {kind: servo_effort_limit, elements: gripper}
 """
-"""As on page 'SO-101 arm' of the documentation."""
+"""As in docs/results/example-so101.md."""
 
 GO2_PARAMETERS = """\
 parameters:
@@ -73,7 +74,7 @@ parameters:
   - {kind: tendon_frictionloss, elements: ["*_rod", "*_strap"], nominal: 5, ratio: 10}
   - {kind: dof_armature, elements: "*_joint"}
 """
-"""As on page 'Go2 on a stand, public recording' of the documentation."""
+"""As in docs/results/example-go2-suspended.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +146,7 @@ def _so101(ask: _Ask) -> CalibrateSettings:
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
     held_out = ("step_response", "slow_precision")
-    files = ask.recorded("so101", (*fitted, *held_out), "page 'SO-101 arm' of the documentation")
+    files = ask.recorded("so101", (*fitted, *held_out), page("results/example-so101.md"))
     parameters = ask.folder / "so101.yaml"
     parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
     recordings = Recordings(
@@ -164,7 +165,7 @@ def _go2(ask: _Ask) -> CalibrateSettings:
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
     parts = [f"traj_0_part{number}" for number in range(1, 5)]
-    files = ask.recorded("go2", parts, "page 'Go2 on a stand, public recording' of the documentation")
+    files = ask.recorded("go2", parts, page("results/example-go2-suspended.md"))
     parameters = ask.folder / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
     recordings = Recordings(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from deal_hw.calibration import Budget
+from deal_hw.cli.json_output import only_document
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.ranges import Range, check_ranges
@@ -75,9 +77,8 @@ class Bench:
     first fit to the fitted recordings."""
 
     real: Annotated[Path | None, Only(("first-answer",))] = None
-    """Folder with so101/ and go2/: the recordings and the columns.yaml of each. Pages 'SO-101 arm'
-    and 'Go2 on a stand, public recording' of the documentation make them. Without it these two are
-    skipped."""
+    """Folder with so101/ and go2/: the recordings and the columns.yaml of each. docs/results/example-so101.md
+    and docs/results/example-go2-suspended.md make them. Without it these two are skipped."""
 
     problems: Annotated[str, Only(("first-answer", "verdict"))] = ""
     """Robots, comma separated; by default all. first-answer: double-pendulum,
@@ -103,7 +104,8 @@ class Bench:
     """Seeds, comma separated; ranges as 1000-1009. 0-99 are for tuning, 1000 and up for reporting."""
 
     methods: Annotated[str, METHODS] = ""
-    """Methods, comma separated; by default the default with training, and each search without refinement."""
+    """Methods, comma separated, as for `deal-hw calibrate`; by default the default with training, and
+    each search without refinement."""
 
     range_ratio: Annotated[str, METHODS] = "5"
     """Ratios of the search range, comma separated; for loop, speed and real one."""
@@ -138,6 +140,10 @@ class Bench:
 
     threads: Annotated[Threads, ROWS] = None
     """Simulation threads; by default all CPUs."""
+
+    json: bool = False
+    """Print one JSON document: the contents of the file of rows. Everything else that is printed goes to the
+    error output."""
 
     quiet: bool = False
     """Print nothing but errors."""
@@ -198,14 +204,22 @@ def parse_ratios(text: str) -> tuple[float, ...]:
 
 def bench(config: Bench) -> int:
     """Run the cells that are not done yet, writing the files after each; return 1 if any cell failed."""
+    out = config.out or Path(f"{config.bench}.json")
+    with only_document(config.json) as write:
+        code = _run(config, out)
+        if config.json:
+            write(json.loads(out.read_text(encoding="utf-8")))
+    return code
+
+
+def _run(config: Bench, out: Path) -> int:
     try:
         if config.bench == "go2-codec":
             from deal_hw.bench.go2_codec import bench_codec
 
-            return bench_codec(config.out, quiet=config.quiet)
+            return bench_codec(out if config.json else config.out, quiet=config.quiet)
         from deal_hw.bench.rows import run_cells
 
-        out = config.out or Path(f"{config.bench}.json")
         table = _TABLES.get(config.bench, _calibration)(config, out)
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "bench") from err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ import tyro
 
 from deal_hw.calibration import Progress
 from deal_hw.cli.calibrate_output import print_files, print_result, show_progress
+from deal_hw.cli.json_output import only_document
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.best_so_far import (
     CHECKPOINT,
@@ -23,6 +25,7 @@ from deal_hw.workflows.calibration.model import write_parameters
 from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
 from deal_hw.workflows.calibration.run import CalibrateReport, finish
 from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.options import refuse
 from deal_hw.workflows.say import aloud, silent
 
 __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_parameters"]
@@ -61,6 +64,10 @@ class Calibrate(CalibrateSettings):
     advise: bool = True
     """Compute which motion to record next if the data say little of a parameter; takes some seconds."""
 
+    json: bool = False
+    """Print one JSON document: the contents of result.json and the written files. Everything else that is
+    printed goes to the error output."""
+
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -92,13 +99,18 @@ def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:
         DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     if config.recordings.write_parameters is not None:
+        refuse(["--json"] if config.json else [], "--write-parameters calibrates nothing")
         path = write_parameters(config.recordings, config.dataset)
         model = config.recordings.model
         source = str(config.dataset) if model is None else f"--model {model} --data ..."
         again = f"deal-hw calibrate {source} --parameters {path}"
         print(f"written: {path}; edit it, then: {again}")
         return 0
-    return calibrate(config)
+    with only_document(config.json) as write:
+        report = calibrate(config)
+        files = {name: str(path) for name, path in report.files.items()}
+        write({**json.loads(report.files["result.json"].read_text(encoding="utf-8")), "files": files})
+    return report
 
 
 def calibrate(config: Calibrate) -> CalibrateReport:

@@ -24,6 +24,7 @@ from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.data.run_folder import RunFolder
+from deal_hw.documentation import page
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
@@ -305,6 +306,6 @@ def _sentence(measures: Sequence[Measure]) -> str:
     return (
         f"The policy fine-tuned under the calibration {walked('calibrated')}; the policy fine-tuned as "
         f"long without it {walked('udr more')}; the shipped policy {walked('udr')}. Differences below "
-        "0.02 m/s are chance: two trainings with one setting differ as much (five robots: page 'Benches' of "
-        "the documentation)."
+        f"0.02 m/s are chance: two trainings with one setting differ as much (five robots: "
+        f"{page('results/bench.md')})."
     )

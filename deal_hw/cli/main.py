@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TextIO, cast
 
+from deal_hw.documentation import page
 from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError, short
 from deal_hw.version import __version__
 
@@ -32,6 +33,7 @@ EXIT_PIPE = 141
 LONGEST_MESSAGE = 2000
 """Longest error in one line [characters]: part of it may come from a file of unknown origin."""
 TRACEBACK_VARIABLE = "DEAL_HW_TRACEBACK"
+HELP_ALL = "--help-all"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +47,7 @@ class Verb:
         help: One line.
         example: Working arguments, as `deal-hw --help` shows them.
         extra: The extra that installs the verb's packages; "" for the base install.
+        common: Settings that --help explains; all where empty. --help-all explains all.
     """
 
     module: str
@@ -53,6 +56,7 @@ class Verb:
     help: str
     example: str
     extra: str = ""
+    common: tuple[str, ...] = ()
 
 
 def _verb(
@@ -64,6 +68,7 @@ def _verb(
     module: str = "",
     function: str = "",
     config: str = "",
+    common: str = "",
 ) -> Verb:
     plain = name.replace("-", "_")
     return Verb(
@@ -73,6 +78,7 @@ def _verb(
         help=help,
         example=example,
         extra=extra,
+        common=tuple(common.split()),
     )
 
 
@@ -83,6 +89,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             help="record the robot during an informative motion",
             example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
             function="collect_and_say_next",
+            common="port out motion policy seconds transport velocity stand quiet",
         ),
         "calibrate": _verb(
             "calibrate",
@@ -90,6 +97,8 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             example="calibrate runs/first/dataset",
             extra="calib",
             function="calibrate_or_write_parameters",
+            common="model data columns parameters write_parameters holdout holdout_part leave_out method "
+            "known space out resume json quiet",
         ),
         "train": _verb(
             "train",
@@ -97,11 +106,13 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             example="train cartpole --distribution runs/first/calibration/distribution.json --out runs/first",
             extra="train",
             function="train_and_say_next",
+            common="distribution udr nominal env out start resume steps quiet",
         ),
         "deploy": _verb(
             "deploy",
             help="run a policy on the robot behind the safety filter",
             example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/policy.onnx",
+            common="port out policy seconds task transport velocity stand trust_calibration dry_run quiet",
         ),
         "inspect": _verb(
             "inspect",
@@ -202,9 +213,10 @@ def help_text() -> str:
     lines += [
         "",
         "No robot at hand? `deal-hw demo` needs none; `deal-hw emulate cartpole` prints a port to use.",
-        f"with every verb: --help; --traceback (or {TRACEBACK_VARIABLE}=1) shows the code that raised an "
-        "error",
-        "without a verb: --help, --version",
+        "with every verb: --help explains its options; --help-all rare ones, too",
+        f"with every verb: --traceback (or {TRACEBACK_VARIABLE}=1) shows the code that raised an error",
+        "without a verb: --help, --version; --completion bash (or zsh) prints a script for the Tab key",
+        f"documentation: {page('index.md')}; messages and help texts name its pages",
     ]
     return "\n".join(lines)
 
@@ -239,17 +251,19 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
     import tyro
 
-    from deal_hw.cli.parsing import CONFIG, Rules, unparsed
+    from deal_hw.cli.parsing import CONFIG, Rules, rarely_needed, unparsed
 
     module = importlib.import_module(verb.module)
-    rules = Rules(arguments)
+    explains_all = HELP_ALL in arguments
+    arguments = ["--help" if word == HELP_ALL else word for word in arguments]
+    rules = Rules(arguments, () if explains_all else verb.common)
 
     def read() -> Any:
         return tyro.cli(
             getattr(module, verb.config),
             prog=f"deal-hw {name}",
             description=_description(verb, getattr(module, verb.config), rules.hidden),
-            args=list(arguments),
+            args=arguments,
             config=CONFIG,
             registry=rules.registry,
         )
@@ -261,7 +275,12 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     except SystemExit as stop:
         if not stop.code:
             # Help. Only now is it known which options are hidden.
-            settings = read()
+            with contextlib.suppress(SystemExit):
+                read()
+            if rules.rare:
+                given = [word for word in arguments if word not in ("-h", "--help")]
+                print(rarely_needed(rules.rare, " ".join(["deal-hw", name, *given])))
+            raise
         # tyro draws a box around an error; here it becomes one line, like other errors.
         cause: BaseException | None = stop
         while cause is not None and not isinstance(cause, DealHwError):
@@ -271,7 +290,9 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
         if hasattr(module, "check_words"):
             # A verb may know a better answer than that an option is unknown.
             module.check_words(arguments)
-        raise unparsed(said.getvalue(), f"deal-hw {name}", verb.example) from None
+        raise unparsed(
+            said.getvalue(), f"deal-hw {name}", verb.example, shortened=bool(verb.common)
+        ) from None
     return settings, getattr(module, verb.function)
 
 
@@ -393,6 +414,11 @@ def _answer(given: list[str]) -> int:
             return EXIT_OK
         if given[0] == "--version":
             print(f"deal-hw {__version__}")
+            return EXIT_OK
+        if given[0] == "--completion":
+            from deal_hw.cli.completion import completion
+
+            print(completion(given[1] if len(given) > 1 else "", VERBS), end="")
             return EXIT_OK
         return run(given[0], given[1:])
     except KeyboardInterrupt:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+import shutil
+import textwrap
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -19,7 +21,9 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from deal_hw.documentation import with_places
 from deal_hw.errors import ConfigurationError
+from deal_hw.ranges import option
 from deal_hw.workflows.options import OWN_ROBOT, Only
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
@@ -32,22 +36,31 @@ class Rules:
     Files and folders, which Python may also name by a string, are paths. The settings themselves refuse wrong
     choices, with the same words as from Python. An option that is off by default has one flag, one that is on
     has two. A help page hides options of other robots or benches; they are still parsed, so that the settings
-    can refuse them.
+    can refuse them. It names rare options without explaining them.
 
     Args:
         words: The arguments, which may contain --help, and name a robot or a bench.
+        common: Fields that --help explains; all where empty.
+        choices: Whether the parser knows the choices, to complete them; it then refuses others by itself.
     """
 
-    def __init__(self, words: Sequence[str] = ()) -> None:
+    def __init__(
+        self, words: Sequence[str] = (), common: Collection[str] = (), *, choices: bool = False
+    ) -> None:
         self._named = set(words)
+        self._common = common
         self._helps = bool({"-h", "--help"} & self._named)
         if any(word.endswith((".yaml", ".yml")) for word in words):
             self._named |= set(OWN_ROBOT.names)
+        self._no_options: list[Any] = []
         self._asks_others = False
         self.hidden: set[str] = set()
         """Names whose own options were not shown."""
+        self.rare: list[str] = []
+        """Options that the help page only names."""
         self.registry = ConstructorRegistry()
-        self.registry.primitive_rule(_choice)
+        if not choices:
+            self.registry.primitive_rule(_choice)
         self.registry.primitive_rule(_path)
         self.registry.primitive_rule(_number)
         self.registry.struct_rule(self._struct)
@@ -68,20 +81,50 @@ class Rules:
         if not isinstance(found, StructConstructorSpec):
             # A default of another type, which the parser's own rule handles.
             return None
-        return dataclasses.replace(found, fields=tuple(map(self._field, found.fields)))
+        return dataclasses.replace(
+            found, fields=tuple(self._field(field, info.type) for field in found.fields)
+        )
 
-    def _field(self, field: StructFieldSpec) -> StructFieldSpec:
+    def _field(self, field: StructFieldSpec, owner: Any) -> StructFieldSpec:
         parts = get_args(field.type) if get_origin(field.type) is Annotated else (field.type,)
         marks: list[Any] = [tyro.conf.arg(metavar=_metavar(field.name, parts), help_behavior_hint=_default)]
         if others := self.hides(field.type):
             marks.append(tyro.conf.Suppress)
             self.hidden |= others
+            self._no_options += [kind for kind in parts if dataclasses.is_dataclass(kind)]
+        elif self._helps and self._is_rare(field.name, parts, owner):
+            marks.append(tyro.conf.Suppress)
+            self.rare += [flag] if (flag := option(field.name)) not in self.rare else []
         if field.default is False:
             marks.append(tyro.conf.FlagCreatePairsOff)
         text = field.helptext() if callable(field.helptext) else field.helptext
         annotated = (field.type, *marks)
         kind: Any = Annotated[annotated]
-        return dataclasses.replace(field, type=kind, helptext=" ".join(text.split()) if text else text)
+        return dataclasses.replace(
+            field, type=kind, helptext=with_places(" ".join(text.split())) if text else text
+        )
+
+    def _is_rare(self, name: str, parts: tuple[Any, ...], owner: Any) -> bool:
+        groups = [kind for kind in (parts[0], *get_args(parts[0])) if dataclasses.is_dataclass(kind)]
+        if owner in self._no_options or tyro.conf.Suppress in parts[1:]:
+            # What is inside a group without options is none, either.
+            self._no_options += groups
+            return False
+        if tyro.conf.Positional in parts[1:] or groups or get_origin(parts[0]) is Callable:
+            return False
+        return bool(self._common) and name not in self._common
+
+
+def rarely_needed(rare: Sequence[str], line: str) -> str:
+    """Return the end of a help page: options that it only names.
+
+    Args:
+        rare: The options.
+        line: The command whose help page explains them.
+    """
+    width = min(shutil.get_terminal_size().columns, 100)
+    text = f"Rarely needed (explained by {line} --help-all): {', '.join(rare)}"
+    return textwrap.fill(text, width, break_on_hyphens=False, break_long_words=False)
 
 
 def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:
@@ -154,7 +197,7 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float | None] |
     )
 
 
-def unparsed(printed: str, line: str, example: str) -> ConfigurationError:
+def unparsed(printed: str, line: str, example: str, *, shortened: bool) -> ConfigurationError:
     """Return the parser's error as one line.
 
     Args:
@@ -162,6 +205,7 @@ def unparsed(printed: str, line: str, example: str) -> ConfigurationError:
             lie between them.
         line: The command without its arguments, such as `deal-hw collect`.
         example: Working arguments, the verb included.
+        shortened: Whether --help explains the common options only.
     """
     _, *parts, page = (" ".join(part.split()) for part in re.split("-{10,}", printed))
     page = "deal-hw" + page.partition("deal-hw")[2]
@@ -169,4 +213,4 @@ def unparsed(printed: str, line: str, example: str) -> ConfigurationError:
     if page == f"{line} --help":
         # The example of a verb with sub-verbs is not one of each sub-verb.
         parts.append(f"example: deal-hw {example}")
-    return ConfigurationError("; ".join([*parts, f"all options: {page}"]))
+    return ConfigurationError("; ".join([*parts, f"all options: {page}{'-all' * shortened}"]))

@@ -10,6 +10,7 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from deal_hw.cli.piped import PipedProgress
+from deal_hw.documentation import page
 from deal_hw.drivers import ROBOTS
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import InterruptedTrainingError, Training, TrainSettings, run
@@ -64,7 +65,7 @@ def _print(training: Training) -> None:
         up = "" if share is None else f"; {share:.0%} of an episode's time passes before a fall"
         print(
             f"return: {training.status.mean_return:.1f}, at first {training.first_return:.1f}{up} (means of "
-            "up to 100 episodes; page 'Train a policy' of the documentation says what is good)"
+            f"up to 100 episodes; {page('how-to/training.md')} says what is good)"
         )
 
 

@@ -80,7 +80,7 @@ class RichConfig:
     """Parts of the run with other gains and limits; the first part that contains the time is used. By default
     the second half has low effort limits and a high speed limit, because a recording shows a limit only where
     it is reached. It also has high stiffness and low damping, because a slow cart never reaches the effort
-    limit. Page 'Choose a motion' of the documentation has the figures."""
+    limit. docs/how-to/excitation.md has the figures."""
 
     def __post_init__(self) -> None:
         low, high = self.hold_s

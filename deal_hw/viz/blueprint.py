@@ -22,6 +22,14 @@ from deal_hw.viz.body_log import LEG_COLORS, SUPPLY, supply, tilt
 from deal_hw.viz.columns import DEVICE_TIMELINE, command_device_times
 from deal_hw.viz.scales import Curve, clear_corner, time_columns, visible_range
 
+FROM_CAMERA = np.array([0.1, -1.7, 0.37])
+"""From the robot's middle to the camera, in multiples of its reach. Rerun shows 0.6 of the distance up and
+down, so the whole reach, and more to the sides."""
+BESIDE = 0.25
+"""Part of the measured range that predictions may take to either side of it."""
+SMALLEST_M = 0.1
+"""Least reach of a robot in the view [m]: a single joint has no extent."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plot:
@@ -80,7 +88,9 @@ def inspect_blueprint(
     if trajectory.body is not None:
         tabs.append(_body(trajectory, trajectory.body))
     tabs.append(_loop_timing(trajectory, cycles))
-    details = rrb.Tabs(
+    # In one place, so that each text has the height of many alarms, and the robot is large.
+    texts = rrb.Tabs(
+        rrb.TextDocumentView(origin="/verdict", name="Verdict and alarms"),
         rrb.TextDocumentView(origin="/summary", name="Parameters and errors"),
         rrb.TextLogView(
             origin="/events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
@@ -88,8 +98,7 @@ def inspect_blueprint(
         rrb.StateTimelineView(origin="/status", name="Status"),
         active_tab=0,
     )
-    verdict = rrb.TextDocumentView(origin="/verdict", name="Verdict and alarms")
-    left = rrb.Vertical(verdict, _robot(description, bodies), details, row_shares=[7 if alarms else 4, 4, 6])
+    left = rrb.Vertical(texts, _robot(description, bodies), row_shares=[4 if alarms else 3, 3])
     right = rrb.Tabs(*tabs, active_tab=0)
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[2, 3]),
@@ -144,7 +153,7 @@ def _joints(
     for j, (joint, unit) in enumerate(zip(trajectory.joint_names, description.position_units, strict=True)):
         measured = getattr(trajectory, quantity)[:, j]
         low, high = _span(measured)
-        # A prediction that diverges must not hide the measured curve.
+        # A prediction that diverges must not make the measured curve small.
         reach = high - low or np.inf
         shown, errors = [(trajectory.device_s, measured)], []
         if overlay is not None:
@@ -157,7 +166,7 @@ def _joints(
                 name=f"{joint} {quantity} [{unit}{per_second}]",
                 origin=f"/joints/{joint}/{quantity}",
                 curves=tuple(shown),
-                within=(low - reach, high + reach),
+                within=(low - BESIDE * reach, high + BESIDE * reach),
             )
         ]
         if errors:
@@ -262,10 +271,10 @@ def _robot(description: RobotDescription, bodies: FloatArray | None) -> Any:
     if bodies is not None and not slides:
         # Halfway between the outermost bodies; links reach somewhat beyond their frames.
         center = 0.5 * (bodies.min(axis=0) + bodies.max(axis=0))
-        reach = max(reach, 1.3 * float(np.linalg.norm(bodies - center, axis=1).max()))
+        reach = max(SMALLEST_M, 1.3 * float(np.linalg.norm(bodies - center, axis=1).max()))
     eye = rrb.EyeControls3D(
         kind=rrb.components.Eye3DKind.Orbital,
-        position=tuple(center + reach * np.array([0.12, -2.1, 0.46])),
+        position=tuple(center + reach * FROM_CAMERA),
         look_target=tuple(center),
         eye_up=(0.0, 0.0, 1.0),
     )

@@ -1,7 +1,7 @@
 """The initial y range of a plot, and the corner in which its legend covers least.
 
 Rerun labels an axis at multiples of a power of ten only. So a range of its own choice often has one label, or
-none; ours has three at least.
+none; ours has two at least.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ class ScaleSettings:
             look small.
         least_span: The least span of values near zero, in their unit, so that rounding does not look like a
             signal.
-        ticks: Least number of labels.
+        ticks: Least number of labels. Two give the scale; with three, values from 0.1 to 1.4 got an axis from
+            0 to 2.
+        time_ticks: Least number of time labels of plots beside each other.
         label_px: Rerun leaves out labels that are closer together [px].
         window_px: Height that plots share in a window of 1280 x 800 [px].
         frame_px: Height of a plot's title and time labels [px].
@@ -41,7 +43,8 @@ class ScaleSettings:
     margin: float = 0.06
     least_share: float = 0.01
     least_span: float = 1e-3
-    ticks: int = 3
+    ticks: int = 2
+    time_ticks: int = 3
     label_px: float = 24.0
     window_px: float = 700.0
     frame_px: float = 50.0
@@ -95,7 +98,9 @@ def time_columns(seconds: float, settings: ScaleSettings = SETTINGS) -> int:
         settings: Widths and numbers of labels.
     """
     return (
-        1 if _time_labels(seconds, 1, settings) >= settings.ticks > _time_labels(seconds, 2, settings) else 2
+        1
+        if _time_labels(seconds, 1, settings) >= settings.time_ticks > _time_labels(seconds, 2, settings)
+        else 2
     )
 
 

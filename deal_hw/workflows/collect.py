@@ -83,7 +83,7 @@ class CollectSettings(RunOptions):
 def collect(settings: CollectSettings) -> RunReport:
     """Record the robot during an informative motion, as ``deal-hw collect``.
 
-    :class:`CollectSettings` and ``deal-hw collect --help`` describe the arguments: ``collect("cartpole",
+    :class:`CollectSettings` and ``deal-hw collect --help-all`` describe the arguments: ``collect("cartpole",
     port="/dev/ttyUSB0", out="runs/first")``.
 
     Returns:

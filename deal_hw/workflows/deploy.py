@@ -56,7 +56,7 @@ class DeploySettings(RunOptions):
 def deploy(settings: DeploySettings) -> RunReport:
     """Run a policy on the robot behind the safety filter, and record it, as ``deal-hw deploy``.
 
-    :class:`DeploySettings` and ``deal-hw deploy --help`` describe the arguments: ``deploy("cartpole",
+    :class:`DeploySettings` and ``deal-hw deploy --help-all`` describe the arguments: ``deploy("cartpole",
     port="/dev/ttyUSB0", policy="policy.onnx", out="runs/first")``.
 
     Returns:

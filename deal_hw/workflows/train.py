@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 
+from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import VERDICT
@@ -153,7 +154,7 @@ class InterruptedTrainingError(KeyboardInterrupt):
 def train(settings: TrainSettings) -> Training:
     """Train a policy under a calibrated distribution, as ``deal-hw train``.
 
-    :class:`TrainSettings` and ``deal-hw train --help`` describe the arguments: ``train("cartpole",
+    :class:`TrainSettings` and ``deal-hw train --help-all`` describe the arguments: ``train("cartpole",
     distribution=deal_hw.calibrate(...), out="runs/first")``.
 
     Returns:
@@ -330,7 +331,7 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
     if is_user_robot(config.robot) and not config.env:
         raise ConfigurationError(
             f"{config.robot}: deal-hw has no training environment for this robot; name your own by --env "
-            "module:ENV_ID (page 'Train a policy' of the documentation)"
+            f"module:ENV_ID ({page('how-to/training.md')})"
         )
     if config.env:
         if config.udr:

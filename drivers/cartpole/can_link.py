@@ -1,4 +1,4 @@
-"""The cart-pole's messages as classic CAN frames (page 'Cart-pole, CAN' of the documentation).
+"""The cart-pole's messages as classic CAN frames (docs/reference/protocol-cartpole-can.md).
 
 The table of signals is assets/cartpole.dbc.
 

@@ -1,7 +1,7 @@
 """A cart-pole of parts: an ODrive on the belt (its public CANSimple frames) and a pole encoder node.
 
 The host side of the wire. It converts the messages of the cart-pole to CANSimple frames and back, so the
-robot class is the same as on other wires. Page 'ODrive' of the documentation shows how to set up the parts.
+robot class is the same as on other wires. docs/how-to/cartpole-odrive.md shows how to set up the parts.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Serial protocol of the cart-pole, version 1: bytes <-> messages of integers.
 
-Page 'Cart-pole, serial' of the documentation describes it.
+docs/reference/protocol-cartpole-serial.md describes it.
 
 A frame on the wire is ``COBS(version, type, body, CRC-16) 00``: version and type are one byte each, all
 numbers are little-endian, the CRC is CRC-16/IBM-3740 (poly 0x1021, init 0xFFFF) over version, type and body.

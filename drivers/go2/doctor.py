@@ -15,6 +15,7 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.control.clock_check import judge_clock
 from deal_hw.control.leg_checks import tilt
+from deal_hw.documentation import page
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
@@ -148,7 +149,7 @@ class Go2Doctor:
         for peer in seen.peers:
             yield Finding("dds", Level.OK, str(peer))
         for complaint in seen.complaints:
-            yield Finding("dds", Level.FAIL, complaint, "see page 'DDS' of the documentation")
+            yield Finding("dds", Level.FAIL, complaint, f"see {page('how-to/go2-dds.md')}")
         typed: dict[str, set[str]] = {}
         for end in seen.endpoints:
             if end.topic in topics.TYPES:

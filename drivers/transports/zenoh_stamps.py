@@ -3,7 +3,7 @@
 The robot's side stamps its messages with its own clock. A client returns the newest received stamp with each
 message of its own, and numbers its messages. So the robot's side knows, by its own clock alone, the age of
 the state that the client acted on, with both ways included. No wall clock is used. TCP's timestamps work
-alike (RFC 7323). Page 'Go2 messages' of the documentation has the bytes for other languages.
+alike (RFC 7323). docs/reference/protocol-go2.md has the bytes for other languages.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import struct
 from dataclasses import dataclass
 from typing import Final
 
+from deal_hw.documentation import page
 from deal_hw.errors import FrameError
 
 VERSION: Final = 1
+_DESCRIBED: Final = page("reference/protocol-go2.md")
 _STAMP, _ECHO = 1, 2
 _STAMP_BYTES: Final = struct.Struct("<HHIQQ")
 _ECHO_BYTES: Final = struct.Struct("<HHIQQQQ")
@@ -79,7 +81,7 @@ def read_echo(attachment: bytes) -> Echo:
             return Echo(stream, sequence, Stamp(session, time_ns))
     raise FrameError(
         f"an attachment of {len(attachment)} bytes that begins {attachment[:4].hex(' ')!r} is no "
-        f"echo of version {VERSION} ({_ECHO_BYTES.size} bytes, page 'Go2 messages' of the documentation): "
+        f"echo of version {VERSION} ({_ECHO_BYTES.size} bytes, {_DESCRIBED}): "
         "neither sequence nor age is known"
     )
 

@@ -69,7 +69,7 @@ def test_real_robots_are_skipped_with_a_reason(tmp_path: Path, capsys: pytest.Ca
     assert "so101 seed 0: skipped: no real recordings: give --real DIR" in said and "seed 1" not in said
     assert "go2-suspended: not run" in said
     row = run_cell("so101", 0, real=tmp_path, budget=Budget(), threads=1)
-    assert "chirp_sweep.npz" in row["skipped"] and "page 'SO-101 arm'" in row["skipped"]
+    assert "chirp_sweep.npz" in row["skipped"] and "docs/results/example-so101.md" in row["skipped"]
 
 
 def test_the_go2s_files_are_those_that_its_page_makes(tmp_path: Path) -> None:

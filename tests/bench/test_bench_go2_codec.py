@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from deal_hw.bench import go2_codec
 from deal_hw.bench.go2_codec import TARGETS_US, bench_codec
+from deal_hw.cli.main import main
 
 
 def test_the_codec_bench_writes_medians_and_the_machine(
@@ -24,6 +26,18 @@ def test_the_codec_bench_writes_medians_and_the_machine(
         assert row["target_us"] == TARGETS_US.get(name)
     assert values["machine"]["processors"] >= 1
     assert "encode LowCmd with CRC" in capsys.readouterr().out
+
+
+def test_json_is_the_only_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The document is the file of rows, by default BENCH.json; the text goes to the error output."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(go2_codec, "_calls", lambda: {"nothing": lambda: None})
+    assert main(["bench", "go2-codec", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == json.loads((tmp_path / "go2-codec.json").read_text())
+    assert "nothing" in printed.err and "written: go2-codec.json" in printed.err
 
 
 def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:

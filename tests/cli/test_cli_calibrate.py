@@ -12,7 +12,7 @@ import pytest
 from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calibration import read_result
-from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.calibrate import Calibrate, calibrate, calibrate_or_write_parameters
 from deal_hw.cli.calibrate_output import print_files
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
@@ -88,9 +88,20 @@ def test_a_file_adds_parameters_to_a_robots_own_set(dataset: Path, tmp_path: Pat
         prepare(settings(dataset, free=(), recordings=chosen))
 
 
-def test_writes_everything_a_user_needs(dataset: Path, tmp_path: Path) -> None:
-    """Two parameters are found within 5 %; result, distribution and model are there and agree."""
-    report = calibrate(settings(dataset, out=tmp_path))
+def test_writes_everything_a_user_needs(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two parameters are found within 5 %; result, distribution and model are there and agree.
+
+    With --json the output is one document, and the text is on the error output.
+    """
+    report = calibrate_or_write_parameters(settings(dataset, out=tmp_path, json=True, quiet=False))
+    assert not isinstance(report, int)
+    printed = capsys.readouterr()
+    document = json.loads(printed.out)
+    assert document.pop("files") == {name: str(path) for name, path in report.files.items()}
+    assert document == json.loads(report.files["result.json"].read_text())
+    assert "calibration by default" in printed.err and "written to" in printed.err
     found = dict(zip(report.result.space.names, report.result.estimate, strict=True))
     assert found["cart.mass"] == pytest.approx(0.3, rel=0.05)
     assert found["servo.stiffness"] == pytest.approx(80.0, rel=0.05)
@@ -104,6 +115,13 @@ def test_writes_everything_a_user_needs(dataset: Path, tmp_path: Path) -> None:
     assert provenance["episodes"] == [0] and provenance["holdout"] == [1]
     assert provenance["seed"] == 0 and "mujoco" in provenance["versions"]
     assert json.loads(report.files["distribution.json"].read_text())["latency_s"][0] <= 9e-3
+
+
+def test_no_document_of_a_calibration_that_does_not_run(tmp_path: Path) -> None:
+    """--write-parameters writes a file and calibrates nothing."""
+    recordings = Recordings(model=tmp_path / "arm.xml", write_parameters=tmp_path / "p.yaml")
+    with pytest.raises(ConfigurationError, match="--json would have no effect: --write-parameters"):
+        calibrate_or_write_parameters(Calibrate(recordings=recordings, json=True))
 
 
 def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from verb_options import dataclasses_of
 
+from deal_hw.calib.pipeline.methods import METHODS
 from deal_hw.cli.main import VERBS, main, run
 from deal_hw.control.posture import PostureConfig
 from deal_hw.errors import ConfigurationError, UnknownNameError
@@ -234,7 +235,8 @@ def test_words_that_do_not_parse_get_one_line(
     printed = capsys.readouterr()
     assert printed.err.startswith(f"deal-hw: error: {words}") and printed.err.count("\n") == 1
     verb = "data info" if line == "data info" else line.split()[0]
-    assert printed.err.endswith(f"; all options: deal-hw {verb} --help\n") and not printed.out
+    page = f"deal-hw {verb} --help{'-all' if VERBS[line.split()[0]].common else ''}"
+    assert printed.err.endswith(f"; all options: {page}\n") and not printed.out
 
 
 @pytest.mark.parametrize(
@@ -288,11 +290,38 @@ def test_a_missing_recording_is_told_before_the_missing_desktop(
     assert "nothere.mcap cannot be read" in capsys.readouterr().err
 
 
-def help_page(line: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Return what a line prints with --help."""
-    with pytest.raises(SystemExit):
-        main([*line.split(), "--help"])
+def help_page(line: str, capsys: pytest.CaptureFixture[str], option: str = "--help-all") -> str:
+    """Return what a line prints with --help-all or --help."""
+    with pytest.raises(SystemExit) as stop:
+        main([*line.split(), option])
+    assert not stop.value.code
     return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", ["collect", "calibrate", "train", "deploy"])
+@pytest.mark.parametrize("robot", ["", "go2"])
+def test_help_explains_common_options_and_names_rare_ones(
+    verb: str, robot: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Together these are the options that --help-all explains, and each common one exists."""
+    line = verb if verb == "calibrate" else f"{verb} {robot}".strip()
+    common, _, end = help_page(line, capsys, "--help").partition("Rarely needed ")
+    all_options = options_of(help_page(line, capsys))
+    rare = set(re.findall(r"--[\w-]+", end.partition("):")[2]))
+    assert options_of(common) | rare == all_options and not options_of(common) & rare
+    assert 0 < len(options_of(common)) <= 15 and rare
+    assert " ".join(end.split()).startswith(f"(explained by deal-hw {line} --help-all): --")
+    if robot or verb == "calibrate":
+        assert {name.replace("_", "-") for name in VERBS[verb].common} <= {
+            option.removeprefix("--") for option in options_of(common)
+        }
+
+
+def test_the_help_of_calibrate_lists_each_method(capsys: pytest.CaptureFixture[str]) -> None:
+    """A user need not mistype a name to see the names."""
+    page = " ".join(help_page("calibrate", capsys, "--help").replace("│", " ").split())
+    named = page.partition("--method STR")[2].partition("(default:")[0]
+    assert set(METHODS) <= set(re.findall(r"[a-z][\w-]*", named))
 
 
 @pytest.mark.parametrize(
@@ -333,7 +362,7 @@ def test_a_help_page_shows_what_the_named_robot_takes(verb: str, capsys: pytest.
 
 def options_of(page: str) -> set[str]:
     """Return the options that a help page lists."""
-    return set(re.findall(r"^\W*(--[a-z][\w-]*)", page, flags=re.M))
+    return set(re.findall(r"^\W{1,2}(--[a-z][\w-]*)", page, flags=re.M))
 
 
 @pytest.mark.parametrize("name", VERBS)

@@ -344,6 +344,7 @@ def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
     assert sorted(loaded) == [
         "deal_hw.cli",
         "deal_hw.cli.main",
+        "deal_hw.documentation",
         "deal_hw.errors",
         "deal_hw.install",
         "deal_hw.version",

@@ -10,6 +10,8 @@ import check_site
 import docs_pages
 import pytest
 
+import deal_hw
+from deal_hw import documentation
 from deal_hw.cli.main import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -80,21 +82,37 @@ def test_each_alarm_is_on_its_page() -> None:
 
 
 def test_values_of_run_time_are_shortened() -> None:
-    """Braces inside an expression do not end it."""
+    """Braces inside an expression do not end it; a page's name is known before."""
+    assert docs_pages.shortened("{x}: {page('how-to/add.md')} shows") == "…: docs/how-to/add.md shows"
     assert docs_pages.shortened("a {', '.join({x})} b {y}") == "a … b …"
 
 
-def test_messages_name_pages_of_the_site() -> None:
-    """Texts in the product name a page as the navigation does; an installed wheel has no docs/ folder."""
-    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
-    pages = set(re.findall(r"- ([^:\n]+): \S+\.md$", navigation, flags=re.M))
-    named = []
+def test_messages_name_pages_by_their_file() -> None:
+    """Each page that the product names is a file of docs/: by `page(...)` in messages, `docs/...` in help."""
+    named = set()
     for path in (file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                assert not re.search(r"\bdocs/[\w-]+/", node.value), f"{path.relative_to(ROOT)}: {node.value}"
-                named += re.findall(r"page '([^']+)'", node.value, flags=re.I)
-    assert named and set(named) <= pages
+                assert not re.search(r"\bpages? '", node.value, flags=re.I), f"{path.name}: {node.value}"
+                named |= set(re.findall(r"\bdocs/([\w-]+/[\w-]+\.md)", node.value))
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "page":
+                named |= {str(part.value) for part in node.args if isinstance(part, ast.Constant)}
+    assert "how-to/import.md" in named
+    assert [name for name in named if not (DOCS / name).is_file()] == []
+
+
+def test_a_page_is_named_so_that_it_opens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the checkout by docs/..., from elsewhere by its full path; help texts follow the same rule."""
+    monkeypatch.chdir(ROOT)
+    assert documentation.page("how-to/import.md") == "docs/how-to/import.md"
+    monkeypatch.chdir(tmp_path)
+    full = str(DOCS / "how-to/import.md")
+    assert documentation.page("how-to/import.md") == full
+    # Another project's docs/ is not ours.
+    (tmp_path / "docs/how-to").mkdir(parents=True)
+    (tmp_path / "docs/how-to/import.md").touch()
+    assert documentation.page("how-to/import.md") == full
+    assert documentation.with_places("see docs/how-to/import.md.") == f"see {full}."
 
 
 def test_readme_is_short() -> None:
@@ -151,10 +169,24 @@ def test_no_site_is_a_complaint(tmp_path: Path) -> None:
 
 def test_the_reference_has_the_arguments_of_each_function() -> None:
     """A function of settings shows in a signature that it takes settings; its arguments are the class's."""
-    page = docs_pages.api_page()
+    text = "\n".join(docs_pages.api_pages().values())
     for name in ("collect", "deploy", "train", "emulate", "inspect", "replay", "design_excitation"):
-        assert f"heading: Arguments of deal_hw.{name}\n" in page
-    assert "::: deal_hw.workflows.collect.CollectSettings\n" in page
+        assert f"heading: Arguments of deal_hw.{name}\n" in text
+    assert "::: deal_hw.workflows.collect.CollectSettings\n" in text
+
+
+def test_each_public_name_is_on_one_page_of_the_api() -> None:
+    """The start page lists all of them; no page has everything."""
+    pages = docs_pages.api_pages()
+    start = pages.pop("reference/api.md")
+    assert "::: " not in start and len(pages) >= 8
+    described = [line for text in pages.values() for line in text.splitlines() if line.startswith("::: ")]
+    assert len(described) == len(set(described))
+    names = docs_pages.public_names(deal_hw)
+    assert {f"::: {name}" for name in names} <= set(described)
+    for name in names:
+        assert f"#{name})" in start
+    assert max(text.count("::: ") for text in pages.values()) <= 12
 
 
 def test_names_in_docstrings_are_names() -> None:

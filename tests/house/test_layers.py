@@ -20,6 +20,7 @@ VOCABULARY = (
     "reading",
     "schema",
     "install",
+    "documentation",
     "ranges",
     "child_process",
     "signals",

@@ -112,14 +112,14 @@ def data_in_tree() -> set[str]:
             if path.is_file() and path.suffix not in {".py", ".pyc"} and not path.name.startswith("."):
                 inside = path.relative_to(ROOT)
                 found.add(str(inside if folder == "deal_hw" else Path("deal_hw") / inside))
-    return found
+    return found | {f"deal_hw/{path.relative_to(ROOT)}" for path in (ROOT / "docs").rglob("*.md")}
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the wheel from a copy, since setuptools leaves files in the tree that later builds pick up."""
     source = tmp_path_factory.mktemp("source")
-    for folder in FOLDERS:
+    for folder in (*FOLDERS, "docs"):
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -149,9 +149,9 @@ def run_elsewhere(code: str, unpacked: Path, cwd: Path) -> subprocess.CompletedP
 
 
 def test_packages_are_all_listed_and_mapped() -> None:
-    """The list and the mapping in pyproject.toml name exactly the packages of the tree."""
+    """The list and the mapping in pyproject.toml name exactly the packages of the tree, and the pages."""
     setuptools = project()["tool"]["setuptools"]  # type: ignore[index]
-    tree = packages_in_tree()
+    tree = {**packages_in_tree(), "deal_hw.docs": ROOT / "docs"}
     assert sorted(setuptools["packages"]) == sorted(tree)
     mapping = setuptools["package-dir"]
     for name, folder in tree.items():
@@ -218,6 +218,16 @@ def test_command_runs_from_the_wheel(unpacked: Path, tmp_path: Path) -> None:
     done = run_elsewhere(code, unpacked, tmp_path)
     assert done.stdout == f"deal-hw {project()['project']['version']}\n"  # type: ignore[index]
     assert done.returncode == 0
+
+
+def test_a_message_of_the_wheel_names_a_page_that_can_be_opened(unpacked: Path, tmp_path: Path) -> None:
+    """Outside the repository a refusal names the page of the installed package by its full path."""
+    words = ["deploy", "robot.yaml", "--port", "p"]
+    code = f"import sys; from deal_hw.cli.main import main; sys.exit(main({words}))"
+    done = run_elsewhere(code, unpacked, tmp_path)
+    assert done.returncode == 2, done.stderr
+    (named,) = re.findall(r"(/\S+\.md)", done.stderr)
+    assert Path(named) == unpacked / "deal_hw/docs/how-to/add.md" and Path(named).is_file()
 
 
 def test_the_wheel_calibrates_a_robot_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:

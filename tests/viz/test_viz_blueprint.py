@@ -48,7 +48,9 @@ def plots(layout: Any) -> dict[str, Any]:
 def test_the_verdict_is_at_the_top(layout: Any) -> None:
     """At the top left, and higher than the rest of its column where there are alarms."""
     left, right = layout.root_container.contents
-    assert [view.origin for view in left.contents[:2]] == ["/verdict", "/world"]
+    texts, robot = left.contents
+    assert [view.origin for view in texts.contents] == ["/verdict", "/summary", "/events", "/status"]
+    assert texts.active_tab == 0 and robot.origin == "/world"
     assert left.row_shares[0] == max(left.row_shares)
     assert [tab.name for tab in right.contents] == ["Position", "Velocity", "Commands", "Loop timing"]
 
@@ -62,7 +64,7 @@ def test_every_plot_names_its_unit_and_shares_the_time_axis(plots: dict[str, Any
 
 
 def test_axes_hold_what_is_drawn(plots: dict[str, Any], shown: Any) -> None:
-    """All that was measured and sent, with room; predictions and their errors; three labels at least."""
+    """All that was measured and sent, with room; predictions and their errors; two labels at least."""
     t, overlay = shown.trajectory, shown.overlay
     nominal = overlay.predictions["nominal"]
     drawn = {
@@ -84,7 +86,7 @@ def test_axes_hold_what_is_drawn(plots: dict[str, Any], shown: Any) -> None:
 
 
 def test_a_prediction_that_runs_away_leaves_the_plot(shown: Any) -> None:
-    """It may take the measured range once more to either side, and no more."""
+    """It may take a quarter of the measured range to either side: the measured one keeps half of the plot."""
     wild = dataclasses.replace(
         shown.overlay.predictions["nominal"], position=1e6 * shown.overlay.predictions["nominal"].position
     )
@@ -93,8 +95,8 @@ def test_a_prediction_that_runs_away_leaves_the_plot(shown: Any) -> None:
     found = {view.name: view for view in views(layout.root_container)}
     real = shown.trajectory.position[:, 0]
     low, high = axis(found["cart position [m]"])
-    assert low < real.min() - 0.9 * np.ptp(real) and real.max() + 0.9 * np.ptp(real) < high
-    assert high - low < 5 * np.ptp(real)
+    assert low < real.min() - 0.25 * np.ptp(real) and real.max() + 0.25 * np.ptp(real) < high
+    assert high - low < 2 * np.ptp(real)
 
 
 def test_efforts_that_were_not_recorded_have_no_plot(shown: Any) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import render_notebook
 
 import deal_hw
 from deal_hw.errors import InsufficientDataError
@@ -26,7 +27,7 @@ SCRIPTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
 """Script -> arguments, and what it must have told at its end."""
 SHORT: dict[str, Any] = {"method": "eki", "refine": False, "population": 20, "generations": 3}
 """A calibration that ends at once, for a script in real time, for which other such tests have to wait."""
-NOTEBOOK = EXAMPLES / "calibrate.ipynb"
+NOTEBOOK = EXAMPLES / "hidden_payload.ipynb"
 EXECUTE = """
 import sys
 import nbformat
@@ -83,7 +84,7 @@ def outputs_of(notebook: Path) -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 def test_the_notebook_runs(tmp_path: Path) -> None:
-    """Each cell runs; a calibration is shown as a table; the committed file holds no outputs."""
+    """The payload is found; the intervals hold the truth; a figure is drawn; no outputs are committed."""
     assert not any(outputs_of(NOTEBOOK))
     done = tmp_path / "done.ipynb"
     words = [sys.executable, "-c", EXECUTE, str(NOTEBOOK), str(done)]
@@ -91,5 +92,18 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     subprocess.run(words, check=True, cwd=tmp_path, env=environment, capture_output=True, timeout=400)
     outputs = outputs_of(done)
     shown = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
-    assert any("<table>" in html and "pivot.damping" in html for html in shown)
-    assert "cannot tell which channel is the time" in "".join(outputs[-1]["text"])
+    assert any("<td>hand.mass</td>" in html and "green" in html for html in shown)
+    (table,) = ("".join(output["text"]) for output in outputs if output.get("name") == "stdout")
+    rows = {line.split()[0]: line.split() for line in table.splitlines()[1:]}
+    mass = rows["hand.mass"]
+    assert float(mass[2]) == pytest.approx(0.35, abs=0.002) and mass[-1] == "inside"
+    assert sum(row[-1] == "inside" for row in rows.values()) >= 4 and len(rows) == 5
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+
+
+def test_the_notebooks_page_has_its_code() -> None:
+    """After a change of the notebook: python tools/render_notebook.py."""
+    page = render_notebook.PAGE.read_text(encoding="utf-8")
+    for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"]).strip()
+        assert (render_notebook.code_block(source) if cell["cell_type"] == "code" else source) in page

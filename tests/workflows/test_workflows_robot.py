@@ -204,7 +204,7 @@ REFUSED: list[tuple[str, str]] = [
     ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a simulated"),
     (
         "deploy {made}/robot.yaml --port p",
-        "deal-hw has no driver for this robot; page 'Add a robot or a method'",
+        "docs/how-to/add.md shows how to write one",
     ),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]

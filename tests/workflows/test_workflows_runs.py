@@ -83,7 +83,7 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
     # The reason of a failure follows as the error.
     assert dataclasses.replace(lost, outcome=Outcome.FAILED).lines() == ["failed"]
     kept = dataclasses.replace(lost, path=Path("000003.mcap"))
-    assert kept.lines()[-1].startswith("  to see why: deal-hw inspect 000003.mcap (page 'Remedies'")
+    assert kept.lines()[-1].startswith("  to see why: deal-hw inspect 000003.mcap (docs/troubleshooting.md)")
 
 
 @pytest.mark.parametrize("confirmed", [True, False])

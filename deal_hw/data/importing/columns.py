@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from deal_hw.documentation import page
 from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
 from deal_hw.reading import NAMES, number, read_yaml, reading
 
@@ -198,7 +199,7 @@ def read_column_map(path: Path) -> ColumnMap:
     Raises:
         ConfigurationError: It cannot be read or has an entry that a column map cannot have.
     """
-    described = "page 'Use your recordings' of the documentation describes it"
+    described = f"{page('how-to/import.md')} describes it"
     with reading(path, "a column map", described, error=ConfigurationError):
         return parse_column_map(read_yaml(Path(path)), (f"column map {Path(path).name}",))
 

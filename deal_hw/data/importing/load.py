@@ -22,6 +22,7 @@ from deal_hw.data.importing.table import Table, build_table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.documentation import page
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
 
@@ -94,7 +95,7 @@ def load_tables(
     Raises:
         DatasetError: It cannot be read or understood.
     """
-    described = "page 'Use your recordings' of the documentation describes one"
+    described = f"{page('how-to/import.md')} describes one"
     with reading(path, "a recording of a robot", described):
         tables = tables_of(read_channels(path), columns, joints, say, said)
     if not tables:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.fields import element_id, element_names
@@ -14,7 +15,7 @@ from deal_hw.sim.parameters.kind import Kind, joint_of
 
 _HEAD = """\
 # Parameters of {title} for `deal-hw calibrate --parameters`. Remove what you know or do not want to search.
-# Every key is explained on page 'Parameters' of the documentation. Nominal values are the model's.
+# Every key is explained in {page}. Nominal values are the model's.
 # A value of 0 has no ratio, so its line is commented out: give it a `nominal` or a `range`, remove the #.
 # Measure what you can: `weighed: 0.35` fixes a mass, `prior: {{mean: 0.35, std: 0.02}}` says what you expect.
 parameters:
@@ -40,7 +41,7 @@ def template(model: Any, title: str = "this model") -> str:
         model: The MjModel.
         title: Name of the model in the head of the file.
     """
-    lines = [_HEAD.format(title=title)]
+    lines = [_HEAD.format(title=title, page=page("reference/parameters.md"))]
     for name in _ON:
         lines += _section(model, KIND_TABLE[name], active=True)
     for name in _OFF:

@@ -1,6 +1,6 @@
 """A user's params.yaml: the searched parameters of an MJCF, their ranges, and known values.
 
-Page 'Parameters' of the documentation describes the format. Nominal values come from the MJCF, so the file
+docs/reference/parameters.md describes the format. Nominal values come from the MJCF, so the file
 holds only the user's changes.
 """
 
@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import yaml
 
+from deal_hw.documentation import page
 from deal_hw.errors import QUOTED, ConfigurationError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
 from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
@@ -49,7 +50,7 @@ def read_space(path: Path, model: Any) -> ParameterSpace:
         ConfigurationError: The file cannot be used; the message names the entry and what to write instead.
         UnknownNameError: A kind or an element is not known; the message lists the names.
     """
-    described = "page 'Parameters' of the documentation describes them"
+    described = f"{page('reference/parameters.md')} describes them"
     with reading(path, "parameters", described, error=ConfigurationError):
         return parse_space(read_bytes(path, YAML_BYTES).decode("utf-8"), model, source=str(path))
 

@@ -33,7 +33,7 @@ DEFAULT = "default"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recordings(Checked):
-    """Any robot: its MuJoCo model and its recordings (page 'Your own robot' of the documentation)."""
+    """Any robot: its MuJoCo model and its recordings (docs/tutorials/your-robot.md)."""
 
     model: Path | None = None
     """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
@@ -42,7 +42,7 @@ class Recordings(Checked):
     """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
 
     columns: Path | None = None
-    """Column map (YAML; page 'Use your recordings' of the documentation). Without one, the meaning of the
+    """Column map (YAML; docs/how-to/import.md). Without one, the meaning of the
     channels is guessed from their names."""
 
     parameters: Path | None = None
@@ -110,17 +110,21 @@ class CalibrateSettings(Checked):
     """Held-out predictions restart from the measured state after this time [s]."""
 
     method: str = DEFAULT
-    """Search method: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
-    default is eki with refinement. For a walk it is gait. With --model, for servos on a fixed base, it is
-    output-error, unless --residual-std or --no-refine is given."""
+    """How to calibrate. default is eki with refinement; for a walk it is gait; with --model, for servos on a
+    fixed base, it is output-error, unless --residual-std or --no-refine is given. Fits without a search:
+    output-error, local, gait. Searches: eki, deal. The DEAL paper's Algorithm 1 and its variants: deal-paper,
+    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay. Baselines: easi,
+    easi-log, bo, bo-critic, cma, gauss-newton, least-squares, least-squares-random,
+    least-squares-multistart, ekf, ekf-one-pass, mujoco-sysid, random. Without data: midpoint,
+    midpoint-linear, nominal."""
 
     policy: File | None = None
     """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
     simulator; by default the copy in the dataset."""
 
     space: str = ""
-    """Named parameter set of a robot with a driver, such as k9 or k11; by default the first. Page
-    'Parameters' of the documentation lists them."""
+    """Named parameter set of a robot with a driver, such as k9 or k11; by default the first.
+    docs/reference/parameters.md lists them."""
 
     free: tuple[str, ...] = ()
     """Search exactly these parameters; all others keep their nominal values."""

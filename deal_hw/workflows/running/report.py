@@ -15,6 +15,7 @@ from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.replay_error import ReplayError
 from deal_hw.control.velocity_error import VelocityError
 from deal_hw.data.recording.excitation import Excitation
+from deal_hw.documentation import page
 from deal_hw.workflows.say import html_table, text_table
 
 _HEAD = ("episode", "outcome", "reason", "states", "clipped cycles", "recording")
@@ -92,9 +93,7 @@ class EpisodeReport:
         if self.path is not None:
             lines.append(f"  recorded {self.states_recorded} states in {self.path}")
             if self.outcome is Outcome.TRIPPED:
-                lines.append(
-                    f"  to see why: deal-hw inspect {self.path} (page 'Remedies' of the documentation)"
-                )
+                lines.append(f"  to see why: deal-hw inspect {self.path} ({page('troubleshooting.md')})")
         if self.walk is not None and self.walk.seconds:
             lines.append(
                 f"  velocity error, by leg odometry and IMU: {self.walk.velocity_m_s:.2f} m/s, "

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
+from deal_hw.documentation import page
 from deal_hw.drivers import default_transport, driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, option
@@ -119,8 +120,7 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
     """
     if is_user_robot(robot):
         raise ConfigurationError(
-            f"{robot}: deal-hw has no driver for this robot; page 'Add a robot or a method' of the "
-            "documentation shows how to write one"
+            f"{robot}: deal-hw has no driver for this robot; {page('how-to/add.md')} shows how to write one"
         )
     description = driver_description(robot)
     stands = _stands(description) if legs.stand is None else legs.stand

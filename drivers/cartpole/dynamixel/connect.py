@@ -8,6 +8,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from deal_hw.clock import Clock
+from deal_hw.documentation import page
 from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.transports.listen_only import listen_only
@@ -41,7 +42,7 @@ def parse_port(port: str) -> tuple[str, DynamixelSettings]:
             Path(file),
             dict[str, Any],
             "settings of the servos",
-            "page 'Dynamixel servos' of the documentation shows one",
+            f"{page('how-to/dynamixel.md')} shows one",
             error=ConfigurationError,
         )
     values |= {name: _value(text) for name, text in given.items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.clock import Clock
+from deal_hw.documentation import page
 from deal_hw.drivers.cartpole.dynamixel.bus import Answer, Bus
 from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
 from deal_hw.drivers.cartpole.dynamixel.examine import model_name
@@ -168,7 +169,7 @@ def _latency_timer(path: str, sysfs: Path) -> Iterator[Finding]:
         f"the adapter's latency timer is {timer_ms} ms",
         f"deal-hw sets it to 1 ms while it runs; for other programs: echo 1 > /sys/class/tty/"
         f"{Path(path).resolve().name}/device/latency_timer, or the udev rule "
-        "on page 'Dynamixel servos' of the documentation"
+        f"in {page('how-to/dynamixel.md')}"
         if slow
         else "",
     )

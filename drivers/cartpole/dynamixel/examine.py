@@ -11,6 +11,7 @@ from dynamixel_easy_sdk.control_table import ControlTable
 from dynamixel_easy_sdk.dynamixel_error import DxlRuntimeError
 
 from deal_hw.clock import Clock
+from deal_hw.documentation import page
 from deal_hw.drivers.cartpole.dynamixel.bus import Answer, Bus
 from deal_hw.drivers.cartpole.dynamixel.registers import (
     BAUD_RATE,
@@ -45,7 +46,7 @@ _TRIES = 5
 """Attempts of a request with corrupt answers; with 5 % corrupt answers all fail once in 10**6."""
 _LISTEN_S = 0.05
 _ALL_STATUS = 2
-_WIZARD = "with Dynamixel Wizard 2.0 (page 'Dynamixel servos' of the documentation)"
+_WIZARD = f"with Dynamixel Wizard 2.0 ({page('how-to/dynamixel.md')})"
 
 
 @dataclass(frozen=True, slots=True)
