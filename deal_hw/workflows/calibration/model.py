@@ -115,7 +115,7 @@ def prepare_model(
     columns = None if config.columns is None else read_column_map(config.columns)
     said: dict[str, str] = {}
     fitted, held = (
-        read_tables(sources, columns, facts.names, say, name, said)
+        read_tables(sources, columns, facts, say, name, said)
         for name, sources in (("data", data), ("holdout", holdout))
     )
     refuse_copies([*fitted, *held])

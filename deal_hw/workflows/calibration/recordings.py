@@ -14,11 +14,12 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import REQUIRED_CHECKS
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.columns import ColumnMap
+    from deal_hw.data.importing.columns import ColumnMap, JointKinds
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.describe import Sampling
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
     from deal_hw.sim.recordings.episode import SampledEpisode
 
 STRETCH_S = 2.5
@@ -33,7 +34,7 @@ Source = Path | str | Mapping[str, Any] | Any
 def read_tables(
     sources: Sequence[Source],
     columns: ColumnMap | None,
-    joints: Sequence[str],
+    facts: JointFacts,
     say: Callable[[str], None],
     name: str,
     said: dict[str, str],
@@ -46,12 +47,25 @@ def read_tables(
     from deal_hw.data.importing.memory_source import read_memory
 
     tables: list[Table] = []
+    joints, kinds = facts.names, kinds_of(facts)
     for number, source in enumerate(sources):
         if isinstance(source, str | Path):
-            tables += load_tables(Path(source), columns, joints, say, said)
+            tables += load_tables(Path(source), columns, joints, say, said, kinds)
         else:
-            tables += tables_of([read_memory(source, f"{name}[{number}]")], columns, joints, say, said)
+            channels = read_memory(source, f"{name}[{number}]")
+            tables += tables_of([channels], columns, joints, say, said, kinds)
     return tables
+
+
+def kinds_of(facts: JointFacts) -> JointKinds:
+    """Return which joints of a model slide, and which have motors."""
+    from deal_hw.data.importing.columns import JointKinds
+
+    motors = zip(facts.names, facts.motor & ~facts.servo, facts.full_effort, strict=True)
+    return JointKinds(
+        slides=frozenset(n for n, unit in zip(facts.names, facts.units, strict=True) if unit == "m"),
+        motors={name: float(full) for name, motor, full in motors if motor},
+    )
 
 
 def refuse_copies(tables: Sequence[Table]) -> None:
