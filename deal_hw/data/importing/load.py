@@ -124,14 +124,14 @@ def tables_of(
         if say is not None:
             _tell(say, channels, used, joints, columns is None and number == 0, said)
         table = build_table(channels, used, joints)
-        _ask(table, used)
+        _ask(channels.path, table, used)
         if say is not None:
             _tell_turns(say, table)
         tables.append(table)
     return tables
 
 
-def _ask(table: Table, columns: ColumnMap) -> None:
+def _ask(path: Path, table: Table, columns: ColumnMap) -> None:
     """Refuse a motor's commands that may be newtons as well as a share of full power.
 
     Raises:
@@ -152,7 +152,7 @@ def _ask(table: Table, columns: ColumnMap) -> None:
             unit = joint.effort_unit
             scale = f"{{from: [-1, 1], to: [-{full:.4g}, {full:.4g}]}}"
             raise DatasetError(
-                f"{table.name}: the commands of {name} lie within -1..1, and its motor in the model gives "
+                f"{path}: the commands of {name} lie within -1..1, and its motor in the model gives "
                 f"{full:.4g} {unit} at its highest command: 1 may be full power or 1 {unit}. Write into the "
                 f"column map, for {name}, `target_normalised: {scale}` if it is full power, or "
                 f"`target_unit: {unit}`"
