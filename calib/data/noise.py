@@ -31,6 +31,8 @@ class DataSettings:
         noise_free_std: Positions with less noise are taken as exact [m or rad].
         noise_free_residual: Residual scale of noise-free recordings [m or rad]: far above rounding, far below
             sensors.
+        held_std: Noise of a position that never changes, which shows none [m or rad]: a count of a coarse
+            encoder. Without it such a joint would outweigh all that move.
         noise_order: Order of the differences that remove smooth motion and leave white noise.
         speed_bins: Number of bins of equal speed in which noise is estimated.
         fewest_in_bin: Fewest samples per bin for an estimate of jitter.
@@ -52,6 +54,7 @@ class DataSettings:
     resolution: float = 1e-6
     noise_free_std: float = 2e-5
     noise_free_residual: float = 1e-5
+    held_std: float = 1e-3
     noise_order: int = 6
     speed_bins: int = 10
     fewest_in_bin: int = 20
@@ -111,7 +114,10 @@ def white_noise_std(
     differences = _differences(parts, settings.noise_order, masks)
     rounding = _rounding_std(parts, masks, settings)
     found = [_spread(d, settings.noise_order) if len(d) else 0.0 for d, _ in differences]
-    return np.maximum(np.maximum(found, rounding), settings.floor)
+    first = next((x[0] for x in parts if len(x)), None)
+    held = np.all([np.all(x == first, axis=0) for x in parts], axis=0)
+    least = np.where(held, settings.held_std, settings.floor)
+    return np.maximum(np.maximum(found, rounding), least)
 
 
 def _rounding_std(
@@ -287,6 +293,11 @@ def smooth_states(
     return StartStates(position, velocity, std)
 
 
+def smoothed_samples(period_s: float, settings: DataSettings = SETTINGS) -> int:
+    """Return the number of samples of a smoothing polynomial; no shorter recording can be used."""
+    return max(2 * round(settings.smoothing_s / period_s / 2) + 1, settings.fewest_smoothed)
+
+
 def _local_polynomials(
     values: FloatArray, period_s: float, settings: DataSettings
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -296,7 +307,7 @@ def _local_polynomials(
         Values and slopes, (T, n), and the gain of each on white noise, (T,).
     """
     T, order = len(values), settings.smoothing_order
-    length = max(2 * round(settings.smoothing_s / period_s / 2) + 1, settings.fewest_smoothed)
+    length = smoothed_samples(period_s, settings)
     half = length // 2
     if length > T:
         raise InsufficientDataError(

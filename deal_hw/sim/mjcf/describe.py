@@ -89,7 +89,8 @@ def describe(
     free = _check_joints(model, index)
     actuators = [actuator_of(model, name) for name in actuated]
     _check_actuators(model, actuators, actuated)
-    kinds = {_actuation(model, i, name) for i, name in zip(actuators, actuated, strict=True)}
+    # Without actuators there is nothing to command, as with motors that are off.
+    kinds = {_actuation(model, i, name) for i, name in zip(actuators, actuated, strict=True)} or {"motor"}
     if len(kinds) > 1:
         raise ConfigurationError(
             "some actuators of the model are position servos, some are motors; calibration takes one kind"
@@ -171,11 +172,6 @@ def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[st
         raise ConfigurationError(
             f"actuators of the model without recorded commands: {', '.join(idle)}; name their `target` in "
             "the column map, or remove them from a copy of the MJCF"
-        )
-    if not actuated:
-        raise ConfigurationError(
-            "no recorded joint has commands: name the `target` in the column map, or give the model an "
-            "actuator, such as <position joint=... kp=...>, where it has none"
         )
 
 

@@ -113,9 +113,41 @@ def common_rates(
                 "separately"
             )
         # An invalid clock has no period; report it before anything else fails on it.
-        require([v for v in examine(table) if v.name in REQUIRED_CHECKS], table.name)
+        found = examine(table, efforts=not model_has_servos(model))
+        require([v for v in found if v.name in REQUIRED_CHECKS], table.name)
     timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
     return sampling(common_period(tables), timestep, window_s)
+
+
+def model_has_servos(model: Any) -> bool:
+    """Return whether an actuator of a model takes positions."""
+    return bool((model.actuator_biasprm[:, 1] < 0).any())
+
+
+def at_rest_without_commands(
+    tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
+) -> list[Table]:
+    """Return recordings in which motors without any recorded command are off: their commands are 0.
+
+    A servo holds its joint, so its commands cannot be guessed. These recordings stay as they are.
+    """
+    found = []
+    for table in tables:
+        driven = tuple(
+            name
+            for name, servo, motor in zip(facts.names, facts.servo, facts.motor, strict=True)
+            if (servo or motor) and name in table.joint_names
+        )
+        if table.command_s.size or facts.servo.any():
+            found.append(table)
+            continue
+        off = f"its motors ({', '.join(driven)}) were off" if driven else "the model has no actuators"
+        say(f"{table.name}: no commands, and {off}: it is taken as a motion of the joints alone")
+        table = dataclasses.replace(
+            table, actuated=driven, command_s=np.zeros(1), target=np.zeros((1, len(driven)))
+        )
+        found.append(table)
+    return found
 
 
 def without(
@@ -190,6 +222,22 @@ def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...], name
     if recording.orientation is not None and recording.gyro is not None and robot.base is not None:
         episode = with_base(episode, robot, feet, recording.orientation, recording.gyro)
     return fill_gaps(episode)
+
+
+def without_scraps(episodes: Sequence[SampledEpisode], say: Callable[[str], None]) -> list[SampledEpisode]:
+    """Return recordings without those too short to be smoothed, as a few samples between two gaps are.
+
+    If all are, all stay: whoever uses them says how long a recording must be.
+    """
+    from deal_hw.calib.data.noise import smoothed_samples
+
+    kept = [e for e in episodes if len(e.sample) > 1 and len(e.sample) >= smoothed_samples(e.period_s)]
+    short = len(episodes) - len(kept)
+    if not kept or not short:
+        return list(episodes)
+    samples = sum(len(e.sample) for e in episodes) - sum(len(e.sample) for e in kept)
+    say(f"{short} parts of {samples} samples in all, between gaps, are too short to be used, and left out")
+    return kept
 
 
 def divide(
