@@ -141,7 +141,9 @@ def _finite(table: Table) -> CheckResult:
         return _verdict("finite", Severity.FAIL, f"{stamps} stamps are not numbers; repair the time channel")
     if not bad:
         return _verdict("finite", Severity.OK, "all values are finite")
-    text = "values that are not finite: " + ", ".join(f"{name} {count}" for name, (count, _) in bad.items())
+    text = "values that are not finite: " + ", ".join(
+        f"{name} ({count} samples)" for name, (count, _) in bad.items()
+    )
     worst = max((count for count, kind in bad.values() if kind == "position"), default=0)
     targets = any(kind == "target" for _, kind in bad.values())
     if targets or worst > MAX_NAN * table.time_s.size:

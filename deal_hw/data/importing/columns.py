@@ -211,7 +211,8 @@ class ColumnMap:
     """What the channels of a file mean.
 
     Attributes:
-        time: Time of the measured samples.
+        time: Time of the measured samples; None: the channel with the name of a time, such as LeRobot's
+            timestamp.
         joints: The joints, in the order of the file's arrays.
         position: Channel pattern: with ``{joint}`` one channel per joint, without it one array for all.
         target: The same for commanded positions.
@@ -223,7 +224,7 @@ class ColumnMap:
         source: Origin of the map: a file, or a guess.
     """
 
-    time: TimeColumn
+    time: TimeColumn | None
     joints: tuple[JointColumns, ...]
     position: str | None = None
     target: str | None = None
@@ -272,18 +273,17 @@ def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
     """Return the column map in plain YAML values; errors as :func:`read_column_map`."""
     entries = {field.name for field in fields(ColumnMap)} - {"source"}
     top = _mapping("column map", values, entries | {"unit", "target_unit"})
-    for name in ("time", "joints"):
-        if name not in top:
-            raise ConfigurationError(
-                f"column map: {name!r} is missing; it has {', '.join(sorted(top)) or 'nothing'}"
-            )
+    if "joints" not in top:
+        raise ConfigurationError(
+            f"column map: 'joints' is missing; it has {', '.join(sorted(top)) or 'nothing'}"
+        )
     if not isinstance(top["joints"], list):
         raise ConfigurationError("column map: joints is a list of names or of mappings with a name")
     defaults = {name: str(top[name]) for name in ("unit", "target_unit") if top.get(name) is not None}
     command_time = top.get("command_time")
     patterns = {name: _text(name, top.get(name)) for name in _CHANNELS}
     return ColumnMap(
-        time=_time("time", top["time"]),
+        time=None if top.get("time") is None else _time("time", top["time"]),
         command_time=None if command_time is None else _time("command_time", command_time),
         joints=tuple(_joint(entry, defaults) for entry in top["joints"]),
         orientation=_vector("orientation", top.get("orientation"), 4),

@@ -212,7 +212,10 @@ def _guess(channels: Channels, joints: Sequence[str] | None, say: Say | None) ->
 
 
 _INCOMPLETE = "a column map to start from; save it as columns.yaml, and replace COLUMN:"
-_GUESSED = "no column map given; this one was guessed (to change it, save it and name it by --columns):"
+_GUESSED = (
+    "no column map given; this one was guessed (to change it, save it and name it by --columns, in Python by "
+    "columns=):"
+)
 
 
 def _say_map(

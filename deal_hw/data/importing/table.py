@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
+from deal_hw.data.importing.guess import guess_time, unguessed
 from deal_hw.data.importing.wraps import nearest_turn, unwrap
 from deal_hw.data.recording.spikes import position_units
 from deal_hw.errors import DatasetError, short
@@ -252,7 +253,10 @@ def _ordered(
 
 def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArray]:
     """Return the stamps of samples and commands since the first sample, (T,) and (C,) [s]."""
-    raw, unit = channels.column(columns.time.column), TIME_UNITS[columns.time.unit]
+    time = columns.time or guess_time(channels)
+    if time is None:
+        raise unguessed(channels, "which channel is the time")
+    raw, unit = channels.column(time.column), TIME_UNITS[time.unit]
     finite = raw[np.isfinite(raw)]
     # The first one is subtracted before scaling: an epoch in ns times 1e-9 has a resolution of only 0.2 us.
     zero = float(finite[0]) if finite.size else 0.0

@@ -32,7 +32,7 @@ class JointFacts:
         command: Lowest and highest command by the actuator's ctrlrange, as in recordings (positions, or
             efforts at the joint), (J, 2); infinite for none.
         full_effort: Effort of each joint's motor at its highest command, or at 1 without a ctrlrange, (J,)
-            [N or N·m]; NaN without a motor.
+            [N or N·m]; NaN without a motor, or with one whose force also depends on the motion.
     """
 
     names: tuple[str, ...]
@@ -101,7 +101,8 @@ def _actuation(
         if not closes:
             full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
             most = np.max(np.abs(model.actuator_ctrlrange[actuator])) if limited else 1.0
-            full_effort[at] = abs(full) * most
+            if not model.actuator_biasprm[actuator].any():
+                full_effort[at] = abs(full) * most
         if limited:
             command[at] = np.sort(model.actuator_ctrlrange[actuator] * full)
     return servo, motor, command, full_effort

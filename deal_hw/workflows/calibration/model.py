@@ -211,8 +211,8 @@ def parts_to_calibrate(
         InsufficientDataError: The recordings are too short, do not move, or do not depend on a parameter.
     """
     config, std = settings.recordings, settings.known_std(robot)
-    episodes, judge = without_scraps(episodes, say), without_scraps(judge, say)
     parts, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
+    parts, judge = without_scraps(parts, say), without_scraps(judge, say)
     warn_of_gravity(robot, space, parts, say)
     space = sensitive_parameters(robot, space, parts, std, config.window, settings.threads, say)
     return space, parts, judge

@@ -61,7 +61,7 @@ def kinds_of(facts: JointFacts) -> JointKinds:
     """Return which joints of a model slide, and which have motors."""
     from deal_hw.data.importing.columns import JointKinds
 
-    motors = zip(facts.names, facts.motor & ~facts.servo, facts.full_effort, strict=True)
+    motors = zip(facts.names, ~facts.servo & np.isfinite(facts.full_effort), facts.full_effort, strict=True)
     return JointKinds(
         slides=frozenset(n for n, unit in zip(facts.names, facts.units, strict=True) if unit == "m"),
         motors={name: float(full) for name, motor, full in motors if motor},
@@ -236,7 +236,7 @@ def without_scraps(episodes: Sequence[SampledEpisode], say: Callable[[str], None
     if not kept or not short:
         return list(episodes)
     samples = sum(len(e.sample) for e in episodes) - sum(len(e.sample) for e in kept)
-    say(f"{short} parts of {samples} samples in all, between gaps, are too short to be used, and left out")
+    say(f"left out: {short} parts between gaps, of {samples} samples in all, which are too short to be used")
     return kept
 
 
