@@ -20,9 +20,9 @@ Of each row it reads (CSV, or NPZ arrays of the same names):
 The potentiometer does not read as the log says. Hanging still is at 1209.82 counts, and a count is 0.001467
 rad (swings of a known centre, both sides of the blind angle), where the log has 2 pi / 4096. Over about 0.26
 rad the slider touches nothing: the first and the last counts, below 8 and above 4086, are no angles, and
-their rows are left out. The angle is unwrapped; 0 is upright, as in the model. `--as-logged` keeps the log's
-angle instead, which wraps at +-pi, all rows, and the normalised command: what `deal-hw data import` says of
-these is worth reading.
+their rows are left out. So is a last reading before them that the sensor holds. The angle is unwrapped; 0 is
+upright, as in the model. `--as-logged` keeps the log's angle instead, which wraps at +-pi, all rows, and the
+normalised command: what `deal-hw data import` says of these is worth reading.
 
 Calibrate and import as the recordings of any robot:
 
@@ -51,6 +51,8 @@ HANGING_COUNT = 1209.82
 RAD_PER_COUNT = 0.001467
 FIRST_COUNT, LAST_COUNT = 8, 4086
 """Counts that are angles; the others are read while the slider crosses the gap of its track."""
+MOVES_COUNTS, HELD = 20, 0.3
+"""A reading is held if it changes by less than this share of a step of more than so many counts."""
 FULL_PULSE = 4307.69
 FULL_N = 2.62
 """Force of the motor at full power, by the project's own model [N]."""
@@ -94,6 +96,9 @@ MODEL = """\
 """
 
 
+Mask = np.ndarray[Any, np.dtype[np.bool_]]
+
+
 @dataclass(frozen=True, slots=True)
 class Log:
     """The columns of one recording that are used, (T,) each.
@@ -131,21 +136,38 @@ def read_log(path: Path) -> Log:
     return Log(*(channels.column(name) for name in names))
 
 
-def repaired(log: Log) -> tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], FloatArray]:
+def repaired(log: Log) -> tuple[Mask, FloatArray]:
     """Return which rows have an angle, (T,), and the unwrapped angles of these [rad], 0 upright."""
     sound = (log.count >= FIRST_COUNT) & (log.count <= LAST_COUNT)
     return sound, np.unwrap((log.count[sound] - HANGING_COUNT) * RAD_PER_COUNT - np.pi)
 
 
+def held(log: Log, sound: Mask) -> Mask:
+    """Return which rows repeat the angle before them because the slider has left its track, (T,).
+
+    The last reading before the gap sometimes does: 0.14 rad off, a hundred times the noise.
+    """
+    found = np.zeros(sound.size, dtype=bool)
+    for k in range(2, sound.size - 1):
+        if sound[k - 2 : k + 1].all() and not sound[k + 1]:
+            before, last = np.abs(np.diff(log.count[k - 2 : k + 1]))
+            found[k] = before > MOVES_COUNTS and last < HELD * before
+    return found
+
+
 def arrays(log: Log, as_logged: bool = False) -> dict[str, Any]:
-    """Return the arrays of the NPZ file."""
+    """Return the arrays of the NPZ file; ``every_`` ones include held angles, for tools/score_cartpole.py."""
     if as_logged:
         return {"time": log.sent_s, "position": log.position_m, "angle": log.angle, "Q": log.power}
     sound, angle = repaired(log)
+    kept = ~held(log, sound)[sound]
     return {
-        "time": log.sent_s[sound],
-        "cart_position": log.position_m[sound],
-        "pole_angle": angle,
+        "time": log.sent_s[sound][kept],
+        "cart_position": log.position_m[sound][kept],
+        "pole_angle": angle[kept],
+        "every_time": log.sent_s[sound],
+        "every_cart_position": log.position_m[sound],
+        "every_pole_angle": angle,
         "command_time": log.sent_s,
         "cart_force": log.force_n,
     }

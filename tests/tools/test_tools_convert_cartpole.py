@@ -47,7 +47,18 @@ def test_an_angle_is_repaired_and_its_command_is_in_newtons(tmp_path: Path) -> N
     np.testing.assert_allclose(table.position[0, 1], 0.18 * 0.001467 - np.pi)
     # 4086 is (4086 - 1209.82) 0.001467 - pi = 1.078; 8 lies behind the gap: (8 - 1209.82) 0.001467 + pi.
     np.testing.assert_allclose(table.position[4:6, 1], [1.07776, 1.37852], atol=1e-4)
-    assert not (out / "other").exists()
+
+
+def test_a_held_reading_before_the_gap_is_no_angle(tmp_path: Path) -> None:
+    """118 to 12 counts, then 12 again: left out of the fit, kept in the score. A slow pole repeats itself."""
+    fast, slow = [360, 233, 118, 12, 12, 4092, 4024, 3966], [40, 30, 20, 12, 12, 2, 4080]
+    counts = [2000] * 5 + fast + slow + [2000] * 5
+    out = tmp_path / "out"
+    assert convert_cartpole.main([str(log(tmp_path, counts)), "--out", str(out)]) == 0
+    with np.load(out / "Experiment-0.npz") as file:
+        np.testing.assert_allclose(np.setdiff1d(file["every_time"], file["time"]), [5 + 0.02 * 9])
+        assert len(file["every_time"]) == len(counts) - 2
+    assert score_cartpole.read(out / "Experiment-0.npz").measured.sum() == len(counts) - 2
 
 
 def test_as_logged_keeps_angle_and_power(tmp_path: Path) -> None:
