@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from deal_hw.calib.data.problem import Problem, WindowData, longest_windows, tak
 from deal_hw.calibration import SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.engine.batch import COMMAND_DELAY
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 
@@ -32,6 +33,9 @@ def check_delays(problem: Problem) -> None:
 
 def check_excitation(problem: Problem) -> None:
     """Check that the recordings are long enough and that every joint moves.
+
+    Where no command ever changes and the actuators are motors, the motion is that of the joints alone (a free
+    swing). Then one moving joint is enough.
 
     Raises:
         InsufficientDataError: They are not; the message says what was found and what to record.
@@ -61,16 +65,20 @@ def check_excitation(problem: Problem) -> None:
         for name, span, noise in zip(names, spans, noises, strict=True)
         if span < least * noise
     ]
-    if still:
+    changes = target_changes(problem.episodes)
+    passive = changes == 0 and problem.robot.description.actuation == "motor"
+    if still and not (passive and len(still) < len(names)):
         raise InsufficientDataError(f"the recording hardly moves: {'; '.join(still)}; {advice}")
-    changes = sum(
-        int(np.count_nonzero(np.any(np.diff(e.target, axis=0) != 0, axis=1))) for e in problem.episodes
-    )
-    if changes < settings.fewest_changes:
+    if changes < settings.fewest_changes and not passive:
         raise InsufficientDataError(
             f"the position target changed {changes} times, at least {settings.fewest_changes} are needed; "
             f"{advice}"
         )
+
+
+def target_changes(episodes: Sequence[SampledEpisode]) -> int:
+    """Return how often the commands change in recordings."""
+    return sum(int(np.count_nonzero(np.any(np.diff(e.target, axis=0) != 0, axis=1))) for e in episodes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

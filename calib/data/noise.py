@@ -14,7 +14,7 @@ from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
@@ -31,6 +31,8 @@ class DataSettings:
         noise_free_std: Positions with less noise are taken as exact [m or rad].
         noise_free_residual: Residual scale of noise-free recordings [m or rad]: far above rounding, far below
             sensors.
+        held_std: Noise of a position that never changes, which shows none [m or rad]: a count of a coarse
+            encoder. Without it such a joint would outweigh all that move.
         noise_order: Order of the differences that remove smooth motion and leave white noise.
         speed_bins: Number of bins of equal speed in which noise is estimated.
         fewest_in_bin: Fewest samples per bin for an estimate of jitter.
@@ -52,6 +54,7 @@ class DataSettings:
     resolution: float = 1e-6
     noise_free_std: float = 2e-5
     noise_free_residual: float = 1e-5
+    held_std: float = 1e-3
     noise_order: int = 6
     speed_bins: int = 10
     fewest_in_bin: int = 20
@@ -96,75 +99,100 @@ class NoiseModel:
 
 
 def white_noise_std(
-    values: FloatArray, settings: DataSettings = SETTINGS, reported: Mask | None = None
+    parts: Sequence[FloatArray], settings: DataSettings = SETTINGS, reported: Sequence[Mask | None] = ()
 ) -> FloatArray:
-    """Estimate the standard deviation of white noise on top of smooth motion, (J,), from samples (T, J).
+    """Estimate the standard deviation of white noise on top of smooth motion, (J,), from parts (T, J) each.
 
     The sixth difference of a smooth motion nearly vanishes. That of white noise with variance s^2 has
     variance 924 s^2 (the sum of the squared binomial coefficients). The median ignores impacts and
-    stick-slip. Samples that filled a gap, False in ``reported``, (T,), are smooth and do not count.
+    stick-slip. It is taken over the differences of all parts together: a sensor does not change with the
+    place where a recording is cut, and a part with few samples hardly counts. Samples that filled a gap,
+    False in ``reported``, (T,) for each part, are smooth and do not count. Nor do stretches of one constant
+    value: a joint at rest on a count of its encoder shows no noise.
     """
-    order, floor = settings.noise_order, np.maximum(_rounding_std(values, reported), settings.floor)
-    whole = _whole(len(values), order, reported)
-    if whole.sum() <= order:
-        return np.asarray(floor)
-    return np.maximum(_spread(np.diff(values, n=order, axis=0)[whole], order), floor)
+    masks = reported or [None] * len(parts)
+    differences = _differences(parts, settings.noise_order, masks)
+    rounding = _rounding_std(parts, masks, settings)
+    found = [_spread(d, settings.noise_order) if len(d) else 0.0 for d, _ in differences]
+    first = next((x[0] for x in parts if len(x)), None)
+    held = np.all([np.all(x == first, axis=0) for x in parts], axis=0)
+    least = np.where(held, settings.held_std, settings.floor)
+    return np.maximum(np.maximum(found, rounding), least)
 
 
-def _rounding_std(values: FloatArray, reported: Mask | None) -> FloatArray:
+def _rounding_std(
+    parts: Sequence[FloatArray], reported: Sequence[Mask | None], settings: DataSettings
+) -> FloatArray:
     """Return the noise of rounding to an encoder's counts, (J,): the least step between values over sqrt(12).
 
-    The median of the differences misses it where the joint moves less than a count per sample.
+    The values of all parts count together: few samples of a fast motion lie many counts apart. Values that
+    differ by less than the wire's resolution are one value, such as 0.1 and 0.1 + 2 pi - 2 pi.
     """
-    columns = (values if reported is None else values[reported]).T
-    return np.array([min(np.diff(np.unique(c)), default=0.0) for c in columns]) / math.sqrt(12.0)
+    values = np.concatenate([x if m is None else x[m] for x, m in zip(parts, reported, strict=True)])
+    steps = [np.diff(np.unique(column)) for column in values.T]
+    least = settings.resolution / 2
+    return np.array([min(s[s > least], default=0.0) for s in steps]) / math.sqrt(12.0)
 
 
-def _whole(count: int, order: int, reported: Mask | None) -> Mask:
-    """Return which differences contain no filled sample, (T - order,)."""
-    if reported is None or count <= order:
-        return np.ones(max(count - order, 0), dtype=bool)
-    return np.asarray(sliding_window_view(reported, order + 1).all(axis=1))
+def _differences(
+    parts: Sequence[FloatArray], order: int, reported: Sequence[Mask | None]
+) -> list[tuple[FloatArray, IntArray]]:
+    """Return the differences of each of J columns that show noise, and their rows among those of all parts.
+
+    Part by part there are ``T - order`` rows.
+    """
+    tried = [(x, m) for x, m in zip(parts, reported, strict=True) if len(x) > order]
+    if not tried:
+        return [(np.empty(0), np.empty(0, dtype=np.int64))] * parts[0].shape[1]
+    every = np.concatenate([np.diff(x, n=order, axis=0) for x, _ in tried])
+    moving = [sliding_window_view(np.diff(x, axis=0) != 0, order, axis=0).any(axis=-1) for x, _ in tried]
+    whole = [
+        np.ones(len(x) - order, dtype=bool) if m is None else sliding_window_view(m, order + 1).all(axis=1)
+        for x, m in tried
+    ]
+    shows = np.concatenate(moving) & np.concatenate(whole)[:, None]
+    rows = [np.flatnonzero(column) for column in shows.T]
+    return [(every[row, j], row) for j, row in enumerate(rows)]
 
 
-def _spread(difference: FloatArray, order: int) -> FloatArray:
-    centred = np.abs(difference - np.median(difference, axis=0))
-    return np.asarray(MAD_TO_STD * np.median(centred, axis=0) / math.sqrt(math.comb(2 * order, order)))
+def _spread(difference: FloatArray, order: int) -> float:
+    """Return the standard deviation of the noise that leaves these differences, (n,)."""
+    centred = np.abs(difference - np.median(difference))
+    return MAD_TO_STD * float(np.median(centred)) / math.sqrt(math.comb(2 * order, order))
 
 
 def noise_model(
-    positions: list[FloatArray],
-    velocities: list[FloatArray],
+    positions: Sequence[FloatArray],
+    velocities: Sequence[FloatArray],
     settings: DataSettings = SETTINGS,
-    reported: Sequence[Mask | None] | None = None,
+    reported: Sequence[Mask | None] = (),
 ) -> NoiseModel:
     """Estimate noise and timing jitter from positions and smoothed velocities of recordings, (T, J) each.
 
-    The noise is estimated in bins of equal speed, joint by joint. A straight line is fitted to its square
-    over the squared speed. The intercept is the noise at rest; the slope, shared by all joints, is the
-    jitter's variance. ``reported`` holds a mask for each recording, as in :func:`white_noise_std`.
+    The noise is estimated in bins of equal speed, joint by joint, over all recordings together. A straight
+    line is fitted to its square over the squared speed. The intercept is the noise at rest; the slope, shared
+    by all joints, is the jitter's variance. ``reported`` holds a mask for each recording, as in
+    :func:`white_noise_std`.
     """
     order, bins, floor = settings.noise_order, settings.speed_bins, settings.floor
     masks = reported or [None] * len(positions)
-    whole = np.max(
-        [white_noise_std(x, settings, mask) for x, mask in zip(positions, masks, strict=True)], axis=0
-    )
-    kept = [_whole(len(x), order, mask) for x, mask in zip(positions, masks, strict=True)]
-    usable = [i for i, one in enumerate(kept) if one.sum() > bins * settings.fewest_in_bin - order]
-    if not usable or np.all(whole <= 10 * floor):
+    whole = white_noise_std(positions, settings, masks)
+    differences = _differences(positions, order, masks)
+    fewest = bins * settings.fewest_in_bin - order
+    if all(len(d) <= fewest for d, _ in differences) or np.all(whole <= 10 * floor):
         return NoiseModel(whole, 0.0)
-    difference = np.concatenate([np.diff(positions[i], n=order, axis=0)[kept[i]] for i in usable])
     middle = order // 2
-    speed2 = np.concatenate(
-        [velocities[i][middle : middle + len(velocities[i]) - order][kept[i]] ** 2 for i in usable]
-    )
+    speed2 = np.concatenate([v[middle : middle + len(v) - order] ** 2 for v in velocities if len(v) > order])
+    rounding = _rounding_std(positions, masks, settings)
     slopes, weights = [], []
-    lines: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    rounding = np.max([_rounding_std(x, mask) for x, mask in zip(positions, masks, strict=True)], axis=0)
-    for j in range(positions[0].shape[1]):
-        parts = np.array_split(np.argsort(speed2[:, j]), bins)
-        x = np.array([speed2[part, j].mean() for part in parts])
-        y = np.array([float(_spread(difference[part, j : j + 1], order)[0]) ** 2 for part in parts])
+    lines: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}
+    for j, (difference, rows) in enumerate(differences):
+        if len(difference) <= fewest:
+            continue
+        squared = speed2[rows, j]
+        parts = np.array_split(np.argsort(squared), bins)
+        x = np.array([squared[part].mean() for part in parts])
+        y = np.array([_spread(difference[part], order) ** 2 for part in parts])
         y = np.maximum(y, rounding[j] ** 2)
         # The median of n samples gives a variance to about 2.3 / sqrt(n), relative; neighbouring differences
         # share samples.
@@ -172,13 +200,15 @@ def noise_model(
         slope, error = _slope(x, y, sigma)
         slopes.append(slope)
         weights.append(1.0 / error**2)
-        lines.append((x, y, sigma))
+        lines[j] = x, y, sigma
     variance = float(np.average(slopes, weights=weights))
     error = float(1.0 / math.sqrt(sum(weights)))
     if variance < settings.certain * error:
         return NoiseModel(whole, 0.0)
-    rest = [max(float(np.average(y - variance * x, weights=1 / s**2)), floor**2) for x, y, s in lines]
-    return NoiseModel(np.sqrt(rest), math.sqrt(variance))
+    rest = whole.copy()
+    for j, (x, y, s) in lines.items():
+        rest[j] = math.sqrt(max(float(np.average(y - variance * x, weights=1 / s**2)), floor**2))
+    return NoiseModel(rest, math.sqrt(variance))
 
 
 def _slope(x: FloatArray, y: FloatArray, sigma: FloatArray) -> tuple[float, float]:
@@ -263,6 +293,11 @@ def smooth_states(
     return StartStates(position, velocity, std)
 
 
+def smoothed_samples(period_s: float, settings: DataSettings = SETTINGS) -> int:
+    """Return the number of samples of a smoothing polynomial; no shorter recording can be used."""
+    return max(2 * round(settings.smoothing_s / period_s / 2) + 1, settings.fewest_smoothed)
+
+
 def _local_polynomials(
     values: FloatArray, period_s: float, settings: DataSettings
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -272,7 +307,7 @@ def _local_polynomials(
         Values and slopes, (T, n), and the gain of each on white noise, (T,).
     """
     T, order = len(values), settings.smoothing_order
-    length = max(2 * round(settings.smoothing_s / period_s / 2) + 1, settings.fewest_smoothed)
+    length = smoothed_samples(period_s, settings)
     half = length // 2
     if length > T:
         raise InsufficientDataError(

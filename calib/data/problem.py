@@ -182,10 +182,9 @@ class Problem:
         if self.noise_free:
             return np.full(2 * self.coordinates, self.settings.noise_free_residual)
         found = np.full(2 * self.coordinates, floor)
-        for e in self.episodes:
-            values = np.concatenate([e.position, e.velocity], axis=1)[:, self.channels]
-            std = white_noise_std(values, self.settings, e.reported)
-            found[self.channels] = np.maximum(found[self.channels], std)
+        values = [np.concatenate([e.position, e.velocity], axis=1)[:, self.channels] for e in self.episodes]
+        reported = [e.reported for e in self.episodes]
+        found[self.channels] = white_noise_std(values, self.settings, reported)
         return self._with_given_noise(found, np.arange(2 * self.coordinates))
 
     def _noise_model(self) -> NoiseModel:

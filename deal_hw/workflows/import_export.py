@@ -12,7 +12,7 @@ from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.ranges import Checked, Range
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
-from deal_hw.workflows.calibration.recordings import on_grid
+from deal_hw.workflows.calibration.recordings import at_rest_without_commands, kinds_of, on_grid
 from deal_hw.workflows.options import given, refuse
 from deal_hw.workflows.robot import is_ours, load_robot, recorded_robot
 from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
@@ -102,7 +102,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     told = columns is not None or described is not None or facts is not None
     episodes, foreign = ([], list(config.paths)) if told else _as_recorded(config, say)
     said: dict[str, str] = {}
-    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, said)]
+    kinds = None if facts is None else kinds_of(facts)
+    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, said, kinds)]
+    if facts is not None:
+        tables = at_rest_without_commands(tables, facts, say)
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
     if episodes:
         described = dict(episodes[0].description)
@@ -233,7 +236,7 @@ def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
     if facts is None:
         return True
     at = [facts.names.index(name) for name in table.actuated]
-    return bool(facts.servo[at].any() or not facts.motor[at].any())
+    return bool(at) and bool(facts.servo[at].any() or not facts.motor[at].any())
 
 
 def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, str]:

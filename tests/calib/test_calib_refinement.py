@@ -248,7 +248,7 @@ def test_white_noise_is_measured_under_motion() -> None:
     """0.3 mm of noise on a 5 cm swing at 1 Hz is found within 15 %."""
     t = np.arange(800) * 5e-3
     values = 0.05 * np.sin(2 * np.pi * t)[:, None] + np.random.default_rng(0).normal(0, 3e-4, (800, 1))
-    assert white_noise_std(values)[0] == pytest.approx(3e-4, rel=0.15)
+    assert white_noise_std([values])[0] == pytest.approx(3e-4, rel=0.15)
 
 
 def test_what_was_filled_in_is_not_taken_for_quiet_samples() -> None:
@@ -259,8 +259,50 @@ def test_what_was_filled_in_is_not_taken_for_quiet_samples() -> None:
     reported = np.ones(t.size, dtype=bool)
     reported[5:-5:12] = False
     values[~reported] = CubicSpline(t[reported], values[reported])(t[~reported])
-    assert white_noise_std(values)[0] < 0.9 * 3e-4
-    assert white_noise_std(values, reported=reported)[0] == pytest.approx(3e-4, rel=0.1)
+    assert white_noise_std([values])[0] < 0.9 * 3e-4
+    assert white_noise_std([values], reported=[reported])[0] == pytest.approx(3e-4, rel=0.1)
+
+
+def _encoder(seconds: float, rest_s: float = 0.0) -> FloatArray:
+    """Return a swing of a 12-bit encoder with 2 mrad of noise at 50 Hz, (T, 1), after a rest."""
+    t = np.arange(-rest_s, seconds, 0.02)
+    motion = 2.5 * np.sin(2 * np.pi * 0.9 * np.maximum(t, 0.0))
+    noise = np.random.default_rng(3).normal(0, 2e-3, t.size) * (t >= 0)
+    count = 2 * np.pi / 4096
+    return np.asarray(np.round((motion + noise) / count) * count)[:, None]
+
+
+@given(st.lists(st.integers(1, 1999), min_size=1, max_size=12, unique=True))
+def test_cutting_a_recording_changes_its_noise_by_little(cuts: list[int]) -> None:
+    """Each cut loses six differences of 2000, whatever the shortest part: less than a tenth in all."""
+    values = _encoder(40.0)
+    parts = np.split(values, sorted(cuts))
+    whole = white_noise_std([values])[0]
+    assert whole == pytest.approx(np.hypot(2e-3, 2 * np.pi / 4096 / np.sqrt(12)), rel=0.1)
+    assert white_noise_std(parts)[0] == pytest.approx(whole, rel=0.1)
+    speeds = [np.gradient(values[:, 0], 0.02)[:, None]]
+    model = noise_model([values], speeds)
+    divided = noise_model(parts, np.split(speeds[0], sorted(cuts)))
+    assert divided.position_std[0] == pytest.approx(model.position_std[0], rel=0.2)
+
+
+def test_a_part_of_a_fast_motion_does_not_tell_the_rounding() -> None:
+    """Twenty samples of a fast swing lie 80 counts apart or more, which is no rounding."""
+    values = _encoder(10.0)
+    parts = np.split(values, (18, 38))
+    assert np.min(np.diff(np.unique(parts[1]))) > 80 * 2 * np.pi / 4096
+    assert white_noise_std(parts)[0] == pytest.approx(white_noise_std([values])[0], rel=0.1)
+
+
+def test_a_joint_at_rest_has_no_vote() -> None:
+    """A joint held on one count of its encoder for a minute shows no noise; its swing of 10 s does."""
+    moved, held = _encoder(10.0), _encoder(0.0, rest_s=60.0)
+    assert np.ptp(held) == 0
+    found = white_noise_std([moved])[0]
+    assert white_noise_std([held, moved])[0] == found
+    assert white_noise_std([_encoder(10.0, rest_s=60.0)])[0] == pytest.approx(found, rel=0.1)
+    # Alone it shows nothing, and nothing counts but the rounding on the wire.
+    assert white_noise_std([held])[0] < 1e-6
 
 
 def test_timing_jitter_is_told_from_noise() -> None:

@@ -409,7 +409,7 @@ MOTOR = """
 """
 
 
-def test_motors_take_torques(tmp_path: Path) -> None:
+def test_motors_take_torques(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A motor of gear -2 recorded by its torque in N·m: the hidden damping is found within 5 %."""
     (tmp_path / "wheel.xml").write_text(MOTOR)
     hidden = mujoco.MjModel.from_xml_string(MOTOR.replace('damping="0.08"', 'damping="0.2"'))
@@ -427,6 +427,13 @@ def test_motors_take_torques(tmp_path: Path) -> None:
     )
     (tmp_path / "params.yaml").write_text("parameters: [{kind: dof_damping, elements: hub}]\n")
     words = command(tmp_path, "--latency", "0", "--quiet", "--no-report", model="wheel.xml")
+    # Commands within -1..1 may be a share of 2 N·m, too.
+    assert main([*words, "--out", str(tmp_path / "out")]) == EXIT_ERROR
+    assert "target_unit: Nm" in capsys.readouterr().err
+    (tmp_path / "columns.yaml").write_text(
+        "time: time\nposition: '{joint}_pos'\ntarget: '{joint}_cmd'\njoints: [{name: hub, target_unit: Nm}]\n"
+    )
+    words += ["--columns", str(tmp_path / "columns.yaml")]
     assert main([*words, "--out", str(tmp_path / "out")]) == EXIT_OK
     found = json.loads((tmp_path / "out" / "calibration" / "result.json").read_text())
     assert found["parameters"]["hub.damping"]["estimate"] == pytest.approx(0.2, rel=0.05)

@@ -288,7 +288,7 @@ HOURS = {"column": "t", "unit": "h"}
     ("values", "error", "words"),
     [
         ([], ConfigurationError, "not a mapping"),
-        ({"joints": ["a"]}, ConfigurationError, "'time' is missing"),
+        ({"time": "t"}, ConfigurationError, "'joints' is missing"),
         ({"time": "t", "joints": ["a"], "colour": 1}, UnknownNameError, "'colour'"),
         ({"time": HOURS, "joints": ["a"]}, UnknownNameError, "'h'; known: s, ms, us, ns"),
         ({"time": "t", "joints": []}, ConfigurationError, "at least one"),
@@ -388,3 +388,28 @@ def test_unknown_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="cannot tell which channels are the joints' positions"):
         load_tables(write(tmp_path / "b.csv", "time,b\n1,2\n"))
     assert json.dumps(load_tables(write(tmp_path / "c.csv", "time,a_pos\n0,2\n1,3\n"))[0].source)
+
+
+def test_a_map_without_a_time_takes_the_channel_of_that_name(tmp_path: Path) -> None:
+    """LeRobot's timestamp, a file's time_ms; without one the message asks for it."""
+    columns = parse_column_map({"joints": [{"name": "a", "position": "q"}]})
+    (table,) = load_tables(write(tmp_path / "a.csv", "time_ms,q\n0,1\n20,2\n"), columns)
+    assert table.time_s.tolist() == [0.0, 0.02]
+    with pytest.raises(DatasetError, match="cannot tell which channel is the time"):
+        load_tables(write(tmp_path / "b.csv", "zeit,q\n0,1\n20,2\n"), columns)
+
+
+def test_doubled_columns_and_other_kinds_of_file_are_named(tmp_path: Path) -> None:
+    """Which column is doubled; that a file called .mcap is none; that one ends in the middle."""
+    with pytest.raises(DatasetError, match="'b', 'c' stand there more than once"):
+        load_tables(write(tmp_path / "a.csv", "time,b,c,b,c\n0,1,2,3,4\n"))
+    with pytest.raises(DatasetError, match=r"begins with b'no mcap', MCAP with .*another kind of file"):
+        read_mcap(write(tmp_path / "x.mcap", "no mcap"))
+    whole = joint_states(tmp_path / "bag.mcap", [("left", "right")] * 9).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[:60])
+    with pytest.raises(DatasetError, match=r"cut.mcap cannot be read as MCAP") as refused:
+        read_mcap(tmp_path / "cut.mcap")
+    assert "unpack requires" not in str(refused.value)
+    (tmp_path / "magic.mcap").write_bytes(whole[:12])
+    with pytest.raises(DatasetError, match="in the middle of a record"):
+        read_mcap(tmp_path / "magic.mcap")

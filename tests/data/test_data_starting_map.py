@@ -102,3 +102,13 @@ def test_a_guess_is_printed_as_the_map_that_says_the_same(header: str, tmp_path:
     np.testing.assert_array_equal(read.target, guessed.target)
     np.testing.assert_array_equal(read.time_s, guessed.time_s)
     assert (read.velocity is None) == (guessed.velocity is None)
+
+
+def test_a_channel_that_is_in_the_file_is_filled_in(tmp_path: Path) -> None:
+    """The stick's position has a name of its own, its target not: only the position was not found."""
+    path = tmp_path / "a.csv"
+    path.write_text("time,boom_pos,boom_cmd,s7,stick_cmd\n0,1,2,3,4\n0.1,5,6,7,8\n", encoding="utf-8")
+    assert printed(path)[2:] == [
+        '    - {name: "boom", position: "boom_pos", target: "boom_cmd", unit: "rad"}',
+        '    - {name: "stick", position: COLUMN, target: "stick_cmd", unit: rad}',
+    ]

@@ -182,3 +182,14 @@ def test_gravity_tells_a_gain_and_its_sign(tmp_path: Path) -> None:
     assert found.load[1] == pytest.approx(0.0, abs=1e-9)
     mirrored = gravity_gain(robot, [hold(robot, (0.1, 0.0), (0.0, 0.0))])
     assert mirrored is not None and mirrored.gain[0] < 0
+
+
+def test_an_actuator_that_drives_no_joint_is_named_as_such(tmp_path: Path) -> None:
+    """A tendon's motor was told to name its target, which it had."""
+    path = tmp_path / "arm.xml"
+    tendon = '<tendon><fixed name="belt"><joint joint="lift" coef="1"/></fixed></tendon>'
+    motor = '<motor name="winch" tendon="belt"/></actuator>'
+    path.write_text(ARM.replace("</actuator>", motor).replace("</mujoco>", tendon + "</mujoco>"))
+    model = load_mjcf(path)
+    with pytest.raises(ConfigurationError, match=r"that drive no joint: winch \(a tendon\)"):
+        describe(path, model, ("lift", "rail"), ("lift", "rail"), sampling(0.02, 0.002, 0.4))

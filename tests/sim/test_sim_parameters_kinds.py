@@ -407,3 +407,16 @@ def test_every_kind_has_its_row_in_the_docs() -> None:
         wanted = [kind.element, kind.unit, "see below" if name == "body_scale" else fields, kind.along]
         assert rows[name] == wanted
     assert all(f"`{field}`" in text for field in KIND_TABLE["body_scale"].writes)
+
+
+def test_gain_of_a_motor_is_its_force_at_the_joint(model: mujoco.MjModel) -> None:
+    """A slide's motor of gear -3: 3 N at a control of 1, where 1 N was printed; 6 N doubles MuJoCo's gain."""
+    kind, index = KIND_TABLE["motor_gain"], model.actuator("cart").id
+    assert kind.baseline is not None
+    assert kind.baseline(model, index) == 3.0 and kind.unit_of(model, index) == "N"
+    changed = _single(model, ParameterSpace([_parameter("motor_gain", nominal=6.0)]), np.array([6.0]))
+    data = mujoco.MjData(changed)
+    data.ctrl[index] = 1.0
+    mujoco.mj_forward(changed, data)
+    assert changed.actuator_gainprm[index, 0] == 2.0
+    assert data.joint("cart").qfrc_actuator[0] == -6.0

@@ -52,6 +52,7 @@ def examine(
     limits: FloatArray | None = None,
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
+    efforts: bool = False,
 ) -> tuple[CheckResult, ...]:
     """Run all checks on a recording; the order is fixed.
 
@@ -63,6 +64,7 @@ def examine(
         limits: Lowest and highest position of each joint in the model, (J, 2) [rad or m]; infinite if free.
         kept: The recording without the left-out parts, in which slips do no harm.
         spikes: Definition of a spike.
+        efforts: Commands are efforts of motors: where they never change, the joints move by themselves.
     """
     first = [_size(table), _finite(table), _clock(table)]
     if any(verdict.severity is Severity.FAIL for verdict in first):
@@ -73,8 +75,8 @@ def examine(
         return (*first, rate)
     jumps = spikes_verdict(table.time_s, table.position, table.joint_names, table.units, spikes)
     table = despiked(table, spikes)
-    middle = [rate, _gaps(clock), jumps, _frozen(table), speed_verdict(table), _commands(table)]
-    if not table.command_s.size:
+    middle = [rate, _gaps(clock), jumps, _frozen(table), speed_verdict(table), _commands(table, efforts)]
+    if not table.command_s.size or not table.actuated:
         return (*first, *middle)
     return (
         *first,
@@ -139,7 +141,9 @@ def _finite(table: Table) -> CheckResult:
         return _verdict("finite", Severity.FAIL, f"{stamps} stamps are not numbers; repair the time channel")
     if not bad:
         return _verdict("finite", Severity.OK, "all values are finite")
-    text = "values that are not finite: " + ", ".join(f"{name} {count}" for name, (count, _) in bad.items())
+    text = "values that are not finite: " + ", ".join(
+        f"{name} ({count} samples)" for name, (count, _) in bad.items()
+    )
     worst = max((count for count, kind in bad.values() if kind == "position"), default=0)
     targets = any(kind == "target" for _, kind in bad.values())
     if targets or worst > MAX_NAN * table.time_s.size:
@@ -265,9 +269,12 @@ def _longest_still(table: Table, joint: int) -> float:
     return longest
 
 
-def _commands(table: Table) -> CheckResult:
+def _commands(table: Table, efforts: bool) -> CheckResult:
     if not table.command_s.size:
-        text = "no commanded positions, so nothing can be predicted; name them as `target` in the column map"
+        text = (
+            "no commanded positions, so nothing can be predicted; name them as `target` in the column map. "
+            "If the joints swing freely with their servos off, remove the actuators from a copy of the MJCF"
+        )
         return _verdict("commands", Severity.FAIL, text)
     begin, end = float(table.command_s[0]), float(table.command_s[-1])
     inside = min(end, table.time_s[-1]) - max(begin, table.time_s[0])
@@ -281,7 +288,7 @@ def _commands(table: Table) -> CheckResult:
     still = [
         name for name, span in zip(table.actuated, np.ptp(table.target, axis=0), strict=True) if span == 0
     ]
-    if len(still) == len(table.actuated):
+    if len(still) == len(table.actuated) and not efforts:
         return _verdict("commands", Severity.FAIL, f"{text}; no command ever changes: record a motion")
     return _verdict("commands", Severity.OK, text)
 

@@ -12,11 +12,13 @@ A YAML file such as::
       - {name: jaw, normalised: {from: [0, 100], to: [-0.17, 1.75]}}
 
 A value x of the file becomes ``sign * scale(x) + offset`` in rad or m; offset and sign convert the file's
-zero and direction to the model's, for position and target alike; velocity and effort use the sign only.
+zero and direction to the model's, for position and target alike; velocity, effort and a motor's target,
+which is an effort, use the sign only.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -31,6 +33,8 @@ TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of time -> seconds."""
 POSITION_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0, "mm": 1e-3}
 """Unit of position -> radians or metres."""
+EFFORT_UNITS: Mapping[str, float] = {"N": 1.0, "Nm": 1.0}
+"""Unit of a motor's target -> newtons or newton metres."""
 QUATERNION_ORDERS = ("wxyz", "xyzw")
 
 
@@ -87,12 +91,15 @@ class JointColumns:
         index: Its column in arrays with one column per joint; None: by label, else by its place in the list.
         position, target, velocity, effort: Channels; None: by the map's pattern.
         unit: Unit of position and target, one of :data:`POSITION_UNITS`.
-        target_unit: Unit of the target if it differs; "" for the same.
+        target_unit: Unit of the target if it differs, also one of :data:`EFFORT_UNITS`; "" for the same, or
+            for an effort if a motor drives the joint.
         normalised: Replaces ``unit`` if the file's values have none.
         target_normalised: The same for the target if it differs.
         sign: 1 or -1.
         offset: Added after sign and scale [rad or m].
-        slides: The joint's unit is m; only needed with ``normalised``.
+        slides: The joint's unit is m; only needed with ``normalised``, and without a model.
+        motor: Effort of the motor that drives the joint in the model, at its highest command [N or N·m];
+            None: no motor, or no model. No entry of a file.
     """
 
     name: str
@@ -109,11 +116,21 @@ class JointColumns:
     sign: float = 1.0
     offset: float = 0.0
     slides: bool = False
+    motor: float | None = None
 
     def __post_init__(self) -> None:
-        for unit in (self.unit, self.target_unit or self.unit):
-            if unit not in POSITION_UNITS:
-                raise UnknownNameError("unit of position", unit, POSITION_UNITS)
+        if self.unit not in POSITION_UNITS:
+            raise UnknownNameError("unit of position", self.unit, POSITION_UNITS)
+        if self.target_unit and self.target_unit not in (units := {**POSITION_UNITS, **EFFORT_UNITS}):
+            raise UnknownNameError("unit of a target", self.target_unit, units)
+        if self.slides and self.unit == "deg":
+            raise ConfigurationError(f"joint {self.name!r} slides, but its unit is deg; write m or mm")
+        if self.motor is not None and POSITION_UNITS.get(self.target_unit, 1.0) != 1.0:
+            raise ConfigurationError(
+                f"joint {self.name!r}: target_unit {self.target_unit}, but a motor of the model drives it, "
+                f"so its target is an effort; write target_unit: {self.effort_unit}, or give the model a "
+                "<position>"
+            )
         if self.sign not in (1.0, -1.0) or not math.isfinite(self.offset):
             raise ConfigurationError(
                 f"joint {self.name!r}: sign {self.sign:g}, offset {self.offset:g}; sign is 1 or -1, "
@@ -125,8 +142,28 @@ class JointColumns:
         """Unit of the position after conversion, "rad" or "m"."""
         return "m" if self.slides or self.unit in ("m", "mm") else "rad"
 
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the joint's effort, one of :data:`EFFORT_UNITS`."""
+        return "N" if self.si_unit == "m" else "Nm"
+
+    @property
+    def takes_effort(self) -> bool:
+        """Whether the target is an effort, not a position."""
+        return self.motor is not None or self.target_unit in EFFORT_UNITS
+
+    @property
+    def unit_unsaid(self) -> bool:
+        """Whether a motor's commands may be efforts as well as a share of its full power."""
+        return self.motor is not None and not (self.target_normalised or self.target_unit in EFFORT_UNITS)
+
     def scale(self, target: bool = False) -> tuple[float, float]:
-        """Return slope and constant of the conversion from a file's value to rad or m."""
+        """Return slope and constant of the conversion from a file's value to rad or m, or N or N·m."""
+        if target and self.takes_effort:
+            scale = self.target_normalised
+            slope = 1.0 if scale is None else scale.slope
+            constant = 0.0 if scale is None else scale.robot[0] - slope * scale.file[0]
+            return self.sign * slope, self.sign * constant
         both = self.target_normalised if target and self.target_normalised else self.normalised
         if both is not None and not (target and self.target_unit and not self.target_normalised):
             slope = both.slope
@@ -158,11 +195,25 @@ class Vector:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class JointKinds:
+    """What a model says of its joints.
+
+    Attributes:
+        slides: Those that slide; the others turn.
+        motors: Those driven by a motor, each with its effort at its highest command [N or N·m].
+    """
+
+    slides: frozenset[str] = frozenset()
+    motors: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnMap:
     """What the channels of a file mean.
 
     Attributes:
-        time: Time of the measured samples.
+        time: Time of the measured samples; None: the channel with the name of a time, such as LeRobot's
+            timestamp.
         joints: The joints, in the order of the file's arrays.
         position: Channel pattern: with ``{joint}`` one channel per joint, without it one array for all.
         target: The same for commanded positions.
@@ -174,7 +225,7 @@ class ColumnMap:
         source: Origin of the map: a file, or a guess.
     """
 
-    time: TimeColumn
+    time: TimeColumn | None
     joints: tuple[JointColumns, ...]
     position: str | None = None
     target: str | None = None
@@ -192,6 +243,21 @@ class ColumnMap:
                 f"column map: joints {short(names)}; name each joint once, at least one and at most {NAMES}"
             )
 
+    def for_model(self, kinds: JointKinds) -> ColumnMap:
+        """Return the map with what a model says of its joints: which slide, and which have motors.
+
+        Raises:
+            ConfigurationError: A joint that slides has angles, or a motor's target is a position.
+        """
+        joints = []
+        for joint in self.joints:
+            slides = joint.name in kinds.slides or joint.slides
+            unit = "m" if slides and joint.unit == "rad" else joint.unit
+            joints.append(
+                dataclasses.replace(joint, slides=slides, unit=unit, motor=kinds.motors.get(joint.name))
+            )
+        return dataclasses.replace(self, joints=tuple(joints))
+
 
 def read_column_map(path: Path) -> ColumnMap:
     """Read a column map.
@@ -208,18 +274,17 @@ def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
     """Return the column map in plain YAML values; errors as :func:`read_column_map`."""
     entries = {field.name for field in fields(ColumnMap)} - {"source"}
     top = _mapping("column map", values, entries | {"unit", "target_unit"})
-    for name in ("time", "joints"):
-        if name not in top:
-            raise ConfigurationError(
-                f"column map: {name!r} is missing; it has {', '.join(sorted(top)) or 'nothing'}"
-            )
+    if "joints" not in top:
+        raise ConfigurationError(
+            f"column map: 'joints' is missing; it has {', '.join(sorted(top)) or 'nothing'}"
+        )
     if not isinstance(top["joints"], list):
         raise ConfigurationError("column map: joints is a list of names or of mappings with a name")
     defaults = {name: str(top[name]) for name in ("unit", "target_unit") if top.get(name) is not None}
     command_time = top.get("command_time")
     patterns = {name: _text(name, top.get(name)) for name in _CHANNELS}
     return ColumnMap(
-        time=_time("time", top["time"]),
+        time=None if top.get("time") is None else _time("time", top["time"]),
         command_time=None if command_time is None else _time("command_time", command_time),
         joints=tuple(_joint(entry, defaults) for entry in top["joints"]),
         orientation=_vector("orientation", top.get("orientation"), 4),
@@ -261,7 +326,7 @@ _CHANNELS = ("position", "target", "velocity", "effort")
 def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
     if isinstance(entry, (str, int)):
         entry = {"name": str(entry)}
-    values = _mapping("joint", entry, {field.name for field in fields(JointColumns)})
+    values = _mapping("joint", entry, {field.name for field in fields(JointColumns)} - {"motor"})
     if "name" not in values:
         raise ConfigurationError(f"joint {shown(values)} has no name; give its name in the model")
     name = str(_text("name of a joint", values["name"]))

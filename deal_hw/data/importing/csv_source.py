@@ -61,9 +61,16 @@ def _parse(path: Path, lines: _Lines) -> tuple[dict[str, FloatArray], tuple[str,
         raise DatasetError(f"{path} is empty; a CSV file starts with a line that names its columns")
     delimiter = max(",;\t", key=header.count)
     names = [name.strip() for name in next(csv.reader([header], delimiter=delimiter))]
-    if len(set(names)) != len(names) or all(_is_number(name) for name in names):
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled or all(_is_number(name) for name in names):
+        found = (
+            f"{short(', '.join(map(repr, doubled)), 80)} stand there more than once"
+            if doubled
+            else "it has numbers"
+        )
         raise DatasetError(
-            f"{path}: the first line must name the columns, each once, such as time,elbow_pos,elbow_target"
+            f"{path}: the first line must name the columns, each once, such as time,elbow_pos,elbow_target; "
+            f"{found}"
         )
     if len(names) > NAMES:
         raise DatasetError(f"{path} has {len(names)} columns; {NAMES} are allowed")

@@ -207,15 +207,24 @@ def match_joints(
     return found
 
 
-def _from_columns(
-    channels: Channels, time: TimeColumn, guesses: list[_Guess], joints: Sequence[str] | None
-) -> ColumnMap:
+def channels_of_joints(
+    channels: Channels, time: TimeColumn | None, joints: Sequence[str] | None = None
+) -> dict[str, dict[str, str]]:
+    """Return the channels with a joint's name and a known quantity: by joint, then quantity."""
+    guesses = [_read_name(name, joints or ()) for name in channels.arrays]
+    found = _by_joint(channels, time, guesses, joints)
+    return {name: {role: g.channel for role, g in roles.items()} for name, roles in found.items()}
+
+
+def _by_joint(
+    channels: Channels, time: TimeColumn | None, guesses: list[_Guess], joints: Sequence[str] | None
+) -> dict[str, dict[str, _Guess]]:
     names = {_key(name): name for name in joints} if joints is not None else {}
     found: dict[str, dict[str, _Guess]] = {}
     with_target = {guess.stem for guess in guesses if guess.role == "target"}
     for guess in guesses:
         if (
-            guess.channel == time.column
+            (time is not None and guess.channel == time.column)
             or not guess.role
             or not guess.stem
             or channels.is_wide(guess.channel)
@@ -229,6 +238,13 @@ def _from_columns(
             continue
         name = names.get(key) or next((g.original for g in guesses if g.stem == guess.stem), guess.original)
         found.setdefault(name, {}).setdefault(guess.role, guess)
+    return found
+
+
+def _from_columns(
+    channels: Channels, time: TimeColumn, guesses: list[_Guess], joints: Sequence[str] | None
+) -> ColumnMap:
+    found = _by_joint(channels, time, guesses, joints)
     found = {name: roles for name, roles in found.items() if "position" in roles}
     if not found:
         raise unguessed(channels, "which channels are the joints' positions")
@@ -316,5 +332,5 @@ def unguessed(channels: Channels, what: str) -> DatasetError:
     """Return the error that names what cannot be guessed, and the channels."""
     return DatasetError(
         f"{channels.path}: cannot tell {what} (channels: {channels.listed()}); write it into a column map, "
-        "and add --columns columns.yaml"
+        "columns.yaml, and name that by --columns (in Python: columns=)"
     )

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 from mcap.records import Chunk, Metadata
 
 from deal_hw.data.files import INDEX_NAME
 from deal_hw.data.importing.channels import Channels
-from deal_hw.data.importing.columns import ColumnMap
+from deal_hw.data.importing.columns import ColumnMap, JointKinds
 from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.data.importing.episode_source import read_own
 from deal_hw.data.importing.guess import guess_columns
@@ -35,6 +36,8 @@ _READERS: dict[str, Callable[[Path], Channels]] = {
     ".mcap": read_mcap,
 }
 _HEAD_BYTES = 1 << 20
+SAME_EFFORT = 0.02
+"""A motor of 1 N or N·m, within this, takes both kinds of command alike [N or N·m]."""
 
 
 def read_channels(path: Path) -> list[Channels]:
@@ -80,6 +83,7 @@ def load_tables(
     joints: Sequence[str] | None = None,
     say: Say | None = None,
     said: dict[str, str] | None = None,
+    kinds: JointKinds | None = None,
 ) -> list[Table]:
     """Read the recordings in a file, in SI units, on their own stamps.
 
@@ -91,13 +95,14 @@ def load_tables(
         say: Called with sentences on guesses and omissions.
         said: Guessed maps that were printed already, each with the recording's name; a new one is added. One
             that is in it is not printed again.
+        kinds: Which of the model's joints slide or have motors; None: unknown.
 
     Raises:
         DatasetError: It cannot be read or understood.
     """
     described = f"{page('how-to/import.md')} describes one"
     with reading(path, "a recording of a robot", described):
-        tables = tables_of(read_channels(path), columns, joints, say, said)
+        tables = tables_of(read_channels(path), columns, joints, say, said, kinds)
     if not tables:
         raise DatasetError(f"{path} holds no recording")
     return tables
@@ -109,15 +114,58 @@ def tables_of(
     joints: Sequence[str] | None = None,
     say: Say | None = None,
     said: dict[str, str] | None = None,
+    kinds: JointKinds | None = None,
 ) -> list[Table]:
     """Interpret channels, as :func:`load_tables` does for a file."""
     tables = []
     for number, channels in enumerate(recordings):
         used = columns or _guess(channels, joints, say)
+        if kinds is not None:
+            used = used.for_model(kinds)
         if say is not None:
             _tell(say, channels, used, joints, columns is None and number == 0, said)
-        tables.append(build_table(channels, used, joints))
+        table = build_table(channels, used, joints)
+        _ask(channels.path, table, used)
+        if say is not None:
+            _tell_turns(say, table)
+        tables.append(table)
     return tables
+
+
+def _ask(path: Path, table: Table, columns: ColumnMap) -> None:
+    """Refuse a motor's commands that may be newtons as well as a share of full power.
+
+    Raises:
+        DatasetError: All commands of motors lie within -1..1, and the map does not say what 1 is.
+    """
+    motors = {joint.name: joint for joint in columns.joints if joint.motor is not None}
+    reach = {
+        name: float(np.nanmax(np.abs(values)))
+        for name, values in zip(table.actuated, table.target.T, strict=True)
+        if name in motors and np.isfinite(values).any()
+    }
+    if not reach or max(reach.values()) > 1.0:
+        return
+    for name, furthest in reach.items():
+        joint = motors[name]
+        full = joint.motor
+        if furthest > 0 and full is not None and joint.unit_unsaid and abs(full - 1.0) > SAME_EFFORT:
+            unit = joint.effort_unit
+            scale = f"{{from: [-1, 1], to: [-{full:.4g}, {full:.4g}]}}"
+            raise DatasetError(
+                f"{path}: the commands of {name} lie within -1..1, and its motor in the model gives "
+                f"{full:.4g} {unit} at its highest command: 1 may be full power or 1 {unit}. Write into the "
+                f"column map, for {name}, `target_normalised: {scale}` if it is full power, or "
+                f"`target_unit: {unit}`"
+            )
+
+
+def _tell_turns(say: Say, table: Table) -> None:
+    for name, count in table.source.get("unwrapped", {}).items():
+        say(
+            f"{table.name}: the angle of {name} jumps by a full turn {count} times: it was folded into one "
+            "turn, such as -pi..pi. It is unwrapped, so that nothing is interpolated across a jump"
+        )
 
 
 def own_episodes(path: Path, say: Say | None = None) -> list[Path]:
@@ -165,7 +213,10 @@ def _guess(channels: Channels, joints: Sequence[str] | None, say: Say | None) ->
 
 
 _INCOMPLETE = "a column map to start from; save it as columns.yaml, and replace COLUMN:"
-_GUESSED = "no column map given; this one was guessed (to change it, save it and name it by --columns):"
+_GUESSED = (
+    "no column map given; this one was guessed (to change it, save it and name it by --columns, in Python by "
+    "columns=):"
+)
 
 
 def _say_map(

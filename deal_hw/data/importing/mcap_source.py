@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from deal_hw.types import FloatArray
 
 STAMP_FIELDS = ("log_time", "header.stamp")
 """Times of each topic [s]: the recorder's time of receipt, and the sender's time."""
+MAGIC = b"\x89MCAP0\r\n"
+"""First bytes of an MCAP file (mcap.dev/spec)."""
 CHUNK_BYTES = 64 * MIB
 """Largest record, and largest chunk once it is unpacked; recorders write chunks of 1 to 4 MiB."""
 _LEAF_COST = 16
@@ -60,8 +63,15 @@ def read_mcap(path: Path) -> Channels:
     path = Path(path)
     with reading(path, "MCAP with ROS 2 messages", "if it is incomplete, `mcap recover` repairs it"):
         check_size(path, RECORDING_BYTES)
+        with open(path, "rb") as file:
+            begin = file.read(len(MAGIC))
+        if begin != MAGIC:
+            raise ValueError(f"it begins with {begin!r}, MCAP with {MAGIC!r}: it is another kind of file")
         digest = digest_of_file(path)
-        return _channels(path, digest)
+        try:
+            return _channels(path, digest)
+        except struct.error as error:
+            raise ValueError("it ends, or is damaged, in the middle of a record") from error
 
 
 def _channels(path: Path, digest: str) -> Channels:

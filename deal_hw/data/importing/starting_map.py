@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
-from deal_hw.data.importing.guess import guess_columns, guess_time
+from deal_hw.data.importing.guess import channels_of_joints, guess_columns, guess_time
 from deal_hw.errors import DatasetError
 
 COLUMN = "COLUMN"
@@ -44,12 +44,17 @@ def starting_map(
         if pattern is not None:
             lines.append(f"{name}: {json.dumps(pattern)}")
     names = joints or tuple(known) or ("JOINT",)
-    return [*lines, "joints:", *(f"  - {{{_entries(name, known.get(name))}}}" for name in names)]
+    partly = channels_of_joints(channels, time, joints)
+    entries = [_entries(name, known.get(name), partly.get(name, {})) for name in names]
+    return [*lines, "joints:", *(f"  - {{{entry}}}" for entry in entries)]
 
 
-def _entries(name: str, joint: JointColumns | None) -> str:
+def _entries(name: str, joint: JointColumns | None, partly: Mapping[str, str]) -> str:
     if joint is None:
-        return f"name: {json.dumps(name)}, position: {COLUMN}, target: {COLUMN}, unit: rad"
+        position, target = (
+            json.dumps(partly[key]) if key in partly else COLUMN for key in ("position", "target")
+        )
+        return f"name: {json.dumps(name)}, position: {position}, target: {target}, unit: rad"
     values = {
         key: getattr(joint, key) for key in ("name", "column", "index", *_QUANTITIES, "unit", "target_unit")
     }

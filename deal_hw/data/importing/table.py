@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
+from deal_hw.data.importing.guess import guess_time, unguessed
+from deal_hw.data.importing.wraps import nearest_turn, unwrap
 from deal_hw.data.recording.spikes import position_units
 from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray, IntArray, Trajectory
@@ -84,7 +86,7 @@ class Table:
 
 
 def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | None = None) -> Table:
-    """Pick and convert the channels that a column map names.
+    """Pick and convert the channels that a column map names; angles that wrap are unwrapped.
 
     Rows without any position are left out (they occur in logs with several rates), and so are rows without
     any target; ``source`` counts both.
@@ -132,6 +134,9 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
     if not kept.any():
         raise DatasetError(f"{channels.path}: every position is empty; check the channel in the column map")
     zero_s = float(time_s[kept][0])
+    position, target, turns = _unwrapped(
+        [joint for joint, _ in ordered], actuated, time_s, position, command_s, target
+    )
     return Table(
         joint_names=tuple(joint.name for joint, _ in ordered),
         actuated=tuple(joint.name for joint in actuated),
@@ -153,8 +158,36 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
             "notes": list(channels.notes),
             "rows_without_position": int(np.sum(~kept)),
             "rows_without_target": int(np.sum(~sent)),
+            **({"unwrapped": turns} if turns else {}),
         },
     )
+
+
+def _unwrapped(
+    joints: Sequence[JointColumns],
+    actuated: Sequence[JointColumns],
+    time_s: FloatArray,
+    position: FloatArray,
+    command_s: FloatArray,
+    target: FloatArray,
+) -> tuple[FloatArray, FloatArray, dict[str, int]]:
+    """Return positions (T, J) and targets (C, A) without jumps by full turns, and how many each joint had.
+
+    A commanded angle gets the turns that bring it nearest to the measured one.
+    """
+    position, target, turns = position.copy(), target.copy(), {}
+    for j, joint in enumerate(joints):
+        if joint.si_unit == "rad":
+            position[:, j], count = unwrap(position[:, j], time_s)
+            if count:
+                turns[joint.name] = count
+    for a, joint in enumerate(actuated):
+        if joint.name in turns and not joint.takes_effort:
+            measured = position[:, joints.index(joint)]
+            sound = np.isfinite(measured) & np.isfinite(time_s)
+            near = np.interp(command_s, time_s[sound], measured[sound])
+            target[:, a] = nearest_turn(target[:, a], near)
+    return position, target, turns
 
 
 def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
@@ -220,7 +253,10 @@ def _ordered(
 
 def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArray]:
     """Return the stamps of samples and commands since the first sample, (T,) and (C,) [s]."""
-    raw, unit = channels.column(columns.time.column), TIME_UNITS[columns.time.unit]
+    time = columns.time or guess_time(channels)
+    if time is None:
+        raise unguessed(channels, "which channel is the time")
+    raw, unit = channels.column(time.column), TIME_UNITS[time.unit]
     finite = raw[np.isfinite(raw)]
     # The first one is subtracted before scaling: an epoch in ns times 1e-9 has a resolution of only 0.2 us.
     zero = float(finite[0]) if finite.size else 0.0

@@ -24,6 +24,12 @@ WINDOW_TICKS = 20
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+DRIVEN = {
+    int(mujoco.mjtTrn.mjTRN_TENDON): "tendon",
+    int(mujoco.mjtTrn.mjTRN_SITE): "site",
+    int(mujoco.mjtTrn.mjTRN_SLIDERCRANK): "slider-crank",
+}
+"""What an actuator drives that has no joint."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +95,8 @@ def describe(
     free = _check_joints(model, index)
     actuators = [actuator_of(model, name) for name in actuated]
     _check_actuators(model, actuators, actuated)
-    kinds = {_actuation(model, i, name) for i, name in zip(actuators, actuated, strict=True)}
+    # Without actuators there is nothing to command, as with motors that are off.
+    kinds = {_actuation(model, i, name) for i, name in zip(actuators, actuated, strict=True)} or {"motor"}
     if len(kinds) > 1:
         raise ConfigurationError(
             "some actuators of the model are position servos, some are motors; calibration takes one kind"
@@ -167,15 +174,20 @@ def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
 
 def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[str]) -> None:
     idle = [model.actuator(i).name or f"number {i}" for i in range(model.nu) if i not in actuators]
+    apart = [
+        f"{model.actuator(i).name or f'number {i}'} (a {DRIVEN.get(int(model.actuator_trntype[i]), 'body')})"
+        for i in range(model.nu)
+        if i not in actuators and joint_of(model, i) < 0
+    ]
+    if apart:
+        raise ConfigurationError(
+            f"actuators of the model that drive no joint: {', '.join(apart)}; calibration takes commands of "
+            "joints: remove these actuators from a copy of the MJCF, or let them drive a joint"
+        )
     if idle:
         raise ConfigurationError(
             f"actuators of the model without recorded commands: {', '.join(idle)}; name their `target` in "
             "the column map, or remove them from a copy of the MJCF"
-        )
-    if not actuated:
-        raise ConfigurationError(
-            "no recorded joint has commands: name the `target` in the column map, or give the model an "
-            "actuator, such as <position joint=... kp=...>, where it has none"
         )
 
 

@@ -15,6 +15,8 @@ from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 
+Flags = np.ndarray[Any, np.dtype[np.bool_]]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointFacts:
@@ -29,15 +31,18 @@ class JointFacts:
         motor: Whether one takes efforts, (J,).
         command: Lowest and highest command by the actuator's ctrlrange, as in recordings (positions, or
             efforts at the joint), (J, 2); infinite for none.
+        full_effort: Effort of each joint's motor at its highest command, or at 1 without a ctrlrange, (J,)
+            [N or N·m]; NaN without a motor, or with one whose force also depends on the motion.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     limits: FloatArray
     left_out: tuple[str, ...]
-    servo: np.ndarray[Any, np.dtype[np.bool_]]
-    motor: np.ndarray[Any, np.dtype[np.bool_]]
+    servo: Flags
+    motor: Flags
     command: FloatArray
+    full_effort: FloatArray
 
 
 def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
@@ -70,18 +75,21 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
         limits.append(joint.range if bool(joint.limited[0]) else (-np.inf, np.inf))
     if not names:
         raise ConfigurationError(f"model {mjcf} has no hinge or slide joint")
-    servo, motor, command = _actuation(model, index_of)
     return JointFacts(
-        tuple(names), tuple(units), np.array(limits, dtype=np.float64), tuple(left_out), servo, motor, command
+        tuple(names),
+        tuple(units),
+        np.array(limits, dtype=np.float64),
+        tuple(left_out),
+        *_actuation(model, index_of),
     )
 
 
 def _actuation(
     model: mujoco.MjModel, column: Mapping[int, int]
-) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], np.ndarray[Any, np.dtype[np.bool_]], FloatArray]:
-    """Return which joints have servos and motors, and their command ranges, by column of the joints."""
+) -> tuple[Flags, Flags, FloatArray, FloatArray]:
+    """Return which joints have servos, which motors, command ranges and full efforts, by column."""
     servo, motor = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
-    command = np.tile([-np.inf, np.inf], (len(column), 1))
+    command, full_effort = np.tile([-np.inf, np.inf], (len(column), 1)), np.full(len(column), np.nan)
     for actuator in range(model.nu):
         joint = joint_of(model, actuator)
         if joint not in column:
@@ -89,7 +97,12 @@ def _actuation(
         at = column[joint]
         closes = bool(model.actuator_biasprm[actuator, 1] < 0)
         servo[at], motor[at] = servo[at] or closes, motor[at] or not closes
-        if model.actuator_ctrllimited[actuator]:
-            full = 1.0 if closes else model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0]
+        limited, full = bool(model.actuator_ctrllimited[actuator]), 1.0
+        if not closes:
+            full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
+            most = np.max(np.abs(model.actuator_ctrlrange[actuator])) if limited else 1.0
+            if not model.actuator_biasprm[actuator].any():
+                full_effort[at] = abs(full) * most
+        if limited:
             command[at] = np.sort(model.actuator_ctrlrange[actuator] * full)
-    return servo, motor, command
+    return servo, motor, command, full_effort

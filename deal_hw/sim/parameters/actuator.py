@@ -1,7 +1,8 @@
 """Parameter kinds of actuators.
 
 Position servos: force = clip(kp (setpoint - q) - kd q', +-limit). Motors: force = gain * control, joint
-torque = gear * force.
+torque = gear * force. The parameter ``motor_gain`` is their product, the joint torque at a control of 1: a
+gain alone has the joint's unit only where the gear is 1.
 """
 
 from __future__ import annotations
@@ -46,10 +47,12 @@ def servo_effort_limit(fields: Fields, elements: Sequence[str], values: Array) -
 
 
 def motor_gain(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set a motor's force for a control of 1 [N or N·m]."""
+    """Set a motor's effort at the joint for a control of 1, behind the gear [N or N·m]; its sign stays."""
     gain = fields.get("actuator_gainprm")
     for name in elements:
-        gain[:, element_id(fields.model, "actuator", name), 0] = values
+        actuator = element_id(fields.model, "actuator", name)
+        own = fields.model.actuator_gainprm[actuator, 0]
+        gain[:, actuator, 0] = np.copysign(values / abs(fields.model.actuator_gear[actuator, 0]), own)
 
 
 def motor_gear(fields: Fields, elements: Sequence[str], values: Array) -> None:
@@ -84,6 +87,10 @@ def _motor(model: Any, actuator: int, name: str) -> None:
     fixed = int(model.actuator_gaintype[actuator]) == _FIXED
     if not fixed or np.any(model.actuator_biasprm[actuator]):
         raise ConfigurationError(f"actuator {name!r} is no motor; for a position servo use servo_stiffness")
+    if model.actuator_gear[actuator, 0] == 0:
+        raise ConfigurationError(
+            f"actuator {name!r} has gear 0, so it moves nothing; give it another gear in the MJCF"
+        )
 
 
 ACTUATOR_KINDS = (
@@ -141,9 +148,9 @@ ACTUATOR_KINDS = (
         unit="N·m",
         unit_slide="N",
         writes=("actuator_gainprm",),
-        along="nothing",
+        along="nothing; gear and signs stay",
         apply=motor_gain,
-        baseline=lambda m, i: float(m.actuator_gainprm[i, 0]),
+        baseline=lambda m, i: float(abs(m.actuator_gainprm[i, 0] * m.actuator_gear[i, 0])),
         usable=_motor,
     ),
     Kind(

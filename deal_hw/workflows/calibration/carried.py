@@ -70,7 +70,7 @@ def prepare_carried(settings: CalibrateSettings, holdout: Sequence[int], say: Sa
     }
     if settings.sample_hz is not None:
         episodes = {i: thin(episode, settings.sample_hz) for i, episode in episodes.items()}
-    parts, judge = parts_to_calibrate(
+    space, parts, judge = parts_to_calibrate(
         settings, robot, space, [episodes[i] for i in fit], [episodes[i] for i in held], share, say
     )
     return CalibrationInputs(

@@ -97,7 +97,7 @@ def examine_recording(
     limits = None
     if facts is not None:
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    every = list(examine(table, limits, kept, spikes))
+    every = list(examine(table, limits, kept, spikes, efforts=not servo))
     if facts is not None and {v.name for v in every} >= {"assignment"}:
         # These checks run only if clock and values are valid.
         command = facts.command[[facts.names.index(name) for name in table.actuated]]
@@ -159,7 +159,7 @@ def warn_of_gravity(
             )
 
 
-def require_sensitive_parameters(
+def sensitive_parameters(
     robot: RobotModel,
     space: ParameterSpace,
     episodes: Sequence[SampledEpisode],
@@ -167,9 +167,22 @@ def require_sensitive_parameters(
     window_s: float,
     threads: int | None,
     say: Callable[[str], None],
-) -> None:
-    """Check before any search that the recordings are long enough, move, and depend on every parameter."""
-    from deal_hw.calib.data.checks import check_excitation, compute_sensitivity, jumps, require_sensitive
+) -> ParameterSpace:
+    """Check before any search that the recordings are long enough, move, and depend on every parameter.
+
+    Recordings without any command never show what an actuator does. Parameters without effect on these keep
+    their nominal values; a sentence names them.
+
+    Returns:
+        The parameters to search.
+    """
+    from deal_hw.calib.data.checks import (
+        check_excitation,
+        compute_sensitivity,
+        jumps,
+        require_sensitive,
+        target_changes,
+    )
     from deal_hw.calib.data.problem import Problem, samples_in
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
@@ -185,6 +198,12 @@ def require_sensitive_parameters(
             str(err).partition("; record again with")[0] + "; record more motion"
         ) from err
     found = compute_sensitivity(problem)
+    if found.unseen and not target_changes(episodes) and len(found.unseen) < len(found.names):
+        say(
+            f"not identifiable without commands, so the model's values stay: {', '.join(found.unseen)}. "
+            "Add a recording with commands to find them"
+        )
+        return space.with_known({name: space[name].nominal for name in found.unseen})
     require_sensitive(found)
     if found.faint:
         say(
@@ -200,3 +219,4 @@ def require_sensitive_parameters(
             "millionth. The model's solver stops too early, and no fit can follow such jumps. Write <option "
             'tolerance="1e-15" iterations="200" ls_tolerance="1e-6" ls_iterations="200"/> into the MJCF'
         )
+    return space

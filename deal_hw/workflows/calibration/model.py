@@ -13,12 +13,13 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.workflows.calibration.checks import (
     examine_recording,
     require_base,
-    require_sensitive_parameters,
+    sensitive_parameters,
     warn_of_gravity,
 )
 from deal_hw.workflows.calibration.recordings import (
     Source,
     aligned,
+    at_rest_without_commands,
     common_rates,
     divide,
     named_on_grid,
@@ -26,6 +27,7 @@ from deal_hw.workflows.calibration.recordings import (
     refuse_copies,
     seconds_of,
     without,
+    without_scraps,
 )
 from deal_hw.workflows.calibration.run import CalibrationInputs
 from deal_hw.workflows.calibration.settings import DEFAULT, CalibrateSettings, Recordings
@@ -115,9 +117,10 @@ def prepare_model(
     columns = None if config.columns is None else read_column_map(config.columns)
     said: dict[str, str] = {}
     fitted, held = (
-        read_tables(sources, columns, facts.names, say, name, said)
+        read_tables(sources, columns, facts, say, name, said)
         for name, sources in (("data", data), ("holdout", holdout))
     )
+    fitted, held = (at_rest_without_commands(tables, facts, say) for tables in (fitted, held))
     refuse_copies([*fitted, *held])
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
@@ -140,7 +143,7 @@ def prepare_model(
         [aligned(r, robot, config.feet, name) for name, r in recordings]
         for recordings in (fit_recordings, held_recordings)
     )
-    episodes, judge = parts_to_calibrate(settings, robot, space, episodes, judge, share, say)
+    space, episodes, judge = parts_to_calibrate(settings, robot, space, episodes, judge, share, say)
     return CalibrationInputs(
         robot=robot,
         space=space,
@@ -192,8 +195,8 @@ def parts_to_calibrate(
     judge: Sequence[SampledEpisode],
     share: float,
     say: Say,
-) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
-    """Return the fitted and the held-out recordings, checked against the parameters.
+) -> tuple[ParameterSpace, list[SampledEpisode], list[SampledEpisode]]:
+    """Return the parameters that recordings show, the fitted and the held-out recordings.
 
     Args:
         settings: How recordings are used.
@@ -209,9 +212,10 @@ def parts_to_calibrate(
     """
     config, std = settings.recordings, settings.known_std(robot)
     parts, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
+    parts, judge = without_scraps(parts, say), without_scraps(judge, say)
     warn_of_gravity(robot, space, parts, say)
-    require_sensitive_parameters(robot, space, parts, std, config.window, settings.threads, say)
-    return parts, judge
+    space = sensitive_parameters(robot, space, parts, std, config.window, settings.threads, say)
+    return space, parts, judge
 
 
 def heldout_share(config: Recordings, holdout: Sequence[object]) -> float:

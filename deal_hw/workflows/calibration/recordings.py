@@ -14,11 +14,12 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import REQUIRED_CHECKS
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.columns import ColumnMap
+    from deal_hw.data.importing.columns import ColumnMap, JointKinds
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.describe import Sampling
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
     from deal_hw.sim.recordings.episode import SampledEpisode
 
 STRETCH_S = 2.5
@@ -33,7 +34,7 @@ Source = Path | str | Mapping[str, Any] | Any
 def read_tables(
     sources: Sequence[Source],
     columns: ColumnMap | None,
-    joints: Sequence[str],
+    facts: JointFacts,
     say: Callable[[str], None],
     name: str,
     said: dict[str, str],
@@ -46,12 +47,25 @@ def read_tables(
     from deal_hw.data.importing.memory_source import read_memory
 
     tables: list[Table] = []
+    joints, kinds = facts.names, kinds_of(facts)
     for number, source in enumerate(sources):
         if isinstance(source, str | Path):
-            tables += load_tables(Path(source), columns, joints, say, said)
+            tables += load_tables(Path(source), columns, joints, say, said, kinds)
         else:
-            tables += tables_of([read_memory(source, f"{name}[{number}]")], columns, joints, say, said)
+            channels = read_memory(source, f"{name}[{number}]")
+            tables += tables_of([channels], columns, joints, say, said, kinds)
     return tables
+
+
+def kinds_of(facts: JointFacts) -> JointKinds:
+    """Return which joints of a model slide, and which have motors."""
+    from deal_hw.data.importing.columns import JointKinds
+
+    motors = zip(facts.names, ~facts.servo & np.isfinite(facts.full_effort), facts.full_effort, strict=True)
+    return JointKinds(
+        slides=frozenset(n for n, unit in zip(facts.names, facts.units, strict=True) if unit == "m"),
+        motors={name: float(full) for name, motor, full in motors if motor},
+    )
 
 
 def refuse_copies(tables: Sequence[Table]) -> None:
@@ -99,9 +113,41 @@ def common_rates(
                 "separately"
             )
         # An invalid clock has no period; report it before anything else fails on it.
-        require([v for v in examine(table) if v.name in REQUIRED_CHECKS], table.name)
+        found = examine(table, efforts=not model_has_servos(model))
+        require([v for v in found if v.name in REQUIRED_CHECKS], table.name)
     timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
     return sampling(common_period(tables), timestep, window_s)
+
+
+def model_has_servos(model: Any) -> bool:
+    """Return whether an actuator of a model takes positions."""
+    return bool((model.actuator_biasprm[:, 1] < 0).any())
+
+
+def at_rest_without_commands(
+    tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
+) -> list[Table]:
+    """Return recordings in which motors without any recorded command are off: their commands are 0.
+
+    A servo holds its joint, so its commands cannot be guessed. These recordings stay as they are.
+    """
+    found = []
+    for table in tables:
+        driven = tuple(
+            name
+            for name, servo, motor in zip(facts.names, facts.servo, facts.motor, strict=True)
+            if (servo or motor) and name in table.joint_names
+        )
+        if table.command_s.size or facts.servo.any():
+            found.append(table)
+            continue
+        off = f"its motors ({', '.join(driven)}) were off" if driven else "the model has no actuators"
+        say(f"{table.name}: no commands, and {off}: it is taken as a motion of the joints alone")
+        table = dataclasses.replace(
+            table, actuated=driven, command_s=np.zeros(1), target=np.zeros((1, len(driven)))
+        )
+        found.append(table)
+    return found
 
 
 def without(
@@ -176,6 +222,22 @@ def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...], name
     if recording.orientation is not None and recording.gyro is not None and robot.base is not None:
         episode = with_base(episode, robot, feet, recording.orientation, recording.gyro)
     return fill_gaps(episode)
+
+
+def without_scraps(episodes: Sequence[SampledEpisode], say: Callable[[str], None]) -> list[SampledEpisode]:
+    """Return recordings without those too short to be smoothed, as a few samples between two gaps are.
+
+    If all are, all stay: whoever uses them says how long a recording must be.
+    """
+    from deal_hw.calib.data.noise import smoothed_samples
+
+    kept = [e for e in episodes if len(e.sample) > 1 and len(e.sample) >= smoothed_samples(e.period_s)]
+    short = len(episodes) - len(kept)
+    if not kept or not short:
+        return list(episodes)
+    samples = sum(len(e.sample) for e in episodes) - sum(len(e.sample) for e in kept)
+    say(f"left out: {short} parts between gaps, of {samples} samples in all, which are too short to be used")
+    return kept
 
 
 def divide(

@@ -143,7 +143,7 @@ def calibrate_episodes(
     try:
         from threadpoolctl import threadpool_limits
 
-        from deal_hw.calib.data.checks import check_delays
+        from deal_hw.calib.data.checks import check_delays, target_changes
         from deal_hw.calib.data.noise import SETTINGS as DATA
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.pipeline.methods import make_method
@@ -154,6 +154,9 @@ def calibrate_episodes(
         raise MissingExtraError(str(err.name), "calib") from err
 
     _require_windows(holdout, heldout_window_s)
+    if latency_s is None and not target_changes(episodes):
+        latency_s = 0.0
+        say("no command ever changes, so the recordings do not show the latency: it is taken as 0")
     problem = Problem(
         robot,
         space,
