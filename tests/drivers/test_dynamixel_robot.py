@@ -275,13 +275,13 @@ def test_states_say_when_the_servo_got_a_command_however_late_this_computer_was(
     wire = Wire(lambda t: Late(t, received=None))
     wire.armed()
     accepted: list[int] = []
-    accept = wire.device._loop.accept
+    accept = wire.device._belt._loop.accept
 
     def note(target: Target) -> None:
         accepted.append(wire.device._tick)
         accept(target)
 
-    wire.device._loop.accept = note  # type: ignore[method-assign]
+    wire.device._belt._loop.accept = note  # type: ignore[method-assign]
     states = [state for k in range(1, 51) for state in wire.run(1, target=0.001 * k)]
     reported = {s.command_sequence: s.device_ns - s.command_age_ns for s in states if s.command_sequence > 0}
     assert all(s.command_age_ns >= 0 for s in states if s.command_sequence > 0)
@@ -393,7 +393,7 @@ def test_five_percent_of_corrupt_packets_in_both_directions_are_survived() -> No
 def test_servos_that_know_no_fast_read_are_asked_one_after_the_other() -> None:
     """An older firmware ignores Fast Sync Read: Sync Read gives the same states."""
     wire = Wire()
-    wire.device.fast_read = False
+    wire.device.bus.fast_read = False
     robot = wire.armed()
     assert robot.info is not None
     assert not robot.info.fast_sync_read
@@ -455,7 +455,7 @@ def test_two_servos_with_one_id_are_told() -> None:
 def test_another_baud_rate_is_silence_with_advice() -> None:
     """Servos of another rate do not answer; doctor looks at every rate."""
     wire = Wire()
-    wire.device.host_baud_rate = 57600
+    wire.device.bus.host_baud_rate = 57600
     with pytest.raises(TransportTimeoutError, match=r"New servos use 57600 baud.*doctor"):
         wire.robot.connect()
 
