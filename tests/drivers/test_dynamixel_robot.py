@@ -435,6 +435,61 @@ def test_a_servo_without_current_control_needs_the_other_mode() -> None:
     assert wire.device.true_position[0] > 0.01
 
 
+class Deaf(Transport):
+    """A wire that swallows requests.
+
+    Args:
+        inner: The wire.
+        swallows: Says of each request whether it is lost.
+    """
+
+    def __init__(self, inner: Transport, swallows: Callable[[bytes], bool]) -> None:
+        self.inner, self.swallows = inner, swallows
+
+    def open(self) -> None:
+        """Open the wire."""
+        self.inner.open()
+
+    def close(self) -> None:
+        """Close the wire."""
+        self.inner.close()
+
+    def send(self, message: Message) -> None:
+        """Pass a request on, or lose it."""
+        if not self.swallows(message.payload):
+            self.inner.send(message)
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the next bytes."""
+        return self.inner.receive(timeout_s)
+
+
+def test_servos_that_answer_after_a_pause_are_found() -> None:
+    """The computer pauses for ten pings, some 40 ms; then both answer the request to all, and their own."""
+    left = [10]
+
+    def swallows(request: bytes) -> bool:
+        left[0] -= 1
+        return left[0] >= 0
+
+    wire = Wire(lambda inner: Deaf(inner, swallows))
+    wire.robot.connect()
+    assert wire.robot.info is not None
+    assert (wire.robot.info.cart.id, wire.robot.info.pole.id) == (1, 2)
+
+
+def test_servos_that_only_answer_a_request_to_all_are_not_called_absent() -> None:
+    """Lost: every ping to one servo. The message counts the tries; it said "does not answer; these do"."""
+    wire = Wire(lambda inner: Deaf(inner, lambda request: request[4] != 0xFE and request[7] == 1))
+    with pytest.raises(TransportTimeoutError) as caught:
+        wire.robot.connect()
+    said = str(caught.value)
+    assert "servos 1 and 2 answered a request to all servos, but none of 10 requests" in said
+    assert "(20 without an answer within 3 ms, 0 corrupt)" in said
+    assert "answer_s" in said
+    assert "does not answer" not in said
+
+
 def test_two_servos_with_one_id_are_told() -> None:
     """Factory-new servos all have id 1: the message says who answers and how to separate them."""
     wire = Wire()
