@@ -28,7 +28,7 @@ from deal_hw.drivers.cartpole.odrive_endpoints import (
     HARDWARE,
     REBOOT,
     SAVE,
-    Endpoint,
+    DriveSetting,
 )
 from deal_hw.drivers.cartpole.odrive_endpoints import CLEAR_ERRORS as CLEAR_ERRORS_FUNCTION
 from deal_hw.drivers.cartpole.odrive_frames import (
@@ -332,7 +332,11 @@ class OdriveFirmware:
             # No voltage is on an emulated drive's inputs.
             return pack(self.node, Command.TX_SDO, number, bytes(4))
         confirmed = self._confirm(number)
-        self._call(number)
+        if number == SAVE:
+            # Without a restart: ODrive's example goes on with other settings half a second later.
+            self._saved = dict(self._config)
+        else:
+            self._call(number)
         return confirmed
 
     def _confirm(self, number: int) -> bytes:
@@ -352,7 +356,7 @@ class OdriveFirmware:
         value = live[name] if name in live else self._config[name]
         return value if ENDPOINTS[name].kind == "float" else int(value)
 
-    def _write(self, name: str, endpoint: Endpoint, data: bytes) -> bool:
+    def _write(self, name: str, endpoint: DriveSetting, data: bytes) -> bool:
         value = endpoint.unpack(data)
         if value is None or not endpoint.writable or math.isnan(value):
             return False

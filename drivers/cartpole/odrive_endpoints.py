@@ -19,7 +19,7 @@ SAVE, ERASE, REBOOT, CLEAR_ERRORS, ADC_VOLTAGE = range(5)
 _FORMAT: Final = {"bool": "<?", "uint8": "<B", "uint32": "<I", "float": "<f"}
 
 
-class Endpoint(NamedTuple):
+class DriveSetting(NamedTuple):
     """One setting or measurement.
 
     Attributes:
@@ -42,12 +42,12 @@ class Endpoint(NamedTuple):
         return None if len(data) < layout.size else float(layout.unpack_from(data)[0])
 
 
-def _numbered(first: int, writable: bool, **kinds: str) -> dict[str, Endpoint]:
+def _numbered(first: int, writable: bool, **kinds: str) -> dict[str, DriveSetting]:
     names = {name.replace("__", "."): kind for name, kind in kinds.items()}
-    return {name: Endpoint(first + k, kind, writable) for k, (name, kind) in enumerate(names.items())}
+    return {name: DriveSetting(first + k, kind, writable) for k, (name, kind) in enumerate(names.items())}
 
 
-ENDPOINTS: Final[dict[str, Endpoint]] = {
+ENDPOINTS: Final[dict[str, DriveSetting]] = {
     **_numbered(
         100,
         False,
@@ -73,8 +73,8 @@ ENDPOINTS: Final[dict[str, Endpoint]] = {
         axis0__config__motor__torque_constant="float",
         axis0__config__can__node_id="uint32",
     ),
-    "axis0.config.enable_watchdog": Endpoint(ENABLE_WATCHDOG, "bool", True),
-    "axis0.config.watchdog_timeout": Endpoint(WATCHDOG_TIMEOUT, "float", True),
+    "axis0.config.enable_watchdog": DriveSetting(ENABLE_WATCHDOG, "bool", True),
+    "axis0.config.watchdog_timeout": DriveSetting(WATCHDOG_TIMEOUT, "float", True),
 }
 """Settings and measurements of the emulated drive, by the names of ODrive's reference."""
 _FUNCTIONS: Final[dict[str, tuple[int, list[tuple[str, str]], list[tuple[str, str]]]]] = {

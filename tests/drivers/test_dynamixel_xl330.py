@@ -259,6 +259,18 @@ def test_current_and_pwm_modes_push(mode: OperatingMode, goal: Register, value: 
     assert places[1] - places[0] > 0.02
 
 
+def test_position_mode_settles_with_the_factorys_gains() -> None:
+    """ROBOTIS' examples wait until a goal is within 20 pulses; without back-EMF the cart rang by 2400."""
+    bench = Bench(OperatingMode.POSITION)
+    assert bench.read(r.PRESENT_POSITION) > 3000
+    bench.write(r.GOAL_POSITION, 0)
+    bench.write(r.TORQUE_ENABLE, 1)
+    bench.run(0.5)
+    for _ in range(10):
+        bench.run(0.02)
+        assert abs(bench.read(r.PRESENT_POSITION)) <= 20
+
+
 def test_the_trajectory_is_shown() -> None:
     """Profile Velocity 50 of a far goal: 50 * 0.229 / 60 * 4096 = 782 pulses/s, so 1 s later 782 on."""
     bench = Bench(OperatingMode.EXTENDED_POSITION)

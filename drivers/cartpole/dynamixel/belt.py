@@ -121,6 +121,9 @@ class BeltMotor:
             self._force_n = 0.0
         elif self._drive is None:
             self._force_n = self._loop.update(motor.position, motor.velocity)
+            if self._servo.get(r.OPERATING_MODE) == OperatingMode.POSITION:
+                # The modes that the cart-pole's driver uses have no back-EMF: neither has its truth.
+                self._force_n -= self._back_emf(self._counts(motor.velocity)) * self._settings.cart_direction
         else:
             self._loop.reset(motor.position)
             self._force_n = self._drive_force(self._drive, self._counts(motor.velocity))
@@ -195,10 +198,14 @@ class BeltMotor:
     def _counts(self, velocity: float) -> float:
         return velocity / self._settings.metres_s_per_count * self._settings.cart_direction
 
+    def _back_emf(self, velocity: float) -> float:
+        """Return the effort that the motor's own voltage takes at a velocity of the shaft [N]."""
+        return xl330.MOST_PWM * velocity / xl330.NO_LOAD_VELOCITY * self._settings.effort_per_pwm
+
     def _drive_force(self, drive: Drive, velocity: float) -> float:
         """Return the force on the cart [N]; voltage and speed limit it as the motor's line says."""
         s = self._settings
-        back = xl330.MOST_PWM * velocity / xl330.NO_LOAD_VELOCITY
+        back = self._back_emf(velocity) / s.effort_per_pwm
         most = self._servo.get(r.PWM_LIMIT)
         if drive.mode == OperatingMode.CURRENT:
             pwm = drive.value * s.effort_per_current / s.effort_per_pwm + back
