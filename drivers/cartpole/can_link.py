@@ -50,6 +50,8 @@ LAST_NODE: Final = 62
 STATES_PER_HEARTBEAT: Final = 20
 FRAME: Final = struct.Struct("<IB3x8s")
 """One frame as bytes: Linux's ``struct can_frame`` with id, length and eight data bytes."""
+REMOTE: Final = 0x4000_0000
+"""Flag of a remote frame in the id of :data:`FRAME`, as in Linux's ``struct can_frame``."""
 _NUMBER_BITS: Final = 5
 _DEVICE_TIME: Final = 2**48 - 1
 _GROUPS: Final[dict[str, type[CanMessage]]] = {

@@ -13,8 +13,8 @@ from deal_hw.testing.faults import FrameFaults
 class CanFaults(Checked):
     """An emulated CAN bus and its faults, whose times count from the first arming of the motor."""
 
-    node: Annotated[int, Range(1, 62)] = 1
-    """CAN: number of the device on the bus."""
+    node: Annotated[int, Range(0, 62)] = 1
+    """CAN: number of the device on the bus; 0, the factory number, for an ODrive alone."""
 
     bitrate: Literal[125000, 250000, 500000, 800000, 1000000] = 500000
     """CAN: bit rate of the bus; a host with another rate receives nothing."""

@@ -25,6 +25,7 @@ from deal_hw.drivers.cartpole.odrive_frames import (
     PASSTHROUGH,
     POSITION_CONTROL,
     READ,
+    SDO_HEAD,
     WRITE,
     AxisError,
     Command,
@@ -333,6 +334,8 @@ class OdriveLink:
             self._second_host = second_host(f"the ODrive at node {self._s.drive}", Command(number).name)
         if number not in (Command.HEARTBEAT, Command.ENCODER_ESTIMATES, Command.TORQUES, Command.TX_SDO):
             return
+        if number == Command.TX_SDO and len(data) == SDO_HEAD.size:
+            return  # From 0.6.11 on a drive confirms a write; the value is read back in any case.
         layout = LAYOUT[Command(number)]
         if len(data) != layout.size:
             self.errors += 1

@@ -191,7 +191,7 @@ class CartpoleRobot(Robot):
             )
         raise TransportTimeoutError(
             f"{self._where}: no answer to hello within {HELLO_TIMEOUT_S:g} s; check the device's power and "
-            f"the port{self._trouble}"
+            f"the port (`deal-hw doctor cartpole` finds out what answers there){self._trouble}"
         )
 
     def _hear_info(self, timeout_s: float) -> tuple[protocol.Info | None, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from deal_hw.drivers.cartpole.can_link import FRAME
+from deal_hw.drivers.cartpole.can_link import FRAME, REMOTE
 from deal_hw.drivers.cartpole.device import EmulatedDevice
 from deal_hw.drivers.cartpole.faults import CanFaults
 from deal_hw.drivers.transports.slcan_transport import (
@@ -18,7 +18,9 @@ from deal_hw.drivers.transports.slcan_transport import (
     WARNING,
     LineReader,
     decode_line,
+    decode_remote_line,
     encode_line,
+    is_extended_line,
 )
 
 _BUFFERED: Final = 3
@@ -104,7 +106,7 @@ class SlcanAdapter:
 
     def _answer(self, line: bytes) -> bytes:
         match line[:1]:
-            case b"t":
+            case b"t" | b"r" | b"T" | b"R":
                 return self._send(line)
             case b"S":
                 self._bitrate = line
@@ -128,15 +130,16 @@ class SlcanAdapter:
         return END
 
     def _send(self, line: bytes) -> bytes:
-        frame = decode_line(line)
+        frame = _frame(line)
         if frame is None or not self._is_open or self._bus_off or self._full:
             return REFUSED
+        sent = (b"z" if line[:1] in (b"t", b"r") else b"Z") + END
         if not self._acknowledged:
             self._waiting += 1
-            return b"z" + END if self._waiting <= _BUFFERED else REFUSED
+            return sent if self._waiting <= _BUFFERED else REFUSED
         for device in self._devices:
-            device.receive(FRAME.pack(frame[0], len(frame[1]), frame[1]))
-        return b"z" + END
+            device.receive(frame)
+        return sent
 
     def _flags(self) -> int:
         if self._bus_off or not self._right_bitrate:
@@ -170,6 +173,15 @@ class SlcanAdapter:
         if after_s is None or self._armed_ns is None:
             return False
         return after_s < (self.device_ns - self._armed_ns) / 1e9 <= after_s + length_s
+
+
+def _frame(line: bytes) -> bytes | None:
+    """Return the frame of a line for the devices, empty for one with a 29-bit id: no device here has one."""
+    if (data := decode_line(line)) is not None:
+        return FRAME.pack(data[0], len(data[1]), data[1])
+    if (remote := decode_remote_line(line)) is not None:
+        return FRAME.pack(remote[0] | REMOTE, remote[1], b"")
+    return b"" if is_extended_line(line) else None
 
 
 def _line(frame: tuple[int, int, bytes]) -> bytes:

@@ -18,10 +18,7 @@ NO_ACKNOWLEDGE: Final = (
     "no other node acknowledges: check the device's power, the bit rate, and the termination at both ends "
     "of the bus (60 ohm between CAN-H and CAN-L)"
 )
-BUS_OFF: Final = (
-    "the controller went bus-off after too many errors; check wiring, termination and bit rate. SocketCAN "
-    "recovers by itself after `ip link set {channel} type can restart-ms 100`"
-)
+BUS_OFF: Final = "the controller went bus-off after too many errors; check wiring, termination and bit rate."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +113,17 @@ class CanTransport(Transport):
 
     def _bus_off(self) -> None:
         self._off = True
-        self.trouble = BUS_OFF.format(channel=self.address.channel)
+        self.trouble = f"{BUS_OFF} {self._bus_off_remedy}"
+
+    @property
+    def _bus_off_remedy(self) -> str:
+        """What brings this kind of adapter back, or what its bus-off says of the bit rate."""
+        if self.address.interface == "socketcan":
+            return f"It restarts by itself after `ip link set {self.address.channel} type can restart-ms 100`"
+        return (
+            f"The adapter runs at {self.address.bitrate} bit/s: another rate of the bus looks the same, and "
+            f"is given as {self.address.interface}:{self.address.channel}?bitrate=RATE"
+        )
 
     def _report(self, trouble: str) -> None:
         self.error_frames += 1

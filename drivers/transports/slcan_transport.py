@@ -50,6 +50,8 @@ TX_FULL, WARNING, PASSIVE, BUS_ERROR = 0x02, 0x04, 0x20, 0x80
 _SILENCE_NS = 100_000_000
 """After this silence another process may have left half a line in the adapter, so it is ended first [ns]."""
 _LINE = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
+_REMOTE_LINE = re.compile(rb"r([0-7][0-9A-Fa-f]{2})([0-8])")
+_EXTENDED_LINE = re.compile(rb"[TR]([01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _FLAGS = re.compile(rb"F([0-9A-Fa-f]{2})")
 
 
@@ -79,6 +81,18 @@ def decode_line(line: bytes) -> tuple[int, bytes] | None:
         return None
     data, length = bytes.fromhex(match[3].decode()), int(match[2])
     return (int(match[1], 16), data[:length]) if len(data) in (length, length + 2) else None
+
+
+def decode_remote_line(line: bytes) -> tuple[int, int] | None:
+    """Return id and length of a line without its end; None if it is no remote frame with an 11-bit id."""
+    match = _REMOTE_LINE.fullmatch(line)
+    return None if match is None else (int(match[1], 16), int(match[2]))
+
+
+def is_extended_line(line: bytes) -> bool:
+    """Whether a line without its end is a whole frame with a 29-bit id."""
+    match = _EXTENDED_LINE.fullmatch(line)
+    return match is not None and len(match[3]) == (2 * int(match[2]) if line[:1] == b"T" else 0)
 
 
 class LineReader:

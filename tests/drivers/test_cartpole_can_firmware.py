@@ -21,7 +21,8 @@ from deal_hw.drivers.cartpole.can_robot import CanFrames
 from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.faults import CanFaults
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, library, settings_of
-from deal_hw.drivers.cartpole.odrive_emulator import OdriveFirmware, PoleEncoder, odrive_device
+from deal_hw.drivers.cartpole.odrive_drive import OdriveFirmware
+from deal_hw.drivers.cartpole.odrive_emulator import PoleEncoder, odrive_device
 from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.robot import CartpoleRobot

@@ -15,12 +15,9 @@ from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
-from deal_hw.drivers.cartpole.odrive_emulator import (
-    ENABLE_WATCHDOG,
-    WATCHDOG_TIMEOUT,
-    OdriveFirmware,
-    odrive_device,
-)
+from deal_hw.drivers.cartpole.odrive_drive import OdriveFirmware
+from deal_hw.drivers.cartpole.odrive_emulator import odrive_device
+from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
 from deal_hw.drivers.cartpole.odrive_frames import CLOSED_LOOP, IDLE, AxisError, Command, pack
 from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveLink, OdriveSettings, drive_command
 from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot, odrive_settings
@@ -510,6 +507,14 @@ def test_another_encoder_number_is_refused_over_the_adapter() -> None:
         robot = make_robot("cartpole", "odrive", emulator.port + "&encoder=9", MonotonicClock())
         with pytest.raises((WrongDeviceError, TransportError), match="node 9"):
             robot.connect()
+
+
+def test_a_confirmed_write_is_no_error() -> None:
+    """From firmware 0.6.11 on a drive answers a write with the setting's number alone."""
+    link = OdriveLink(PARTS, VirtualClock())
+    data = struct.pack("<BHx", 0, ENABLE_WATCHDOG)
+    list(link.decode(FRAME.pack(PARTS.drive << 5 | Command.TX_SDO, len(data), data)))
+    assert link.errors == 0
 
 
 def test_axis_states_have_the_drives_numbers() -> None:

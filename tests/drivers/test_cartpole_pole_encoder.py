@@ -18,12 +18,9 @@ from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage,
 from deal_hw.drivers.cartpole.controller import Mode
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, flash_page
-from deal_hw.drivers.cartpole.odrive_emulator import (
-    ENABLE_WATCHDOG,
-    WATCHDOG_TIMEOUT,
-    OdriveFirmware,
-    PoleEncoder,
-)
+from deal_hw.drivers.cartpole.odrive_drive import OdriveFirmware
+from deal_hw.drivers.cartpole.odrive_emulator import PoleEncoder
+from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
 from deal_hw.drivers.cartpole.odrive_frames import IDLE, Command, pack
 from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveSettings
 from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot

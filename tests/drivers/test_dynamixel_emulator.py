@@ -168,7 +168,7 @@ def findings(faults: ServoFaults, tmp_path: Path) -> list[Finding]:
     device = DynamixelDevice(nominal_truth(), DynamixelSettings(baud_rate=faults.servo_baud_rate), faults)
 
     def at(path: str, rate: int, _: Clock) -> Transport:
-        device.host_baud_rate = rate
+        device.bus.host_baud_rate = rate
         return VirtualTransport(device, clock)
 
     return list(examine_servos("servos", clock, tmp_path, at))

@@ -275,13 +275,13 @@ def test_states_say_when_the_servo_got_a_command_however_late_this_computer_was(
     wire = Wire(lambda t: Late(t, received=None))
     wire.armed()
     accepted: list[int] = []
-    accept = wire.device._loop.accept
+    accept = wire.device._belt._loop.accept
 
     def note(target: Target) -> None:
         accepted.append(wire.device._tick)
         accept(target)
 
-    wire.device._loop.accept = note  # type: ignore[method-assign]
+    wire.device._belt._loop.accept = note  # type: ignore[method-assign]
     states = [state for k in range(1, 51) for state in wire.run(1, target=0.001 * k)]
     reported = {s.command_sequence: s.device_ns - s.command_age_ns for s in states if s.command_sequence > 0}
     assert all(s.command_age_ns >= 0 for s in states if s.command_sequence > 0)
@@ -393,7 +393,7 @@ def test_five_percent_of_corrupt_packets_in_both_directions_are_survived() -> No
 def test_servos_that_know_no_fast_read_are_asked_one_after_the_other() -> None:
     """An older firmware ignores Fast Sync Read: Sync Read gives the same states."""
     wire = Wire()
-    wire.device.fast_read = False
+    wire.device.bus.fast_read = False
     robot = wire.armed()
     assert robot.info is not None
     assert not robot.info.fast_sync_read
@@ -435,6 +435,61 @@ def test_a_servo_without_current_control_needs_the_other_mode() -> None:
     assert wire.device.true_position[0] > 0.01
 
 
+class Deaf(Transport):
+    """A wire that swallows requests.
+
+    Args:
+        inner: The wire.
+        swallows: Says of each request whether it is lost.
+    """
+
+    def __init__(self, inner: Transport, swallows: Callable[[bytes], bool]) -> None:
+        self.inner, self.swallows = inner, swallows
+
+    def open(self) -> None:
+        """Open the wire."""
+        self.inner.open()
+
+    def close(self) -> None:
+        """Close the wire."""
+        self.inner.close()
+
+    def send(self, message: Message) -> None:
+        """Pass a request on, or lose it."""
+        if not self.swallows(message.payload):
+            self.inner.send(message)
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the next bytes."""
+        return self.inner.receive(timeout_s)
+
+
+def test_servos_that_answer_after_a_pause_are_found() -> None:
+    """The computer pauses for ten pings, some 40 ms; then both answer the request to all, and their own."""
+    left = [10]
+
+    def swallows(request: bytes) -> bool:
+        left[0] -= 1
+        return left[0] >= 0
+
+    wire = Wire(lambda inner: Deaf(inner, swallows))
+    wire.robot.connect()
+    assert wire.robot.info is not None
+    assert (wire.robot.info.cart.id, wire.robot.info.pole.id) == (1, 2)
+
+
+def test_servos_that_only_answer_a_request_to_all_are_not_called_absent() -> None:
+    """Lost: every ping to one servo. The message counts the tries; it said "does not answer; these do"."""
+    wire = Wire(lambda inner: Deaf(inner, lambda request: request[4] != 0xFE and request[7] == 1))
+    with pytest.raises(TransportTimeoutError) as caught:
+        wire.robot.connect()
+    said = str(caught.value)
+    assert "servos 1 and 2 answered a request to all servos, but none of 10 requests" in said
+    assert "(20 without an answer within 3 ms, 0 corrupt)" in said
+    assert "answer_s" in said
+    assert "does not answer" not in said
+
+
 def test_two_servos_with_one_id_are_told() -> None:
     """Factory-new servos all have id 1: the message says who answers and how to separate them."""
     wire = Wire()
@@ -455,7 +510,7 @@ def test_two_servos_with_one_id_are_told() -> None:
 def test_another_baud_rate_is_silence_with_advice() -> None:
     """Servos of another rate do not answer; doctor looks at every rate."""
     wire = Wire()
-    wire.device.host_baud_rate = 57600
+    wire.device.bus.host_baud_rate = 57600
     with pytest.raises(TransportTimeoutError, match=r"New servos use 57600 baud.*doctor"):
         wire.robot.connect()
 

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage
+from deal_hw.drivers.cartpole.can_link import FRAME, REMOTE, Angle, CanLink, CanMessage
 from deal_hw.drivers.cartpole.controller import Controller, Firmware
 from deal_hw.drivers.cartpole.dynamixel import packets
 from deal_hw.drivers.cartpole.dynamixel.bus import Bus
 from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BYTES
 from deal_hw.drivers.cartpole.firmwares import usable_firmware
 from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings
-from deal_hw.drivers.cartpole.odrive_frames import Command, pack
+from deal_hw.drivers.cartpole.odrive_emulator import odrive_device
+from deal_hw.drivers.cartpole.odrive_frames import BROADCAST_NODE, LAYOUT, NODE_SHIFT, Command, pack
 from deal_hw.drivers.cartpole.odrive_link import DRIVE_NODE, ENCODER_NODE, OdriveLink, OdriveSettings
 from deal_hw.drivers.cartpole.sensor import Motor
 from deal_hw.drivers.cartpole.servo import Servo
@@ -93,6 +94,31 @@ def _odrive_frames() -> list[bytes]:
     return [drive + encoder.encode(_INFO) + samples + drive, drive, samples]
 
 
+def _drive_frames() -> list[bytes]:
+    """Return what a host may send to an ODrive: every frame of CANSimple, as data and as a remote frame."""
+    frames = []
+    for command, layout in LAYOUT.items():
+        identifier = DRIVE_NODE << NODE_SHIFT | command
+        data = bytes(range(1, layout.size + 1))
+        frames += [FRAME.pack(identifier, layout.size, data), FRAME.pack(identifier | REMOTE, 0, b"")]
+    return [b"".join(frames), *frames]
+
+
+def _hear_drive(data: bytes) -> None:
+    """Receive as an emulated ODrive and its encoder do, and run until every report was sent."""
+    device = odrive_device(nominal_truth(), OdriveSettings())
+    device.receive(data[: len(data) // FRAME.size * FRAME.size])
+    device.advance_to(25_000_000)
+
+
+def _other_command(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
+    """Return a sound frame to the drive with any number of a command and any data."""
+    length = rng.randrange(9)
+    flag = rng.choice((0, 0, REMOTE))
+    identifier = rng.choice((DRIVE_NODE, BROADCAST_NODE)) << NODE_SHIFT | rng.randrange(32) | flag
+    return data + FRAME.pack(identifier, length, rng.randbytes(length))
+
+
 def _read_odrive(data: bytes) -> None:
     link = OdriveLink(OdriveSettings(), VirtualClock())
     link.encode(protocol.Hello(1))
@@ -168,6 +194,9 @@ KINDS: dict[str, Kind] = {
     "wire_can": WireKind(make=_can_frames, read=_read_can, mutations=(damage_bytes,)),
     "wire_can_node": WireKind(make=_host_frames, read=_hear_host, mutations=(damage_bytes,)),
     "wire_odrive": WireKind(make=_odrive_frames, read=_read_odrive, mutations=(damage_bytes,)),
+    "wire_odrive_drive": WireKind(
+        make=_drive_frames, read=_hear_drive, mutations=(damage_bytes, _other_command)
+    ),
     "wire_slcan": WireKind(make=_lines, read=_read_lines, mutations=(damage_bytes,)),
     "wire_servo_requests": WireKind(
         make=_requests, read=_read_requests, mutations=(damage_bytes, mended(damage_bytes, _mend_packet))

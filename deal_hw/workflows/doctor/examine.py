@@ -130,6 +130,10 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
         yield from Go2Doctor(link, clock, config.seconds, config.state_check, config.simulator).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
+        if config.robot == "cartpole":
+            from deal_hw.drivers.cartpole.other_wires import name_other_wire
+
+            yield from name_other_wire(config.port, name, clock)
 
 
 def _transport(config: DoctorSettings) -> str:

@@ -38,7 +38,7 @@ class ServoEmulator(CartpoleEmulator):
         data = super()._read(wait_s)
         if data:
             speed = termios.tcgetattr(self._master)[_OUTPUT_SPEED]
-            self._servos.host_baud_rate = _SPEEDS.get(speed, 0)
+            self._servos.bus.host_baud_rate = _SPEEDS.get(speed, 0)
         return data
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -83,6 +84,10 @@ class DynamixelInfo:
     effort_limit: int
 
 
+def _named(servos: Sequence[int]) -> str:
+    return ("servo " if len(servos) == 1 else "servos ") + " and ".join(map(str, servos))
+
+
 def model_name(number: int) -> str:
     """Return a model's name, or a text with its number if the SDK knows no name."""
     try:
@@ -105,6 +110,7 @@ class Examination:
         self._bus, self._settings, self._clock, self._where = bus, settings, clock, where
         self.repeated = 0
         """Number of repeated requests."""
+        self._silent = self._corrupt = 0
 
     def run(self, state_rate_hz: float) -> DynamixelInfo:
         """Return what was found.
@@ -181,14 +187,25 @@ class Examination:
                     f"its register Protocol Type (13) to 2 {_WIZARD}, or update its firmware"
                 )
         others = self._bus.broadcast_ping(_LISTEN_S)
+        self._ask_again(found, others)
         missing = [servo for servo in (s.cart_id, s.pole_id) if servo not in found]
+        if not missing:
+            return found
+        if late := [servo for servo in missing if servo in others]:
+            raise TransportTimeoutError(
+                f"{self._where}: {_named(late)} answered a request to all servos, but none of {2 * _TRIES} "
+                f"requests to each alone ({self._silent} without an answer within "
+                f"{1e3 * s.answer_s:g} ms, {self._corrupt} corrupt): the computer is too busy, the line is "
+                "noisy, or another program uses the port. End other programs, check cable and supply, or "
+                "allow more time: --port 'PORT?answer_s=0.02'"
+            )
         if found or others:
             there = {**others, **found}
-            silent = " and ".join(map(str, missing))
+            verb = "does" if len(missing) == 1 else "do"
             listed = ", ".join(f"{i} ({model_name(a.model)})" for i, a in sorted(there.items()))
             raise TransportTimeoutError(
-                f"{self._where}: servo {silent} does not answer; these do: {listed}. Every new servo has "
-                "id 1, and two servos with the same id corrupt each other's answers: connect one alone, "
+                f"{self._where}: {_named(missing)} {verb} not answer; these do: {listed}. Every new servo "
+                "has id 1, and two servos with the same id corrupt each other's answers: connect one alone, "
                 f"set its id {_WIZARD}, then connect both"
             )
         if self._bus.heard:
@@ -201,6 +218,13 @@ class Examination:
             f"{self._where}: no servo answers at {s.baud_rate} baud; check their supply and the port. New "
             "servos use 57600 baud: `deal-hw doctor cartpole --transport dynamixel` tries every rate"
         )
+
+    def _ask_again(self, found: dict[int, Answer], others: dict[int, Answer]) -> None:
+        """Ping those again that only answered a request to all: a pause of the computer may be over."""
+        for servo in (self._settings.cart_id, self._settings.pole_id):
+            if servo in others and servo not in found:
+                with contextlib.suppress(TransportTimeoutError, FrameError):
+                    found[servo] = self._retry(partial(self._bus.ping, servo))
 
     def _check_model(self, servo: int, answer: Answer) -> None:
         needed = [register.name for register in NEEDED]
@@ -254,6 +278,8 @@ class Examination:
             except (TransportTimeoutError, FrameError) as caught:
                 error = caught
                 self.repeated += 1
+                self._silent += isinstance(caught, TransportTimeoutError)
+                self._corrupt += isinstance(caught, FrameError)
         if error is None:
             raise RuntimeError("unreachable: _TRIES is above 0")
         raise error

@@ -1,4 +1,4 @@
-"""The part of the X-series control table that driver and emulator use.
+"""The X-series control table, and the units of its registers.
 
 Source: ROBOTIS e-Manual, control tables of XL330-M077-T and the other X models, which agree in these
 addresses (``dynamixel_easy_sdk`` carries the same tables; a test compares).
@@ -22,10 +22,10 @@ WATCHDOG_TRIPPED: Final = 0xFF
 TICK_PERIOD_MS: Final = 32768
 """Realtime Tick counts milliseconds from 0 and starts again here."""
 RETURN_DELAY_UNIT_S: Final = 2e-6
-REVERSE_MODE, TIME_BASED_PROFILE = 1, 4
+REVERSE_MODE, TIME_BASED_PROFILE, TORQUE_BY_GOAL = 1, 4, 8
 """Bits of Drive Mode."""
-PROFILE_ONGOING: Final = 2
-"""Bit of Moving Status: the set-point has not reached the goal."""
+IN_POSITION, PROFILE_ONGOING, RECTANGULAR_PROFILE = 1, 2, 0x10
+"""Bits of Moving Status: at the goal; the set-point has not reached the goal; Profile Velocity limits it."""
 
 
 class Register(NamedTuple):
@@ -37,19 +37,35 @@ class Register(NamedTuple):
 
 
 MODEL_NUMBER = Register(0, 2, "Model Number")
+MODEL_INFORMATION = Register(2, 4, "Model Information")
 FIRMWARE_VERSION = Register(6, 1, "Firmware Version")
 ID = Register(7, 1, "ID")
 BAUD_RATE = Register(8, 1, "Baud Rate")
 RETURN_DELAY_TIME = Register(9, 1, "Return Delay Time")
 DRIVE_MODE = Register(10, 1, "Drive Mode")
 OPERATING_MODE = Register(11, 1, "Operating Mode")
+SECONDARY_ID = Register(12, 1, "Secondary(Shadow) ID")
 PROTOCOL_TYPE = Register(13, 1, "Protocol Type")
+HOMING_OFFSET = Register(20, 4, "Homing Offset")
+MOVING_THRESHOLD = Register(24, 4, "Moving Threshold")
+TEMPERATURE_LIMIT = Register(31, 1, "Temperature Limit")
+MAX_VOLTAGE_LIMIT = Register(32, 2, "Max Voltage Limit")
+MIN_VOLTAGE_LIMIT = Register(34, 2, "Min Voltage Limit")
 PWM_LIMIT = Register(36, 2, "PWM Limit")
 CURRENT_LIMIT = Register(38, 2, "Current Limit")
+VELOCITY_LIMIT = Register(44, 4, "Velocity Limit")
+MAX_POSITION_LIMIT = Register(48, 4, "Max Position Limit")
+MIN_POSITION_LIMIT = Register(52, 4, "Min Position Limit")
+STARTUP_CONFIGURATION = Register(60, 1, "Startup Configuration")
+PWM_SLOPE = Register(62, 1, "PWM Slope")
+SHUTDOWN = Register(63, 1, "Shutdown")
 TORQUE_ENABLE = Register(64, 1, "Torque Enable")
 LED = Register(65, 1, "LED")
 STATUS_RETURN_LEVEL = Register(68, 1, "Status Return Level")
+REGISTERED_INSTRUCTION = Register(69, 1, "Registered Instruction")
 HARDWARE_ERROR = Register(70, 1, "Hardware Error Status")
+VELOCITY_I_GAIN = Register(76, 2, "Velocity I Gain")
+VELOCITY_P_GAIN = Register(78, 2, "Velocity P Gain")
 POSITION_D_GAIN = Register(80, 2, "Position D Gain")
 POSITION_I_GAIN = Register(82, 2, "Position I Gain")
 POSITION_P_GAIN = Register(84, 2, "Position P Gain")
@@ -58,16 +74,25 @@ FEEDFORWARD_1ST = Register(90, 2, "Feedforward 1st Gain")
 BUS_WATCHDOG = Register(98, 1, "Bus Watchdog")
 GOAL_PWM = Register(100, 2, "Goal PWM")
 GOAL_CURRENT = Register(102, 2, "Goal Current")
+GOAL_VELOCITY = Register(104, 4, "Goal Velocity")
 PROFILE_ACCELERATION = Register(108, 4, "Profile Acceleration")
 PROFILE_VELOCITY = Register(112, 4, "Profile Velocity")
 GOAL_POSITION = Register(116, 4, "Goal Position")
 REALTIME_TICK = Register(120, 2, "Realtime Tick")
+MOVING = Register(122, 1, "Moving")
 MOVING_STATUS = Register(123, 1, "Moving Status")
+PRESENT_PWM = Register(124, 2, "Present PWM")
 PRESENT_CURRENT = Register(126, 2, "Present Current")
 PRESENT_VELOCITY = Register(128, 4, "Present Velocity")
 PRESENT_POSITION = Register(132, 4, "Present Position")
+VELOCITY_TRAJECTORY = Register(136, 4, "Velocity Trajectory")
+POSITION_TRAJECTORY = Register(140, 4, "Position Trajectory")
 PRESENT_INPUT_VOLTAGE = Register(144, 2, "Present Input Voltage")
 PRESENT_TEMPERATURE = Register(146, 1, "Present Temperature")
+INDIRECT_ADDRESS = Register(168, 2, "Indirect Address 1")
+INDIRECT_DATA = Register(224, 1, "Indirect Data 1")
+INDIRECT_COUNT: Final = 28
+"""Number of indirect addresses (168 to 223) and of indirect data bytes (224 to 251)."""
 
 NEEDED: Final = (
     OPERATING_MODE,
@@ -85,10 +110,14 @@ NEEDED: Final = (
 
 
 class OperatingMode(enum.IntEnum):
-    """Values of Operating Mode with more than one turn."""
+    """Values of Operating Mode."""
 
+    CURRENT = 0
+    VELOCITY = 1
+    POSITION = 3
     EXTENDED_POSITION = 4
     CURRENT_BASED_POSITION = 5
+    PWM = 16
 
 
 BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)

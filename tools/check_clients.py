@@ -1,0 +1,263 @@
+"""Run other people's programs against the emulators, and keep what they print.
+
+    python tools/check_clients.py FOLDER
+    python tools/check_clients.py FOLDER --only can_simple.py read_write.py --transcript clients.md
+
+FOLDER holds your own checkouts: ODriveResources (odriverobotics), DynamixelSDK (ROBOTIS-GIT), lerobot
+(huggingface, v0.4.4: later versions need Python 3.12) and unitree_sdk2_python (unitreerobotics). What is not
+there is left out. Programs run unchanged, but for the port or bus that they open by name
+(tools/clients/sitecustomize.py), in a terminal where this tool presses the keys. Each has its own emulator. A
+program that fails is tried three times, because its time limits are short for a busy machine; the table shows
+the tries. Programs with packages of their own get an environment below --environments. The exit code is 1 if
+one fails.
+
+Unitree's SDK needs cyclonedds 0.10.2: name a Python that has it with --unitree-python. On `lo` it needs
+multicast, which a network of its own allows:
+
+    unshare -rn sh -c 'ip link set lo up multicast on; python tools/check_clients.py FOLDER ...'
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pty
+import re
+import select
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+from clients.programs import CLIENTS, Client
+from dynamixel_sdk import PacketHandler, PortHandler
+
+from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
+from deal_hw.drivers.cartpole.odrive_endpoints import flat_endpoints
+from deal_hw.drivers.cartpole.odrive_frames import (
+    LAYOUT,
+    PASSTHROUGH,
+    POSITION_CONTROL,
+    VELOCITY_CONTROL,
+    Command,
+)
+from deal_hw.errors import TransportError
+from deal_hw.workflows.emulation.process import EmulatorProcess
+
+TOOLS = Path(__file__).resolve().parent / "clients"
+_TRIES = 3
+_BITRATE = 500_000
+_HESITATION_S = 0.5
+"""Time before a key is pressed: a program sets the terminal up after its prompt, and forgets earlier keys."""
+_HEAD, _TAIL = 14, 8
+"""Lines of a program's output that the transcript keeps."""
+_CONFIG = {
+    "axis0.controller.config.control_mode": POSITION_CONTROL,
+    "axis0.controller.config.pos_gain": 10.0,
+    "axis0.controller.config.vel_limit": 50.0,
+    "axis0.config.enable_watchdog": False,
+}
+"""Settings that can_restore_config.py writes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """What a program did.
+
+    Attributes:
+        client: The program.
+        tries: How often it was run.
+        output: What it printed.
+        faults: What was wrong; empty: it passed.
+    """
+
+    client: Client
+    tries: int
+    output: str
+    faults: tuple[str, ...]
+
+
+def run_in_terminal(
+    command: Sequence[str], client: Client, folder: Path, environment: Mapping[str, str]
+) -> tuple[str, int]:
+    """Run a program in a pseudo-terminal and press its keys; return what it printed, and its exit code."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, stdin=slave, stdout=slave, stderr=slave, start_new_session=True
+    )
+    os.close(slave)
+    output, seen, keys = "", 0, list(client.keys)
+    begin_s = time.monotonic()
+    due_s: float | None = None
+    stopped = False
+    try:
+        while True:
+            passed_s = time.monotonic() - begin_s
+            if passed_s > client.limit_s:
+                process.kill()
+                output += f"\nstopped after {client.limit_s:g} s\n"
+                break
+            if client.stop_after_s and passed_s > client.stop_after_s and not stopped:
+                process.send_signal(signal.SIGINT)
+                stopped = True
+            if select.select([master], [], [], 0.1)[0]:
+                try:
+                    data = os.read(master, 4096)
+                except OSError:  # The program closed its side.
+                    break
+                output += data.decode(errors="replace")
+            elif process.poll() is not None:
+                break
+            if keys and due_s is None and (at := output.find(keys[0][0], seen)) >= 0:
+                seen, due_s = at + len(keys[0][0]), passed_s + _HESITATION_S
+            if due_s is not None and passed_s >= due_s:
+                os.write(master, keys.pop(0)[1].encode())
+                due_s = None
+    finally:
+        code = process.wait()
+        os.close(master)
+    return output.replace("\r\n", "\n").replace("\r", "\n"), code
+
+
+def prepare(client: Client, port: str, folder: Path) -> None:
+    """Do what a user does before the program: write its files, set the device up."""
+    if "endpoints" in client.files:
+        (folder / "flat_endpoints.json").write_text(json.dumps(flat_endpoints()))
+    if "config" in client.files:
+        (folder / "config.json").write_text(json.dumps(_CONFIG))
+    if client.prepare == "velocity":
+        with can.interface.Bus(port, interface="slcan", bitrate=_BITRATE, sleep_after_open=0.1) as bus:
+            for command, values in (
+                (Command.SET_CONTROLLER_MODE, (VELOCITY_CONTROL, PASSTHROUGH)),
+                (Command.SET_VEL_GAINS, (0.02, 0.1)),
+            ):
+                data = LAYOUT[command].pack(*values)
+                bus.send(can.Message(arbitration_id=int(command), data=data, is_extended_id=False))
+            time.sleep(0.2)
+    elif client.prepare == "factory":
+        handler = PortHandler(port)
+        handler.setBaudRate(client.servo_rate)
+        for servo in (1, 2):
+            PacketHandler(2.0).factoryReset(handler, servo, KEEP_ID_AND_BAUD)
+        time.sleep(1.5 * BOOT_NS / 1e9)
+        handler.closePort()
+
+
+def check(client: Client, folder: Path, python: Path) -> Run:
+    """Run a program until it passes, twice at most."""
+    run = Run(client=client, tries=0, output="", faults=("not run",))
+    while run.faults and run.tries < _TRIES:
+        try:
+            output, code = _once(client, folder, python)
+        except TransportError as error:
+            output, code = f"the emulator: {error}", -1
+        faults = [
+            f"no {pattern!r} in its output" for pattern in client.must if not re.search(pattern, output)
+        ]
+        faults += [f"{text!r} in its output" for text in client.must_not if text in output]
+        faults += [] if code in client.exit_codes else [f"exit code {code}"]
+        run = Run(client=client, tries=run.tries + 1, output=output, faults=tuple(faults))
+    return run
+
+
+def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
+    with tempfile.TemporaryDirectory() as name, EmulatorProcess(*client.emulator) as emulator:
+        work = Path(name)
+        port = emulator.port.partition("?")[0].removeprefix("slcan:")
+        prepare(client, port, work)
+        places = {"source": folder / client.source, "port": port, "tools": TOOLS}
+        command = [str(python), "-u", *(part.format(**places) for part in client.command)]
+        paths = [TOOLS, *(folder / path for path in client.paths)]
+        environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join(map(str, paths)),
+            "DEAL_HW_CLIENT_PORTS": f"{client.opens}={port}" if client.opens else "",
+        }
+        return run_in_terminal(command, client, work, environment)
+
+
+def python_of(client: Client, folder: Path, pip_args: list[str]) -> Path:
+    """Return the Python of a program, after making its environment if necessary.
+
+    The environment sees the packages of deal-hw's own, so that torch is not installed twice.
+    """
+    if not client.packages:
+        return Path(sys.executable)
+    home = folder / client.name
+    python, ready = home / "bin" / "python", home / ".ready"
+    if not ready.exists():
+        subprocess.run([sys.executable, "-m", "venv", "--clear", str(home)], check=True)
+        (packages,) = home.glob("lib/python3*/site-packages")
+        own = [path for path in sys.path if path.endswith("site-packages")]
+        (packages / "deal_hw_packages.pth").write_text("\n".join(own) + "\n")
+        call = [str(python), "-m", "pip", "install", "--quiet", *pip_args, *client.packages]
+        subprocess.run(call, check=True, capture_output=True, text=True)
+        ready.touch()
+    return python
+
+
+def transcript(runs: Sequence[Run]) -> str:
+    """Return the beginning and the end of what each program printed, as Markdown."""
+    out = ["# What other people's programs printed\n\nWritten by `tools/check_clients.py`.\n"]
+    for run in runs:
+        lines = [line.rstrip() for line in run.output.splitlines() if line.strip()]
+        if len(lines) > _HEAD + _TAIL:
+            left = len(lines) - _HEAD - _TAIL
+            lines = [*lines[:_HEAD], f"... {left} lines ...", *lines[-_TAIL:]]
+        verdict = "pass" if not run.faults else "FAIL: " + "; ".join(run.faults)
+        text = "\n".join("    " + re.sub(r"/\S*/", "", line)[:110] for line in lines)
+        arguments = " ".join(run.client.command[1:]).replace("{port}", "PORT")
+        out.append(
+            f"## {run.client.name} {arguments}".rstrip() + f"\n\n{verdict}, try {run.tries}\n\n{text}\n"
+        )
+    return "\n".join(out)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print a row for each program; return 1 if one fails."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path, help="folder of your checkouts")
+    parser.add_argument("--only", nargs="*", help="these programs")
+    parser.add_argument("--environments", type=Path, default=Path("build/clients"), help="kept")
+    parser.add_argument("--pip-args", default="", help="passed on to every `pip install`")
+    parser.add_argument("--unitree-python", type=Path, help="a Python with cyclonedds 0.10.2 and numpy")
+    parser.add_argument("--transcript", type=Path, help="a Markdown file for what they print")
+    options = parser.parse_args(arguments)
+    folder = options.folder.resolve()
+    chosen = [c for c in CLIENTS if not options.only or c.name in options.only]
+    runs = []
+    print("| program | result | tries |\n|---|---|---|", flush=True)
+    for client in chosen:
+        if not (folder / client.source).exists():
+            print(f"| {client.name} | skipped: no {client.source} | |", flush=True)
+            continue
+        if client.own_python and options.unitree_python is None:
+            print(f"| {client.name} | skipped: no --unitree-python | |", flush=True)
+            continue
+        try:
+            python = (
+                options.unitree_python
+                if client.own_python
+                else python_of(client, options.environments.resolve(), shlex.split(options.pip_args))
+            )
+        except subprocess.CalledProcessError as error:
+            runs.append(Run(client=client, tries=0, output=str(error.stderr), faults=("not installed",)))
+        else:
+            runs.append(check(client, folder, python))
+        verdict = "; ".join(runs[-1].faults) or "pass"
+        print(f"| {client.name} | {verdict} | {runs[-1].tries} |", flush=True)
+    if options.transcript is not None:
+        options.transcript.write_text(transcript(runs))
+    return int(any(run.faults for run in runs))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

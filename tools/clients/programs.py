@@ -1,0 +1,177 @@
+"""The programs that ``tools/check_clients.py`` runs: where they lie, what they need, what they must print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+ODRIVE: Final = "ODriveResources/examples/"
+SERVOS: Final = "DynamixelSDK/python/tests/protocol2_0/"
+DYNAMIXEL: Final = ("cartpole", "--transport", "dynamixel", "--profile", "ideal")
+NEXT: Final = "Press any key"
+"""What ROBOTIS' examples print before they wait for a key."""
+ESCAPE: Final = "\x1b"
+NO_ERROR: Final = ("Traceback", "[TxRxResult]", "[RxPacketError]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Client:
+    """A program of somebody else.
+
+    Attributes:
+        name: Its name in the table.
+        source: File or folder below the user's folder that must be there.
+        command: Arguments after Python; ``{source}``, ``{port}`` and ``{tools}`` are replaced.
+        emulator: Arguments of ``deal-hw emulate``.
+        opens: The port or bus that the program opens by name; "" if it takes it as an argument.
+        paths: Folders below the user's folder for PYTHONPATH.
+        packages: Packages that it needs beside those of deal-hw.
+        own_python: Whether the user must name its Python, because no environment can be made for it here.
+        prepare: What the user does before: "velocity" sets an ODrive to velocity control, "factory" resets
+            servos, except id and rate.
+        files: Files in its working folder: "endpoints" and "config" of the emulated ODrive.
+        servo_rate: Baud rate of the servos.
+        keys: Pairs: what is printed, and the keys to press then; each once, in this order.
+        must: Regular expressions that its output must contain.
+        must_not: Texts that its output must not contain.
+        stop_after_s: An endless program is stopped by Ctrl-C after this time [s].
+        limit_s: Longest run [s].
+        exit_codes: Allowed exit codes.
+    """
+
+    name: str
+    source: str
+    command: tuple[str, ...]
+    emulator: tuple[str, ...]
+    opens: str = ""
+    paths: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ()
+    own_python: bool = False
+    prepare: Literal["", "velocity", "factory"] = ""
+    files: tuple[Literal["endpoints", "config"], ...] = ()
+    servo_rate: int = 57_600
+    keys: tuple[tuple[str, str], ...] = ()
+    must: tuple[str, ...] = ()
+    must_not: tuple[str, ...] = NO_ERROR
+    stop_after_s: float = 0.0
+    limit_s: float = 90.0
+    exit_codes: tuple[int, ...] = (0,)
+
+
+def _odrive(name: str, *arguments: str, **more: object) -> Client:
+    emulator = ("cartpole", "--transport", "odrive", "--node", "0", "--profile", "ideal", "--nominal")
+    return Client(
+        name=name,
+        source=ODRIVE + name,
+        command=("{source}", *arguments),
+        emulator=emulator,
+        opens="can0",
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def _servos(name: str, rate: int = 57_600, **more: object) -> Client:
+    return Client(
+        name=name,
+        source=SERVOS + name,
+        command=("{source}",),
+        emulator=(*DYNAMIXEL, "--servo-baud-rate", str(rate)),
+        servo_rate=rate,
+        opens="/dev/ttyUSB0",
+        paths=("DynamixelSDK/python/src",),
+        prepare="factory",
+        **more,  # type: ignore[arg-type]
+    )
+
+
+BUS: Final = ("-c", "can0")
+MOVE: Final = ((NEXT, " "), (NEXT, " "), (NEXT, ESCAPE))
+REACHED: Final = (r"\[ID:001\] GoalPos:0+ +PresPos", r"\[ID:001\] GoalPos:4095")
+
+CLIENTS: Final = (
+    _odrive(
+        "can_simple.py",
+        prepare="velocity",
+        stop_after_s=6.0,
+        must=(r"pos: [\d.-]+ \[turns\], vel: 0\.[5-9]", r"vel: -0\.[5-9]"),
+        must_not=(),
+        exit_codes=(130, 1, -2),
+    ),
+    _odrive(
+        "can_enumerate.py", *BUS, must=(r"Discovered ODrive \w{12} \(node ID 0\)", "Discovered 1 ODrives")
+    ),
+    _odrive(
+        "can_enumerate.py",
+        *BUS,
+        "--save-config",
+        "motor=5",
+        keys=(("Enter a number", "0\n"),),
+        must=(
+            "Which one is flashing",
+            "Assigning new node IDs to 1 ODrives",
+            "Saving configuration on 1 ODrives",
+        ),
+    ),
+    _odrive(
+        "can_param_access.py",
+        files=("endpoints",),
+        must=(r"received: 1\.2339\d+", r"received: \[0\.0\]"),
+    ),
+    _odrive(
+        "can_restore_config.py",
+        *BUS,
+        "--node-id",
+        "0",
+        "--endpoints-json",
+        "flat_endpoints.json",
+        "--config",
+        "config.json",
+        "--save-config",
+        files=("endpoints", "config"),
+        must=("checking version", "writing 4 variables", "saving configuration"),
+    ),
+    _odrive("can_calibrate.py", *BUS, "--node-id", "0", must=("Calibration successful!",)),
+    _servos("ping.py", must=(r"ping Succeeded. Dynamixel model number : 1190",)),
+    _servos("broadcast_ping.py", must=(r"\[ID:001\] model version : 1190", r"\[ID:002\]")),
+    _servos("read_write.py", keys=MOVE, must=REACHED),
+    _servos("sync_read_write.py", keys=MOVE, must=REACHED),
+    _servos("bulk_read_write.py", keys=MOVE, must=(r"\[ID:001\] Present Position", r"LED Value")),
+    _servos("fast_sync_read.py", 1_000_000, keys=MOVE, must=REACHED),
+    _servos("fast_bulk_read.py", 1_000_000, keys=MOVE, must=(r"Present Position: \d+", r"LED Value: 1")),
+    _servos("indirect_address.py", keys=MOVE, must=(r"GoalPos:0 .* IsMoving:1", r"GoalPos:4095 ")),
+    _servos("reboot.py", keys=((NEXT, " "),), must=("reboot Succeeded",)),
+    _servos(
+        "factory_reset.py",
+        must=("factoryReset Success!", "DXL baudnum is now : 1", "Dynamixel Baudnum is now : 1"),
+    ),
+    _servos(
+        "clear_multi_turn.py",
+        keys=((NEXT, " "), ("GoalPos:1048575", " "), (NEXT, ESCAPE)),
+        must=("Operating mode changed", r"Present Position has been reset. : \d{3,4}\b"),
+    ),
+    Client(
+        name="DynamixelMotorsBus",
+        source="lerobot/src/lerobot/motors",
+        command=("{tools}/half_turn_homing.py", "{port}"),
+        emulator=DYNAMIXEL,
+        paths=("lerobot/src",),
+        packages=("deepdiff", "tqdm", "draccus", "accelerate", "datasets"),
+        must=(
+            r"range_min=0, range_max=4095",
+            r"position after half-turn homing: 2047",
+            r"position after a move to 2400: 2(3[89]|4[01])\d",
+        ),
+    ),
+    Client(
+        name="go2_stand_example.py",
+        source="unitree_sdk2_python/example/go2/low_level/go2_stand_example.py",
+        command=("{source}", "{port}"),
+        emulator=("go2", "--transport", "dds", "--port", "lo"),
+        paths=("unitree_sdk2_python",),
+        own_python=True,
+        keys=(("Press Enter", "\n"),),
+        must=("Done!",),
+        # The example ends with sys.exit(-1).
+        exit_codes=(255,),
+    ),
+)
