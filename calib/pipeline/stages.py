@@ -267,6 +267,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             latency_interval_s=known.latency_interval_s,
             chi2=found.chi2,
             alarms=known.alarms,
+            biased=known.biased,
             steps=problem.steps - steps + attempts.earlier_steps,
             seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
@@ -472,7 +473,7 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
     alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    return conclude_fit(wide, None, fit).but(alarm, diagnosis=[dataclasses.asdict(play.diagnosis)])
+    return conclude_fit(wide, None, fit).but(alarm, diagnosis=[play.diagnosis.to_json()])
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

@@ -27,7 +27,7 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.diagnosis import PlayFit, diagnose
+from deal_hw.calib.validation.diagnosis import Diagnosis, PlayFit, diagnose
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calibration import Z90, Alarm, listed
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
@@ -57,6 +57,9 @@ class CheckSettings:
 
 
 SETTINGS = CheckSettings()
+
+LATENCY = "latency"
+"""Name of the latency among the values that a cause moves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,7 +163,34 @@ def with_causes(
     """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
     found = diagnose(problem, refined, fitted)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
-    return known.with_alarms(*alarms), [dataclasses.asdict(f) for f in found]
+    return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
+
+
+def biased(problem: Problem, known: Uncertainty, causes: Sequence[Diagnosis]) -> Uncertainty:
+    """Return ``known`` with intervals widened by the shift of each cause, and marks on what it moves.
+
+    A cause moves a value that would leave its interval, or that ended at a bound which the data press. Such a
+    value compensates for the cause.
+    """
+    if not causes:
+        return known
+    K = len(known.space)
+    std = np.sqrt(np.diag(known.covariance))
+    shifts = [np.zeros(K + 1) if not len(c.shift) else np.abs(c.shift) for c in causes]
+    total = np.sum(shifts, axis=0)
+    marks = dict(known.biased)
+    for k, name in enumerate(known.space.names):
+        most = int(np.argmax([shift[k] for shift in shifts]))
+        if total[k] > Z90 * std[k] or known.bound[k]:
+            marks[name] = causes[most].cause
+    known = dataclasses.replace(known.widened_to(std + total[:K] / Z90), biased=marks)
+    if problem.fixed_latency_s is not None or not total[-1]:
+        return known
+    (first, last), (low, high) = problem.latency_range_s, known.latency_interval_s
+    if total[-1] > max((high - low) / 2, 0.5 * problem.episodes[0].step_s):
+        marks[LATENCY] = causes[int(np.argmax([shift[-1] for shift in shifts]))].cause
+    wider = (max(low - total[-1], first), min(high + total[-1], last))
+    return dataclasses.replace(known, latency_interval_s=wider, biased=marks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,9 +10,10 @@ the residual is large: beside random forces of constant size, it must make the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
+from deal_hw.calib.validation.cause_words import LOOKS, SearchedKinds, advice
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
@@ -72,52 +74,6 @@ class DiagnosisSettings:
 
 SETTINGS = DiagnosisSettings()
 
-LOOKS: Mapping[Cause, tuple[str, str, str]] = {
-    "friction": (
-        "a force against slow motion",
-        "Friction depends on speed (Stribeck), or creeps where it should hold.",
-        "Free dof_friction_creep, dof_frictionloss and dof_damping of {} (--parameters).",
-    ),
-    "backlash": (
-        "play in the gear",
-        "The joint does not follow its motor at once when the motor turns back.",
-        "Repair the gear of {}, or free servo_play there (--parameters).",
-    ),
-    "delay": (
-        "a timing error that changes",
-        "The delay of commands or sensors varies; the model's is constant.",
-        "End other programs on the computer that sends, send at an even pace, or time-stamp commands where "
-        "they are received{}.",
-    ),
-    "damping": (
-        "a force that grows with speed",
-        "Damping was not free, or follows another law (the square of speed).",
-        "Free dof_damping or servo_damping of {} (--parameters); if they are free already, check the law.",
-    ),
-    "inertia": (
-        "a force in proportion to acceleration",
-        "An inertia or a gain was not free, or its range is too narrow.",
-        "Free dof_armature, body_mass or the actuator's gain of {} (--parameters).",
-    ),
-    "load": (
-        "a constant force",
-        "A mass, its centre or an encoder's zero was not free.",
-        "Free encoder_bias, body_mass or body_ipos of {} (--parameters).",
-    ),
-    "mass": (
-        "another mass",
-        "The ratio of the bodies' masses is not the model's.",
-        "Weigh {}, correct the model, or free body_mass there (--parameters).",
-    ),
-    "contact": (
-        "bursts",
-        "The robot may touch something that the model does not have.",
-        "Look at {}. If it touched something, record without that. Recordings in files (--data) can leave it "
-        "out (--leave-out).",
-    ),
-}
-"""For each cause: how the residual looks, what it means, and what to do, with {} for the place."""
-
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
@@ -129,6 +85,8 @@ class Diagnosis:
         deviance: Gain in held-out deviance.
         joints: Joints or bodies that show it, strongest first.
         alarm: The alarm for the user.
+        shift: Change of the estimates where the fit may have this effect, too: of each parameter in its own
+            scale, then of the latency [s], (K + 1,); empty where it was not estimated.
     """
 
     cause: Cause
@@ -136,6 +94,18 @@ class Diagnosis:
     deviance: float
     joints: tuple[str, ...]
     alarm: Alarm
+    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "cause": self.cause,
+            "share": self.share,
+            "deviance": self.deviance,
+            "joints": list(self.joints),
+            "alarm": dataclasses.asdict(self.alarm),
+            "shift": self.shift.tolist(),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +161,7 @@ class Evidence:
         period_s: Sampling period [s].
         time_s: Time of each sample in its recording, per episode (W, H) [s].
         names: Names of the recordings, per episode.
+        searched: What the fit searched.
     """
 
     rows: Sequence[WindowRows]
@@ -200,6 +171,7 @@ class Evidence:
     period_s: float
     time_s: Sequence[FloatArray]
     names: Sequence[str]
+    searched: SearchedKinds = field(default_factory=SearchedKinds)
 
     @cached_property
     def _following(self) -> list[FloatArray]:
@@ -300,6 +272,7 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
             for e, d in zip(episodes, data, strict=True)
         ],
         names=[e.name for e in episodes],
+        searched=SearchedKinds.of(problem, refined.theta),
     )
 
 
@@ -384,7 +357,11 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
         f"With play in the gears ({sizes}) the model predicts motion that it was not fitted to with chi2 "
         f"{with_play.chi2:.3g} instead of {without.chi2:.3g}: backlash."
     )
-    cause = _finding("backlash", share, deviance, joints, listed(joints), seen_words)
+    space = problem.space
+    shift = np.append(space.to_scale(own) - space.to_scale(refined.theta), fit.latency_s - refined.latency_s)
+    looks = LOOKS["backlash"]
+    alarm = Alarm(seen_words, looks[1], looks[2].replace("{}", listed(joints)))
+    cause = Diagnosis("backlash", share, deviance, tuple(joints), alarm, shift)
     theta = np.concatenate([fit.theta[: len(problem.space)], found[order]])
     return Play(cause, problem.with_more(named), theta, fit.latency_s, with_play.chi2)
 
@@ -395,10 +372,13 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
     taken: list[Signature] = []
     groups = _groups(known.found)
     while groups and len(found) < SETTINGS.most:
+        groups = [group for group in groups if _possible(known, taken, group)]
         gains = [known.gain(taken, group) for group in groups]
+        if not gains or max(gains) <= MISMATCH.evidence:
+            break
         group = groups[int(np.argmax(gains))]
         share = 1 - float(np.exp(-max(gains) / known.count))
-        if max(gains) <= MISMATCH.evidence or share <= SETTINGS.noticed:
+        if share <= SETTINGS.noticed:
             break
         found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
@@ -421,14 +401,15 @@ def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
     ]
 
 
-def _finding(
-    cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str, seen: str = ""
-) -> Diagnosis:
-    looks, means, do = LOOKS[cause]
-    if not seen:
-        seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: {cause}."
-    alarm = Alarm(seen, means, do.replace("{}", where))
-    return Diagnosis(cause, float(share), float(deviance), tuple(joints), alarm)
+def _possible(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> bool:
+    """Return whether a cause leaves every mass above 0."""
+    return group[0].cause != "mass" or _mass_change(known, taken, group[0]) > -1.0
+
+
+def _mass_change(known: Evidence, taken: Sequence[Signature], body: Signature) -> float:
+    """Return the change of a body's mass that the residual asks for, as a share of it."""
+    # The signature is a change per share of the mass; the residual is prediction minus measurement.
+    return -float(known.coefficients([*taken, body])[-1])
 
 
 def _cause_diagnosis(
@@ -436,32 +417,56 @@ def _cause_diagnosis(
 ) -> Diagnosis:
     cause = group[0].cause
     if cause == "mass":
-        return _mass_diagnosis(known, taken, share, deviance)
-    gains = np.array([known.gain(taken, [signature]) for signature in group])
-    order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
-    joints = [group[k].where for k in order[:4]]
-    return _finding(cause, share, deviance, joints, listed(joints))
+        found = _mass_diagnosis(known, taken, share, deviance)
+    else:
+        gains = np.array([known.gain(taken, [signature]) for signature in group])
+        order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
+        joints = [group[k].where for k in order[:4]]
+        found = _diagnosis(known, cause, share, deviance, joints)
+    P = len(known.prior)
+    before, after = (known.coefficients(these)[:P] for these in (taken, [*taken, *group]))
+    # The residual is prediction minus measurement: a parameter moves against its coefficient.
+    return dataclasses.replace(found, shift=before - after)
+
+
+def _diagnosis(
+    known: Evidence, cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str = ""
+) -> Diagnosis:
+    means, do = advice(cause, joints, where or listed(joints), known.searched)
+    looks = LOOKS[cause][0]
+    seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: {cause}."
+    return Diagnosis(cause, float(share), float(deviance), tuple(joints), Alarm(seen, means, do))
 
 
 def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
-    """Name each body that explains about as much: without a known torque, motion shows mass ratios only."""
-    bodies = [s for s in known.found if s.cause == "mass"]
-    gains = {k: known.gain(taken, [body]) for k, body in enumerate(bodies)}
-    alike = sorted(
-        (k for k, gain in gains.items() if gain >= SETTINGS.alike * deviance), key=lambda k: -gains[k]
-    )
-    # The signature is a change per share of the mass; the residual is prediction minus measurement.
-    change = {k: -float(known.coefficients([*taken, bodies[k]])[-1]) for k in alike}
+    """Name each body that explains about as much: without a known torque, motion shows mass ratios only.
+
+    A rotor's inertia at a joint may explain as much, too.
+    """
+
+    def alike(cause: Cause) -> list[Signature]:
+        gains = [(known.gain(taken, [s]), s) for s in known.found if s.cause == cause]
+        enough = [(gain, s) for gain, s in gains if gain >= SETTINGS.alike * deviance]
+        return [s for _, s in sorted(enough, key=lambda pair: -pair[0])]
+
+    bodies = [s for s in alike("mass") if _possible(known, taken, [s])]
+    change = [_mass_change(known, taken, body) for body in bodies]
     ways = [
-        f"{bodies[k].where} {percent(abs(change[k]))} {'heavier' if change[k] > 0 else 'lighter'}"
-        for k in alike
+        f"{body.where} {percent(abs(c))} {'heavier' if c > 0 else 'lighter'}"
+        for body, c in zip(bodies, change, strict=True)
     ]
+    rotors = [s.where for s in alike("inertia")]
+    rotor = f" (another inertia at {listed(rotors)} explains as much)" if rotors else ""
     seen = (
         f"With {' or '.join(ways)} the model predicts left-out motion with {percent(share)} less squared "
-        "residual: another mass."
+        f"residual: another mass{rotor}."
     )
-    names = [bodies[k].where for k in alike]
-    return _finding("mass", share, deviance, names, " and ".join(names), seen)
+    names = [body.where for body in bodies]
+    _, means, do = LOOKS["mass"]
+    do = do.replace("{}", " and ".join(names))
+    if rotors:
+        do += f" If it is a rotor's inertia, free dof_armature of {listed(rotors)}."
+    return Diagnosis("mass", float(share), float(deviance), tuple(names), Alarm(seen, means, do))
 
 
 def _varying_delay(known: Evidence) -> Diagnosis | None:
@@ -473,7 +478,10 @@ def _varying_delay(known: Evidence) -> Diagnosis | None:
         f"{percent(found.share)} of the squared residual comes where commands change fast, as if each "
         f"had its own delay (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
     )
-    return _finding("delay", found.share, found.deviance, (), "", seen)
+    _, means, do = LOOKS["delay"]
+    return Diagnosis(
+        "delay", float(found.share), float(found.deviance), (), Alarm(seen, means, do.replace("{}", ""))
+    )
 
 
 def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None:
@@ -505,7 +513,7 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     ]
     where = ", ".join(stretches[:5]) + (" and more" if len(stretches) > 5 else "")
     deviance = -len(each) * float(np.log(max(1 - share, 1e-300)))
-    return _finding("contact", share, deviance, (), where)
+    return _diagnosis(known, "contact", share, deviance, (), where)
 
 
 def _stretches(numbers: Sequence[int], unit_s: float) -> list[str]:

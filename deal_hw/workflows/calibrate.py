@@ -110,7 +110,15 @@ class Calibration:
         require_other(path, robot.description.mjcf)
         source = f"method {result.method}, distribution {self.distribution.digest()}"
         write_calibrated_mjcf(
-            robot, result.space, result.estimate, path, result.latency_s, source, result.without_value
+            robot,
+            result.space,
+            result.estimate,
+            path,
+            result.latency_s,
+            source,
+            result.without_value,
+            self.colour,
+            result.biased,
         )
         return path
 

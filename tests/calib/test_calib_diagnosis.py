@@ -15,7 +15,8 @@ from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
-from deal_hw.calib.validation.checks import with_causes
+from deal_hw.calib.validation.cause_words import SearchedKinds
+from deal_hw.calib.validation.checks import biased, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
 from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
@@ -145,6 +146,68 @@ def test_two_causes_are_named_and_the_larger_first() -> None:
     found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
     assert [f.cause for f in found] == ["load", "damping"]
     assert found[0].deviance > found[1].deviance > MISMATCH.evidence
+
+
+def _with_masses(wrong: FloatArray, **effect: FloatArray) -> Evidence:
+    """Return evidence with bodies whose mass has these effects on the prediction, (W, H) of twice it."""
+    known = _evidence(wrong)
+    bodies = [Signature("mass", name, (x[..., None] / STD,)) for name, x in effect.items()]
+    return dataclasses.replace(known, found=[*(s for s in known.found if s.cause != "inertia"), *bodies])
+
+
+def test_no_mass_below_zero_is_named() -> None:
+    """A residual as of a cart 1.6 times heavier is also that of a pole 1.6 times lighter: impossible."""
+    v, _ = _motion()
+    effect = _moved_by(v * np.abs(v) + 0.3)
+    found = name_causes(_with_masses(-1.6 * effect, cart=effect, pole=-effect))
+    assert found[0].cause == "mass" and found[0].joints == ("cart",)
+    assert "cart 160 % heavier" in found[0].alarm.seen and "pole" not in found[0].alarm.seen
+    assert not any(f.cause == "mass" for f in name_causes(_with_masses(-1.6 * effect, pole=-effect)))
+
+
+def test_a_rotor_is_named_beside_the_mass_that_moves_alike() -> None:
+    """A force with acceleration at a slide is as much a heavier cart: both stand in one alarm."""
+    _, a = _motion()
+    effect = _moved_by(0.05 * a)
+    known = _with_masses(effect, cart=-effect)
+    rotor = Signature("inertia", "slide", ((effect + _moved_by(0.002 + 0 * a))[..., None] / STD,))
+    (found,) = name_causes(dataclasses.replace(known, found=[*known.found, rotor]))[:1]
+    assert found.cause == "mass" and "cart 100 % heavier" in found.alarm.seen
+    assert "another inertia at slide explains as much" in found.alarm.seen
+    assert "free dof_armature of slide" in found.alarm.do
+
+
+def test_advice_frees_only_what_is_not_free() -> None:
+    """Damping that is searched follows another law; at its bound the range is too narrow."""
+    v, _ = _motion()
+    known = _evidence(_moved_by(-0.3 * v))
+    free = frozenset({("dof_damping", "knee"), ("servo_damping", "knee")})
+    searched = dataclasses.replace(known, searched=SearchedKinds(free))
+    assert "searched already" in name_causes(searched)[0].alarm.do
+    half = dataclasses.replace(known, searched=SearchedKinds(frozenset({("dof_damping", "knee")})))
+    assert name_causes(half)[0].alarm.do == "Free servo_damping of knee (--parameters)."
+    ended = SearchedKinds(free, (("knee.damping", "dof_damping", "knee"),))
+    alarm = name_causes(dataclasses.replace(known, searched=ended))[0].alarm
+    assert "knee.damping ended at the bound" in alarm.means and "--range" in alarm.do
+
+
+def test_a_value_that_compensates_for_a_cause_is_marked(small_problem: Callable[..., Problem]) -> None:
+    """What takes part of a load moves once the load is named: that widens its interval, and marks it."""
+    v, _ = _motion()
+    load = _moved_by(np.full_like(v, 0.3))
+    (found,) = _named(load + _moved_by(-0.1 * v), (0.5 * load + _moved_by(0.2 * v),))[:1]
+    assert abs(found.shift[0]) > 0.1
+    problem = small_problem()
+    fit = with_rows(refine(problem, problem.space.nominal, 0.0, (0.2,), iterations=2))
+    known = uncertainty_at(problem, fit)
+    std = np.sqrt(np.diag(known.covariance))
+    shift = np.array([2 * std[0], 0.1 * std[1], 0.0])
+    wider = biased(problem, known, [dataclasses.replace(found, cause="load", shift=shift)])
+    names = problem.space.names
+    assert wider.biased == {names[0]: "load"} and "identifiable" != wider.verdicts[0] != known.verdicts[0]
+    (low, high), center = problem.space.to_scale(wider.interval.T), problem.space.to_scale(known.theta)
+    assert np.all(low <= center - np.abs(shift[:2])) and np.all(high >= center + np.abs(shift[:2]))
+    assert biased(problem, known, ()) is known
 
 
 def test_contact_comes_in_bursts() -> None:
