@@ -81,6 +81,9 @@ class Validation:
     diagnosis: bool = True
     """Name causes of an unexplained residual."""
 
+    thorough: bool = False
+    """Run checks to their end where they take more physics steps than the fits."""
+
 
 def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
     """Return an alarm where a searched latency ended at an end of its range; zero is no such end."""

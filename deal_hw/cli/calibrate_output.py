@@ -106,7 +106,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         table.add_column(heading, justify="right" if align == "right" else "left")
     for k, p in enumerate(result.space):
         low, high = result.interval[k]
-        verdict = result.verdicts[k] if result.verdicts else "-"
+        verdict: str = result.verdicts[k] if result.verdicts else "-"
         if p.name in result.biased:
             verdict += f", biased by {result.biased[p.name]}"
         table.add_row(
@@ -131,6 +131,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
         console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))
+    for check, why in result.provenance.get("left_out", {}).items():
+        console.print(f"check of {check}: {why} (--checks all)")
     step = result.provenance.get("physics_step", {})
     if "note" in step:
         console.print(f"check of the physics step, {1e3 * step['step_s']:g} ms: {step['note']}")
