@@ -15,7 +15,7 @@ from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
-from deal_hw.calib.validation.diagnosis import PlayFit
+from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.types import FloatArray
 
@@ -80,7 +80,7 @@ class CalibrationRun:
     attempts: Restarts
     settings: Validation
     local: Refined | None = None
-    play: PlayFit | None = None
+    play: WiderFit | None = None
     progress: ProgressCallback | None = None
     first_steps: int = 0
     checks: dict[str, int] = field(default_factory=dict)

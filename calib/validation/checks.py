@@ -27,8 +27,9 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.diagnosis import Diagnosis, PlayFit, diagnose
+from deal_hw.calib.validation.diagnosis import Diagnosis, diagnose
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
+from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Z90, Alarm, listed
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.types import FloatArray
@@ -121,7 +122,7 @@ def judge(
     refined: Refined,
     known: Uncertainty,
     settings: Validation,
-    fitted: PlayFit | None = None,
+    fitted: WiderFit | None = None,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
 
@@ -161,7 +162,7 @@ def with_step(problem: Problem, refined: Refined, known: Uncertainty) -> tuple[U
 
 
 def with_causes(
-    problem: Problem, refined: Refined, known: Uncertainty, fitted: PlayFit | None = None
+    problem: Problem, refined: Refined, known: Uncertainty, fitted: WiderFit | None = None
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
     found = diagnose(problem, refined, fitted)

@@ -10,25 +10,29 @@ the residual is large: beside random forces of constant size, it must make the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
 from deal_hw.calib.validation.cause_words import LOOKS, SearchedKinds, advice
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
+from deal_hw.calib.validation.wider_models import (
+    WiderFit,
+    fit_wider,
+    gain_of,
+    zero_parameters,
+)
 from deal_hw.calibration import Alarm, listed, percent
-from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
@@ -40,13 +44,13 @@ class DiagnosisSettings:
     Attributes:
         folds: Number of folds over the windows.
         rounds: Stretches of consecutive windows that each fold leaves out.
-        noticed: Least share of the held-out squared residual that it explains [-].
+        noticed: Least share of the held-out squared residual that a signature explains [-].
         most: Most named causes.
         alike: Least explained share of a named body's mass, relative to the best one's [-].
         decisive: Share explained by play from which other causes are searched only after its repair [-].
         most_play: Widest play, as a share of the commands' span [-].
         least_play: Least play of a named joint, as a share of the widest one [-].
-        play_s: Windows of the candidate with play [s].
+        sure: Least value of a named parameter that is 0 in the model, in its standard deviations [-].
         parameter_prior: Spread of parameters in the regression, as a share of their range [-].
         latency_prior_s: The same of the latency [s].
         burst_part: Bursts occupy at most this part of the time [-],
@@ -63,7 +67,7 @@ class DiagnosisSettings:
     decisive: float = 0.5
     most_play: float = 0.5
     least_play: float = 0.2
-    play_s: float = 0.2
+    sure: float = 5.0
     parameter_prior: float = 0.5
     latency_prior_s: float = 0.02
     burst_part: float = 0.05
@@ -73,6 +77,14 @@ class DiagnosisSettings:
 
 
 SETTINGS = DiagnosisSettings()
+
+
+ZERO_CAUSES: Mapping[str, Cause] = {
+    "dof_armature": "inertia",
+    "dof_frictionloss": "friction",
+    "dof_damping": "damping",
+}
+"""Cause that a parameter stands for which is 0 in the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,23 +118,6 @@ class Diagnosis:
             "alarm": dataclasses.asdict(self.alarm),
             "shift": self.shift.tolist(),
         }
-
-
-@dataclass(frozen=True, slots=True)
-class PlayFit:
-    """A fit with play in every gear, to a part of the recordings.
-
-    Attributes:
-        of: The recordings, without play among the parameters.
-        plays: The plays.
-        fit: The fit.
-        prediction: The fitted values on the samples that were not fitted.
-    """
-
-    of: Problem
-    plays: Sequence[Parameter]
-    fit: Refined
-    prediction: Refined
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,17 +236,19 @@ class Evidence:
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
-def diagnose(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> tuple[Diagnosis, ...]:
+def diagnose(problem: Problem, refined: Refined, fitted: WiderFit | None = None) -> tuple[Diagnosis, ...]:
     """Return the causes of a fit's residual, best supported first; the fit has linearised residuals.
 
     ``fitted`` is a fit with play, if there is one of this problem.
     """
     found_play = find_play(problem, refined, fitted)
-    play = None if found_play is None else found_play.diagnosis
-    if play is not None and play.share >= SETTINGS.decisive:
-        return (play,)
-    found = name_causes(evidence(problem, refined))
-    return tuple(sorted((*found, *((play,) if play else ())), key=lambda f: -f.deviance))
+    wider = [found_play.diagnosis] if found_play is not None else []
+    if not any(one.share >= SETTINGS.decisive for one in wider):
+        wider += find_zero(problem, refined)
+    decisive = [one for one in wider if one.share >= SETTINGS.decisive]
+    if decisive:
+        return tuple(decisive)
+    return tuple(sorted((*name_causes(evidence(problem, refined)), *wider), key=lambda f: -f.deviance))
 
 
 def evidence(problem: Problem, refined: Refined) -> Evidence:
@@ -276,7 +273,7 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
     )
 
 
-def fit_play(problem: Problem) -> PlayFit | None:
+def fit_play(problem: Problem) -> WiderFit | None:
     """Fit a model with play in every gear to a part of the recordings; None where it cannot be fitted."""
     description, names = problem.robot.description, problem.robot.actuator_names
     known = any(p.kind == "servo_play" for p in problem.space.parameters)
@@ -299,21 +296,10 @@ def fit_play(problem: Problem) -> PlayFit | None:
         for name, joint, most in zip(names, description.actuated, span, strict=True)
         if most > 0
     ]
-    wide = problem.with_more(plays)
-    total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
-    seen = [e.usable for e in part.episodes]
-    rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
-    try:
-        fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.play_s,))
-        length = samples_in(problem, SETTINGS.play_s)
-        prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
-    except (InsufficientDataError, CalibrationError):
-        return None
-    return PlayFit(problem, plays, fit, prediction)
+    return fit_wider(problem, plays)
 
 
-def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> Play | None:
+def find_play(problem: Problem, refined: Refined, fitted: WiderFit | None = None) -> Play | None:
     """Compare predictions with play in the gears and without, of samples that the fit with play has not seen.
 
     The fit without play, ``refined``, has used all recordings. ``fitted`` is the fit with play; it is made
@@ -322,48 +308,54 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
     wide = fitted if fitted is not None and fitted.of is problem else fit_play(problem)
     if wide is None:
         return None
-    plays, fit, with_play = wide.plays, wide.fit, wide.prediction
-    own, found = np.split(fit.theta, [len(problem.space)])
-    seen, unseen = (
-        problem.part([e.usable for e in part.shooting.problem.episodes]) for part in (fit, with_play)
-    )
-    length = with_play.shooting.length
-
-    def decides(without: Refined) -> tuple[float, float] | None:
-        share = 1 - with_play.chi2 / without.chi2
-        deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
-        enough = deviance > MISMATCH.evidence and share > SETTINGS.noticed
-        return (share, deviance) if enough else None
-
-    try:
-        without = at_parameters(unseen, refined.theta, refined.latency_s, length)
-        if decides(without) is None:
-            return None
-        # The wider fit may have left another minimum; a fit from there without play then predicts as well.
-        bare = refine(seen, own, fit.latency_s, (SETTINGS.play_s,))
-        again = at_parameters(unseen, bare.theta, bare.latency_s, length)
-    except (InsufficientDataError, CalibrationError):
+    gained = gain_of(wide, refined)
+    if gained is None:
         return None
-    without = again if again.chi2 < without.chi2 else without
-    decided = decides(without)
-    if decided is None:
-        return None
-    share, deviance = decided
+    plays, fit, found = wide.more, wide.fit, wide.found
     order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
     named = [plays[k] for k in order]
     joints = [play.elements[0] for play in named]
     sizes = listed([f"{found[k]:.2g} {plays[k].unit} at {plays[k].elements[0]}" for k in order])
     seen_words = (
         f"With play in the gears ({sizes}) the model predicts motion that it was not fitted to with chi2 "
-        f"{with_play.chi2:.3g} instead of {without.chi2:.3g}: backlash."
+        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: backlash."
     )
-    space = problem.space
-    shift = np.append(space.to_scale(own) - space.to_scale(refined.theta), fit.latency_s - refined.latency_s)
     looks = LOOKS["backlash"]
     alarm = Alarm(seen_words, looks[1], looks[2].replace("{}", listed(joints)))
-    cause = Diagnosis("backlash", share, deviance, tuple(joints), alarm, shift)
+    cause = Diagnosis("backlash", gained.share, gained.deviance, tuple(joints), alarm, wide.shift_of(refined))
     theta = np.concatenate([fit.theta[: len(problem.space)], found[order]])
-    return Play(cause, problem.with_more(named), theta, fit.latency_s, with_play.chi2)
+    return Play(cause, problem.with_more(named), theta, fit.latency_s, wide.prediction.chi2)
+
+
+def find_zero(problem: Problem, refined: Refined) -> list[Diagnosis]:
+    """Compare predictions with the parameters that are 0 in the model, and were not searched, and without.
+
+    They come as one cause, that of the parameter which explains most.
+    """
+    more = zero_parameters(problem)
+    wide = fit_wider(problem, more) if more and not problem.noise_free else None
+    gained = None if wide is None else gain_of(wide, refined)
+    if wide is None or gained is None:
+        return []
+    sure = wide.significance()
+    order = [k for k in np.argsort(-sure) if sure[k] > SETTINGS.sure]
+    if not order:
+        return []
+    named = [more[k] for k in order]
+    values = listed([f"{p.name} = {wide.found[k]:.2g} {p.unit}" for p, k in zip(named, order, strict=True)])
+    seen = (
+        f"With {values} the model predicts motion that it was not fitted to with chi2 "
+        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}."
+    )
+    alarm = Alarm(
+        seen,
+        "In your model this is 0, so it was not searched. Other values compensate for it.",
+        "Write a value above 0 into the MJCF, such as this one, and calibrate again. Or give it a nominal "
+        "value and a range in a parameter file (--parameters).",
+    )
+    joints = tuple(dict.fromkeys(joint for p in named for joint in p.elements))
+    cause = ZERO_CAUSES[named[0].kind]
+    return [Diagnosis(cause, gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))]
 
 
 def name_causes(known: Evidence) -> list[Diagnosis]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +18,13 @@ from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.cause_words import SearchedKinds
-from deal_hw.calib.validation.checks import biased, with_causes
+from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
 from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
+from deal_hw.calib.validation.wider_models import zero_parameters
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
@@ -336,6 +339,14 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
 Truth = tuple[PlainRobot, Problem, Refined]
 
 
+def problem_of(robot: PlainRobot, folder: Path) -> Problem:
+    """Return the problem of two recordings of 3 s of a robot."""
+    model, paths, held_out = write(robot, folder, seconds=3.0)
+    recordings = Recordings(model=model, data=tuple(paths))
+    work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    return Problem(work.robot, work.space, work.episodes, threads=1)
+
+
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | None], Truth]:
     """Return what makes a simulated robot's recordings, and a fit from its own values; each pair once."""
@@ -343,11 +354,8 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | No
     @functools.cache
     def make(kind: str, fault: Fault | None) -> Truth:
         robot = make_robot(kind, 3, fault)
-        model, paths, held_out = write(robot, tmp_path_factory.mktemp("robot"), seconds=3.0)
-        recordings = Recordings(model=model, data=tuple(paths))
-        work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
-        problem = Problem(work.robot, work.space, work.episodes, threads=1)
-        theta = np.array([robot.truth[name] for name in work.space.names])
+        problem = problem_of(robot, tmp_path_factory.mktemp("robot"))
+        theta = np.array([robot.truth[name] for name in problem.space.names])
         return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
 
     return make
@@ -447,3 +455,23 @@ def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault 
     asked = result.restricted(problem.space)
     assert asked.space.names == problem.space.names and len(asked.verdicts) == len(asked.estimate)
     np.testing.assert_array_equal(asked.distribution().mean, result.distribution().mean[:-1])
+
+
+def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Path) -> None:
+    """A rotor of 0.01 kg m^2 behind a pendulum of 0.0075; the model has none, so nothing searches it."""
+    robot = make_robot("pendulum", 3)
+    without, rotor = (
+        re.sub('armature="[^"]*"', f'armature="{value}"', text)
+        for text, value in ((robot.model, 0), (robot.robot, 0.01))
+    )
+    problem = problem_of(dataclasses.replace(robot, model=without, robot=rotor), tmp_path)
+    fit = with_rows(refine(problem, problem.space.nominal, robot.delay_s, (0.2,), iterations=8))
+    assert "pivot.armature" not in problem.space.names and unexplained(fit)
+    assert [p.name for p in zero_parameters(problem)] == ["pivot.armature"]
+    (found,) = diagnosis.find_zero(problem, fit)
+    value = float(re.findall(r"pivot.armature = (\S+) kg", found.alarm.seen)[0])
+    assert value == pytest.approx(0.01, rel=0.1)
+    assert found.cause == "inertia" and found.joints == ("pivot",) and found.share > 0.5
+    assert "was not searched" in found.alarm.means and "MJCF" in found.alarm.do
+    # The others made up for it.
+    assert np.abs(found.shift[:-1]).max() > 0.1
