@@ -26,7 +26,8 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     ),
     "backlash": (
         "play in the gear",
-        "The joint does not follow its motor at once when the motor turns back.",
+        "Motor and joint do not move as one where the motion or the load turns round. The encoder may be on "
+        "either side.",
         "Repair the gear of {}, or free servo_play there (--parameters).",
     ),
     "delay": (

@@ -213,6 +213,20 @@ class Evidence:
         found = self.coefficients(taken)
         return [r - x @ found for x, r in zip(self._design(taken), self._rest, strict=True)]
 
+    def without(self, taken: Sequence[Signature]) -> list[WindowRows]:
+        """Return the rows without what signatures explain beside the parameters; start states stay free."""
+        found = self.coefficients(taken)[len(self.prior) :]
+        left = []
+        for e, rows in enumerate(self.rows):
+            residual, first = rows.residual.copy(), 0
+            for signature in taken:
+                columns = signature.columns[e]
+                n = columns.shape[2]
+                residual[:, : columns.shape[1]] -= columns @ found[first : first + n]
+                first += n
+            left.append(dataclasses.replace(rows, residual=residual))
+        return left
+
     @cached_property
     def count(self) -> int:
         """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
@@ -375,7 +389,7 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
         found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
-    varying = _varying_delay(known)
+    varying = _varying_delay(known, taken)
     if varying is not None:
         found.append(varying)
     bursts = _bursts(known, known.residual(taken))
@@ -461,9 +475,9 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
     return Diagnosis("mass", float(share), float(deviance), tuple(names), Alarm(seen, means, do))
 
 
-def _varying_delay(known: Evidence) -> Diagnosis | None:
-    """Return whether each command seems to have its own delay; see :mod:`.random_delay`."""
-    found = random_delay(known.rows, known.answers, known.period_s)
+def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
+    """Return whether commands seem to have delays of their own beside other causes; see `.random_delay`."""
+    found = random_delay(known.without(taken), known.answers, known.period_s)
     if found is None or not (found.gain > MISMATCH.evidence and found.share > SETTINGS.noticed):
         return None
     seen = (

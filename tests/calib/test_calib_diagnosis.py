@@ -23,7 +23,13 @@ from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
 from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
 from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
+from deal_hw.calib.validation.signatures import (
+    Cause,
+    Signature,
+    SignatureResponse,
+    held_direction,
+    place_in_play,
+)
 from deal_hw.calib.validation.wider_models import zero_parameters
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
@@ -376,6 +382,29 @@ def test_faults_of_a_simulated_robot_are_named(truth: Callable[[str, Fault | Non
     _, problem, fit = truth("pendulum", "jitter")
     jitter = name_causes(evidence(problem, fit))
     assert jitter[0].cause == "delay" and "its own delay" in jitter[0].alarm.seen
+
+
+def test_a_link_crosses_its_play_as_a_free_body() -> None:
+    """Half of 0.02 rad ahead, 2 rad/s^2: 0.02 = 2 t^2 / 2 takes 0.141 s to the other stop, where it stays.
+
+    A load that turns round brings it back in the same time.
+    """
+    needed = np.repeat([2.0, -2.0], 1000)
+    place = place_in_play(needed, 1e-3, 0.02)
+    assert place[0] == pytest.approx(0.01, abs=1e-5) and place[999] == -0.01
+    first, back = np.flatnonzero(place == -0.01)[0], 1000 + np.flatnonzero(place[1000:] == 0.01)[0]
+    assert first == pytest.approx(141, abs=2) and back == pytest.approx(1141, abs=2)
+    # On its way, half of the time is a quarter of the path.
+    assert place[70] == pytest.approx(0.01 - 0.02 / 4, abs=3e-4)
+
+
+def test_play_behind_the_motors_encoder_is_named(truth: Callable[[str, Fault | None], Truth]) -> None:
+    """1 degree in the elbow, which no set-point's play explains: backlash there, not a heavier link."""
+    _, problem, fit = truth("double-pendulum", "motor-play")
+    found = name_causes(evidence(problem, fit))
+    assert found[0].cause == "backlash" and found[0].joints == ("elbow",)
+    assert "servo_play" in found[0].alarm.do and "on either side" in found[0].alarm.means
+    assert not any(f.cause == "mass" for f in found)
 
 
 def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Truth]) -> None:
