@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import mujoco
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.parameters import Parameter
+from deal_hw.sim.engine.inverse_dynamics import link_torques
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
@@ -190,7 +190,11 @@ def _crossing(
     """
     windows, episode = data.windows, problem.episodes[data.episode]
     at = windows.start[:, None] * windows.stride + np.arange(windows.length * windows.stride)
-    load, inertia = link_load(problem, *states, episode.period_s, c)
+    position, velocity = states
+    acceleration = np.gradient(velocity, episode.period_s, axis=0)
+    load = link_torques(problem.robot, position, velocity, acceleration)[:, c]
+    rotor = float(problem.robot.model.dof_armature[list(problem.robot.qvel)[c]])
+    inertia = max(_inertia(problem, c) - rotor, 1e-9)
     rows = np.arange(len(load)) * windows.stride
     fine = np.interp(np.arange(rows[-1] + windows.stride), rows, load)
     found = []
@@ -199,27 +203,6 @@ def _crossing(
         relative = np.gradient(np.gradient(place, episode.step_s), episode.step_s)
         found.append(-inertia * relative[at] / play * SETTINGS.plays[0] / size)
     return found
-
-
-def link_load(
-    problem: Problem, position: FloatArray, velocity: FloatArray, period_s: float, c: int
-) -> tuple[FloatArray, float]:
-    """Return the torque that moves a joint's links along a motion, (T,), and their inertia at the joint.
-
-    The rotor's inertia, friction and damping of the joint do not count: they act on the motor's side.
-    """
-    robot, model = problem.robot, problem.robot.model
-    dofs = list(robot.qvel)
-    data, place = mujoco.MjData(model), model.jnt_qposadr[model.dof_jntid[dofs]]
-    acceleration = np.gradient(velocity, period_s, axis=0)
-    load, torque = np.empty(len(position)), np.zeros(model.nv)
-    for k in range(len(position)):
-        data.qpos[place], data.qvel[dofs], data.qacc[dofs] = position[k], velocity[k], acceleration[k]
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_rne(model, data, 1, torque)
-        load[k] = torque[dofs[c]]
-    return load, max(_inertia(problem, c) - float(model.dof_armature[dofs[c]]), 1e-9)
 
 
 def place_in_play(acceleration: FloatArray, step_s: float, play: float) -> FloatArray:
