@@ -442,7 +442,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         if checked.tried == checked.of:
             return found
         left = f"{checked.of - checked.tried} of {checked.of} corrections were not tried"
-        return found.but(left_out={SHARED_ERRORS: f"{left}: they would take longer than the fits"})
+        return found.but(checks_left_out={SHARED_ERRORS: f"{left}: they would take longer than the fits"})
     run.say(BEFORE_SEARCH, str(suspect.alarm))
     unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))

@@ -131,7 +131,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
         console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))
-    for check, why in result.provenance.get("left_out", {}).items():
+    for check, why in result.provenance.get("checks_left_out", {}).items():
         console.print(f"check of {check}: {why} (--checks all)")
     step = result.provenance.get("physics_step", {})
     if "note" in step:

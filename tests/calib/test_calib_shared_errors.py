@@ -274,9 +274,9 @@ def test_corrections_that_take_longer_than_the_fits_are_left_out_and_said(
 
     monkeypatch.setattr(stages, "find_shared_error", check)
     found = with_shared_error(AsGiven(), run)
-    assert "3 of 5 corrections were not tried" in found.facts["left_out"][SHARED_ERRORS]
+    assert "3 of 5 corrections were not tried" in found.facts["checks_left_out"][SHARED_ERRORS]
     thorough = dataclasses.replace(run, settings=Validation(thorough=True))
-    assert "left_out" not in with_shared_error(AsGiven(), thorough).facts
+    assert "checks_left_out" not in with_shared_error(AsGiven(), thorough).facts
     assert allowed == [0, math.inf]
 
 

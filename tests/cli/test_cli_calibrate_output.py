@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -70,3 +72,11 @@ def test_a_biased_value_is_marked_in_the_table(capsys: pytest.CaptureFixture[str
     print_result(doubtful(CAUSE), "record another motion")
     said = capsys.readouterr().out
     assert "weak, biased by mass" in said and said.count("biased by mass") == 2
+
+
+def test_a_check_that_was_not_run_is_named_with_its_option(capsys: pytest.CaptureFixture[str]) -> None:
+    """Parts of recordings that the user left out are something else."""
+    notes = {"left_out": [["a.csv", 1.0, 2.0]], "checks_left_out": {"shared errors": "3 of 5 were not tried"}}
+    print_result(dataclasses.replace(doubtful(CAUSE), provenance=notes), "record another motion")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "check of shared errors: 3 of 5 were not tried (--checks all)" in said and "a.csv" not in said
