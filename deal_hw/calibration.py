@@ -139,6 +139,8 @@ class CalibrationResult:
         latency_interval_s: 90 % interval of the latency [s].
         chi2: Mean squared residual over its expected variance; 1 is a perfect model.
         alarms: Reasons to distrust the result; empty is good.
+        biased: Named cause of the residual that a value compensates for, by the name of its parameter, or
+            "latency".
         advice: What to record next, one mapping per weak or unidentified parameter: ``parameter``, its
             standard deviation in its own scale now (``std``) and after that recording (``std_after``),
             ``excitation`` and a ``sentence``; empty if no parameter is weak or no advice was requested.
@@ -162,6 +164,7 @@ class CalibrationResult:
     latency_interval_s: tuple[float, float] = (0.0, 0.0)
     chi2: float = float("nan")
     alarms: tuple[Alarm, ...] = ()
+    biased: Mapping[str, str] = field(default_factory=dict)
     advice: Sequence[Mapping[str, Any]] = ()
     heldout_nrmse: Mapping[str, float] = field(default_factory=dict)
     trace: Sequence[Mapping[str, float]] = ()
@@ -216,6 +219,7 @@ class CalibrationResult:
                 "high": float(self.interval[k, 1]),
                 "range": [p.low, p.high],
                 "verdict": self.verdicts[k] if self.verdicts else None,
+                "biased_by": self.biased.get(p.name),
             }
         return {
             "format": RESULT_FORMAT,
@@ -229,6 +233,7 @@ class CalibrationResult:
             "latency_interval_s": list(self.latency_interval_s),
             "chi2": self.chi2,
             "alarms": [asdict(alarm) for alarm in self.alarms],
+            "biased": dict(self.biased),
             "advice": [dict(row) for row in self.advice],
             "heldout_nrmse": dict(self.heldout_nrmse),
             "steps": self.steps,
@@ -270,6 +275,7 @@ class CalibrationResult:
             latency_interval_s=(float(low_s), float(high_s)),
             chi2=float(numbers(values["chi2"], "chi2", (), finite=False)),
             alarms=tuple(from_values(dict[str, list[Alarm]], {"alarms": values["alarms"]})["alarms"]),
+            biased=from_values(dict[str, dict[str, str]], {"biased": values.get("biased", {})})["biased"],
             advice=tuple(object_of(row, "advice") for row in values.get("advice", ())),
             heldout_nrmse={
                 name: float(numbers(value, "heldout_nrmse", (), finite=False))

@@ -248,14 +248,14 @@ class Problem:
         """Return the problem with more parameters after its own; recordings and noise are shared."""
         other = copy.copy(self)
         space = other.space = ParameterSpace((*self.space.parameters, *parameters))
-        other._batches = BatchPool(self.robot, space, self.threads)
+        other._batches = BatchPool(self.robot, space, self.threads, counted=self._batches.counted)
         return other
 
     def with_robot(self, robot: RobotModel) -> Problem:
         """Return the problem with another model of the same robot; the rest is shared."""
         other = copy.copy(self)
         other.robot = robot
-        other._batches = BatchPool(robot, self.space, self.threads)
+        other._batches = BatchPool(robot, self.space, self.threads, counted=self._batches.counted)
         return other
 
     @property

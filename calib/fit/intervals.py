@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -111,6 +111,8 @@ class Uncertainty:
         clustered: Variances clustered by blocks of time over those of independent residuals; None if not
             computed or with too few blocks. Its last entry is the latency's.
         widened: Factor of clustering on each parameter's interval, (K,).
+        biased: Cause of the residual that each of these values compensates for, by its name; "latency" is the
+            latency.
     """
 
     space: ParameterSpace
@@ -125,6 +127,7 @@ class Uncertainty:
     bound: npt.NDArray[np.int64]
     clustered: Clustered | None
     widened: FloatArray
+    biased: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def verdicts(self) -> tuple[Identifiability, ...]:
@@ -135,7 +138,8 @@ class Uncertainty:
             if self.blind[k]:
                 found.append("not identifiable")
             elif std <= SETTINGS.identifiable_std * unit[k]:
-                found.append("identifiable")
+                # What compensates for a known effect is a property of the fit, not of the robot.
+                found.append("weak" if self.space.names[k] in self.biased else "identifiable")
             else:
                 found.append("weak" if std <= SETTINGS.weak_share * prior_std[k] else "not identifiable")
         return tuple(found)

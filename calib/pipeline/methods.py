@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from typing import TYPE_CHECKING, cast
 
@@ -78,15 +79,20 @@ def usual_budget(
     return Budget(population=members, generations=generations or Budget().generations, refine=refine)
 
 
-def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem]:
-    """Return a new method; see `check_method`. ``refine`` has no effect on baselines and whole methods."""
-    check_method(name)
-    module, _, attribute = METHODS[name].partition(":")
-    search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
-    if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
-        return search
+def make_method(name: str, *, refine: bool = False, thorough: bool = False) -> CalibrationMethod[Problem]:
+    """Return a new method; see `check_method`. ``refine`` has no effect on baselines and whole methods.
+
+    ``thorough``: checks run to their end where they take more physics steps than the fits.
+    """
     from deal_hw.calib.pipeline.stages import CalibrationPipeline
     from deal_hw.calib.validation.checks import Validation
 
+    check_method(name)
+    module, _, attribute = METHODS[name].partition(":")
+    search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
+    if isinstance(search, CalibrationPipeline):
+        search.settings = dataclasses.replace(search.settings, thorough=thorough)
+    if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
+        return search
     # A user who names a search wants it to run, even where refining the nominal values would be enough.
-    return CalibrationPipeline(search, name, Validation(local_first=name == "default"))
+    return CalibrationPipeline(search, name, Validation(local_first=name == "default", thorough=thorough))

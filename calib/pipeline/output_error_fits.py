@@ -37,7 +37,8 @@ from deal_hw.calib.fit.null_space import confounded
 from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.pipeline.stages import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
+from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
+from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import (
@@ -161,7 +162,7 @@ class OutputErrorFits(Fits):
             windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
         choice = Choice("long", {}, settings.long_s, note="without folds")
         if run.settings.cross_validation:
-            choice = self._choose(run, problem, seed, search=better)
+            choice = self._choose(run, problem, seed, (first, *windows), search=better)
         run.say("fit", f"{choice.chosen} on all recordings")
         members = self._members(problem, first, windows, searched if better else None, choice.chosen)
         theta, latency_s = members[choice.chosen]
@@ -169,7 +170,8 @@ class OutputErrorFits(Fits):
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
         known = uncertainty_at(problem, fit, own_scale=True)
-        split = self._split_half(problem, fit, recipe, known)
+        with run.check(AFTER_FIT):
+            split = self._split_half(problem, fit, recipe, known)
         known = widened_by_split_half(known, split)
         if settings.hold_first:
             known = _including(known, first.theta)
@@ -179,7 +181,8 @@ class OutputErrorFits(Fits):
         if run.local is not None:
             # With fitted start states the residual shows model error, not smoothing error.
             local = with_rows(run.local)
-            known, facts["physics_step"] = with_step(run.problem, local, known)
+            with run.check(AFTER_FIT):
+                known, facts["physics_step"] = with_step(run.problem, local, known)
         chi2, left = fit.chi2, None
         if settings.mismatch_s:
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
@@ -189,7 +192,8 @@ class OutputErrorFits(Fits):
             lost = run.local.chi2 >= REFINEMENT.local_hopeless
             judged = (problem, with_rows(left)) if lost else (run.problem, local)
             if unexplained(judged[1]):
-                known, facts["diagnosis"] = with_causes(*judged, known, run.play)
+                with run.check(AFTER_FIT):
+                    known, facts["diagnosis"] = with_causes(*judged, known, run.play)
         found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {
@@ -224,10 +228,20 @@ class OutputErrorFits(Fits):
         parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
         return spread([p for p in parts if p.usable.any()], seconds)
 
-    def _choose(self, run: CalibrationRun, problem: Problem, seed: int, *, search: bool) -> Choice:
+    def _choose(
+        self,
+        run: CalibrationRun,
+        problem: Problem,
+        seed: int,
+        whole: Sequence[OutputErrorFit],
+        *,
+        search: bool,
+    ) -> Choice:
         """Fit every candidate without each fold and compare the predictions of that fold.
 
-        Without ``search``, that on all recordings was no better start, and no fold is searched.
+        Each fit of a fold continues from that of all recordings, ``whole``: the minimum is near, and a fit
+        ends in it whatever its start. Without ``search``, that on all recordings was no better start, and no
+        fold is searched.
         """
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
@@ -240,14 +254,12 @@ class OutputErrorFits(Fits):
         def fits(train: Problem, fold: int) -> dict[str, Member]:
             question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"
             run.say("cross-validation", question)
-            first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, settings.first)
-            searched, start = None, first.member
+            first, *windows = [fit_output_error(train, *fit.member, fit.recipe) for fit in whole]
+            searched = None
             if search:
                 rng = np.random.default_rng([seed, fold])
                 searched = run.attempts.search.run(self._reduced(train, first), run.budget, rng)
-                if self._better_start(train, first, searched):
-                    start = searched.estimate, searched.latency_s
-            return self._members(train, first, self._windows(run, train, start), searched)
+            return self._members(train, first, windows, searched)
 
         def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
             rmse = prediction_rmse(test, members, settings.long_s)

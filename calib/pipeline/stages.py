@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,6 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.intervals import (
     MISMATCH,
-    Uncertainty,
     mismatch,
     uncertainty_at,
     with_rows,
@@ -38,15 +38,21 @@ from deal_hw.calib.fit.refinement import (
     refine,
     window_stages,
 )
+from deal_hw.calib.pipeline.calibration_run import (
+    AFTER_FIT,
+    PLAY,
+    SHARED_ERRORS,
+    CalibrationRun,
+    FitOutcome,
+)
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
-from deal_hw.calib.validation.diagnosis import PlayFit, find_play, fit_play
+from deal_hw.calib.validation.diagnosis import find_play, fit_play
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import averaged, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
-    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -58,7 +64,7 @@ from deal_hw.calibration import (
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.calib.fit.output_error import OutputErrorFit
+    pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,71 +98,6 @@ class RestartSettings:
 
 RESTARTS = RestartSettings()
 ONE_SEARCH = RestartSettings(restarts=0, drawn=0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FitOutcome:
-    """Result of a fitting strategy.
-
-    Attributes:
-        searched: Result of the search, or its substitute.
-        theta: The estimate, (K,).
-        latency_s: Its latency [s].
-        chi2: Mean squared residual over the noise variance.
-        known: Uncertainty of the estimate.
-        facts: More entries for the provenance: plain JSON values.
-    """
-
-    searched: CalibrationResult
-    theta: FloatArray
-    latency_s: float
-    chi2: float
-    known: Uncertainty
-    facts: Mapping[str, Any] = field(default_factory=dict)
-
-    def but(
-        self, *first: Alarm, last: Sequence[Alarm] = (), chi2: float | None = None, **facts: Any
-    ) -> FitOutcome:
-        """Return it with more alarms, before and after its own, and with more facts."""
-        chi2 = self.chi2 if chi2 is None else chi2
-        known = self.known.with_alarms(*first, last=last)
-        return dataclasses.replace(self, chi2=chi2, known=known, facts={**self.facts, **facts})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationRun:
-    """State shared by the stages of one calibration.
-
-    Attributes:
-        problem: Recordings and simulator.
-        budget: Limits of the searches.
-        rng: The only source of randomness.
-        attempts: Runs the search on all recordings and stores its results.
-        settings: Which checks to run.
-        local: The local fit, if there is one.
-        play: The fit with play in the gears, if there is one.
-        progress: Receives progress reports.
-    """
-
-    problem: Problem
-    budget: Budget
-    rng: np.random.Generator
-    attempts: Restarts
-    settings: Validation
-    local: Refined | None = None
-    play: PlayFit | None = None
-    progress: ProgressCallback | None = None
-
-    def say(self, stage: str, message: str = "", done: int = 0, total: int = 1, **candidate: Any) -> None:
-        """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""
-        if self.progress is not None:
-            self.progress(Progress(stage, done, total, message, **candidate))
-
-    def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
-        """Report a candidate estimate and the stage that found it."""
-        theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
-        candidate = {"estimate": theta, "latency_s": found.latency_s, "values": {"chi2": found.chi2}}
-        self.say(stage, f"chi2 {found.chi2:.3g}", 1, 1, **candidate)
 
 
 class Fits(abc.ABC):
@@ -224,6 +165,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             attempts=attempts,
             settings=self.settings,
             progress=progress,
+            first_steps=steps,
         )
         local = local_fit(problem, partial(run.offer, "local fit")) if self.settings.local_first else None
         if local is None and self.settings.local_first:
@@ -244,7 +186,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
             if local is not None and self.settings.diagnosis:
-                run = dataclasses.replace(run, play=fit_play(problem))
+                with run.check(PLAY):
+                    run = dataclasses.replace(run, play=fit_play(problem))
             found = with_play(run) or with_shared_error(fits, run)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
@@ -254,6 +197,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             "search_estimate": dict(zip(searched.space.names, map(float, searched.estimate), strict=True)),
             "search_latency_s": searched.latency_s,
             **found.facts,
+            "physics_steps": {"fits": run.fit_steps, **run.checks},
         }
         return dataclasses.replace(
             searched,
@@ -267,6 +211,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             latency_interval_s=known.latency_interval_s,
             chi2=found.chi2,
             alarms=known.alarms,
+            biased=known.biased,
             steps=problem.steps - steps + attempts.earlier_steps,
             seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
@@ -413,7 +358,8 @@ def conclude_fit(
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:
         known = averaged(problem, whole, known)
-    known, checked = judge(problem, refined, known, run.settings, run.play)
+    with run.check(AFTER_FIT):
+        known, checked = judge(problem, refined, known, run.settings, run.play)
     facts: dict[str, Any] = {
         "restarts": restarts,
         "window_s": refined.shooting.length * problem.episodes[0].period_s,
@@ -461,7 +407,8 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     """
     if run.local is None or run.play is None:
         return None
-    play = find_play(run.problem, run.local, run.play)
+    with run.check(PLAY):
+        play = find_play(run.problem, run.local, run.play)
     if play is None or not play.explains:
         return None
     wide = dataclasses.replace(run, problem=play.problem, progress=None)
@@ -472,35 +419,37 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
     alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    return conclude_fit(wide, None, fit).but(alarm, diagnosis=[dataclasses.asdict(play.diagnosis)])
+    return conclude_fit(wide, None, fit).but(alarm, diagnosis=[play.diagnosis.to_json()])
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     """Return a strategy's result, with an alarm if commands and measurements share an error.
 
-    The alarm is reported before the search. If a simulator is found that predicts as well as the corrected
-    recordings, they are right, and there is no alarm. Where the correction leaves only noise, no parameters
-    are likely to be right, so a brief search has to find it; otherwise the whole strategy.
+    The suspicion is reported before the search. Its correction leaves only noise, so no parameters are likely
+    to be right, and a brief search has to find a simulator that predicts as well as the corrected recordings.
+    If it does, the recordings are right: the suspicion is withdrawn, and the whole strategy follows.
     """
     problem, local = run.problem, run.local
-    suspect = None
     asked = run.settings.diagnosis and run.settings.local_first
-    if asked and (local is None or unexplained(local, MISMATCH.white_samples)):
-        suspect = find_shared_error(
-            problem, local, partial(run.say, "errors that commands and measurements share", "")
-        )
-    if suspect is None:
+    if not asked or (local is not None and not unexplained(local, MISMATCH.white_samples)):
         return fits.best(run)
-    run.say(BEFORE_SEARCH, str(suspect.alarm))
-    brief = suspect.chi2 <= MISMATCH.chi2
-    if brief:
-        unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
-        found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
-    else:
+    most = math.inf if run.settings.thorough else run.check_steps_left
+    with run.check(SHARED_ERRORS):
+        checked = find_shared_error(problem, local, partial(run.say, SHARED_ERRORS, ""), most)
+    suspect = checked.found
+    if suspect is None:
         found = fits.best(run)
-    if not suspect.confirmed(found.theta, found.latency_s):
-        return fits.best(run) if brief else found
-    return found.but(suspect.alarm, shared_error=suspect.to_json())
+        if checked.tried == checked.of:
+            return found
+        left = f"{checked.of - checked.tried} of {checked.of} corrections were not tried"
+        return found.but(checks_left_out={SHARED_ERRORS: f"{left}: they would take longer than the fits"})
+    run.say(BEFORE_SEARCH, str(suspect.alarm))
+    unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
+    found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
+    if suspect.confirmed(found.theta, found.latency_s):
+        return found.but(suspect.alarm, shared_error=suspect.to_json())
+    run.say(BEFORE_SEARCH, suspect.withdrawn)
+    return fits.best(run)
 
 
 def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:

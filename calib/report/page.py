@@ -252,14 +252,15 @@ def write_result(
     try:
         with published_together(folder) as waiting:
             names = [RESULT_FILE, DISTRIBUTION, TRACE]
-            write_json(waiting / RESULT_FILE, result.to_json())
-            judged = {"verdict": trust(result).colour}
+            found = trust(result)
+            judged = {"verdict": found.colour, "verdict_reason": found.sentence}
+            write_json(waiting / RESULT_FILE, result.to_json() | judged)
             write_json(waiting / DISTRIBUTION, result.distribution().to_json() | judged)
             np.savez(waiting / TRACE, **_trace(result))
             if report is not None:
                 write_report(waiting / REPORT, report)
                 names.append(REPORT)
-            names += write_exports(waiting, robot, result)
+            names += write_exports(waiting, robot, result, judged)
             source = f"method {result.method}, distribution {result.distribution().digest()}"
             try:
                 require_other(folder / MODEL, robot.description.mjcf)
@@ -271,6 +272,8 @@ def write_result(
                     result.latency_s,
                     source,
                     result.without_value,
+                    found.colour,
+                    result.biased,
                 )
                 names += [file.name for file in written]
             except ConfigurationError as err:

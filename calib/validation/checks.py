@@ -27,8 +27,9 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.diagnosis import PlayFit, diagnose
+from deal_hw.calib.validation.diagnosis import Diagnosis, diagnose
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
+from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Z90, Alarm, listed
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.types import FloatArray
@@ -58,6 +59,9 @@ class CheckSettings:
 
 SETTINGS = CheckSettings()
 
+LATENCY = "latency"
+"""Name of the latency among the values that a cause moves."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Validation:
@@ -77,6 +81,9 @@ class Validation:
 
     diagnosis: bool = True
     """Name causes of an unexplained residual."""
+
+    thorough: bool = False
+    """Run checks to their end where they take more physics steps than the fits."""
 
 
 def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
@@ -115,7 +122,7 @@ def judge(
     refined: Refined,
     known: Uncertainty,
     settings: Validation,
-    fitted: PlayFit | None = None,
+    fitted: WiderFit | None = None,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
 
@@ -155,12 +162,39 @@ def with_step(problem: Problem, refined: Refined, known: Uncertainty) -> tuple[U
 
 
 def with_causes(
-    problem: Problem, refined: Refined, known: Uncertainty, fitted: PlayFit | None = None
+    problem: Problem, refined: Refined, known: Uncertainty, fitted: WiderFit | None = None
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
     found = diagnose(problem, refined, fitted)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
-    return known.with_alarms(*alarms), [dataclasses.asdict(f) for f in found]
+    return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
+
+
+def biased(problem: Problem, known: Uncertainty, causes: Sequence[Diagnosis]) -> Uncertainty:
+    """Return ``known`` with intervals widened by the shift of each cause, and marks on what it moves.
+
+    A cause moves a value that would leave its interval, or that ended at a bound which the data press. Such a
+    value compensates for the cause.
+    """
+    if not causes:
+        return known
+    K = len(known.space)
+    std = np.sqrt(np.diag(known.covariance))
+    shifts = [np.zeros(K + 1) if not len(c.shift) else np.abs(c.shift) for c in causes]
+    total = np.sum(shifts, axis=0)
+    marks = dict(known.biased)
+    for k, name in enumerate(known.space.names):
+        most = int(np.argmax([shift[k] for shift in shifts]))
+        if total[k] > Z90 * std[k] or known.bound[k]:
+            marks[name] = causes[most].cause
+    known = dataclasses.replace(known.widened_to(std + total[:K] / Z90), biased=marks)
+    if problem.fixed_latency_s is not None or not total[-1]:
+        return known
+    (first, last), (low, high) = problem.latency_range_s, known.latency_interval_s
+    if total[-1] > max((high - low) / 2, 0.5 * problem.episodes[0].step_s):
+        marks[LATENCY] = causes[int(np.argmax([shift[-1] for shift in shifts]))].cause
+    wider = (max(low - total[-1], first), min(high + total[-1], last))
+    return dataclasses.replace(known, latency_interval_s=wider, biased=marks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

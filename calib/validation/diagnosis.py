@@ -11,22 +11,28 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
+from deal_hw.calib.validation.cause_words import LOOKS, SearchedKinds, advice
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
+from deal_hw.calib.validation.wider_models import (
+    WiderFit,
+    fit_wider,
+    gain_of,
+    zero_parameters,
+)
 from deal_hw.calibration import Alarm, listed, percent
-from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
@@ -38,13 +44,13 @@ class DiagnosisSettings:
     Attributes:
         folds: Number of folds over the windows.
         rounds: Stretches of consecutive windows that each fold leaves out.
-        noticed: Least share of the held-out squared residual that it explains [-].
+        noticed: Least share of the held-out squared residual that a signature explains [-].
         most: Most named causes.
         alike: Least explained share of a named body's mass, relative to the best one's [-].
         decisive: Share explained by play from which other causes are searched only after its repair [-].
         most_play: Widest play, as a share of the commands' span [-].
         least_play: Least play of a named joint, as a share of the widest one [-].
-        play_s: Windows of the candidate with play [s].
+        sure: Least value of a named parameter that is 0 in the model, in its standard deviations [-].
         parameter_prior: Spread of parameters in the regression, as a share of their range [-].
         latency_prior_s: The same of the latency [s].
         burst_part: Bursts occupy at most this part of the time [-],
@@ -61,7 +67,7 @@ class DiagnosisSettings:
     decisive: float = 0.5
     most_play: float = 0.5
     least_play: float = 0.2
-    play_s: float = 0.2
+    sure: float = 5.0
     parameter_prior: float = 0.5
     latency_prior_s: float = 0.02
     burst_part: float = 0.05
@@ -72,51 +78,13 @@ class DiagnosisSettings:
 
 SETTINGS = DiagnosisSettings()
 
-LOOKS: Mapping[Cause, tuple[str, str, str]] = {
-    "friction": (
-        "a force against slow motion",
-        "Friction depends on speed (Stribeck), or creeps where it should hold.",
-        "Free dof_friction_creep, dof_frictionloss and dof_damping of {} (--parameters).",
-    ),
-    "backlash": (
-        "play in the gear",
-        "The joint does not follow its motor at once when the motor turns back.",
-        "Repair the gear of {}, or free servo_play there (--parameters).",
-    ),
-    "delay": (
-        "a timing error that changes",
-        "The delay of commands or sensors varies; the model's is constant.",
-        "End other programs on the computer that sends, send at an even pace, or time-stamp commands where "
-        "they are received{}.",
-    ),
-    "damping": (
-        "a force that grows with speed",
-        "Damping was not free, or follows another law (the square of speed).",
-        "Free dof_damping or servo_damping of {} (--parameters); if they are free already, check the law.",
-    ),
-    "inertia": (
-        "a force in proportion to acceleration",
-        "An inertia or a gain was not free, or its range is too narrow.",
-        "Free dof_armature, body_mass or the actuator's gain of {} (--parameters).",
-    ),
-    "load": (
-        "a constant force",
-        "A mass, its centre or an encoder's zero was not free.",
-        "Free encoder_bias, body_mass or body_ipos of {} (--parameters).",
-    ),
-    "mass": (
-        "another mass",
-        "The ratio of the bodies' masses is not the model's.",
-        "Weigh {}, correct the model, or free body_mass there (--parameters).",
-    ),
-    "contact": (
-        "bursts",
-        "The robot may touch something that the model does not have.",
-        "Look at {}. If it touched something, record without that. Recordings in files (--data) can leave it "
-        "out (--leave-out).",
-    ),
+
+ZERO_CAUSES: Mapping[str, Cause] = {
+    "dof_armature": "inertia",
+    "dof_frictionloss": "friction",
+    "dof_damping": "damping",
 }
-"""For each cause: how the residual looks, what it means, and what to do, with {} for the place."""
+"""Cause that a parameter stands for which is 0 in the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +97,8 @@ class Diagnosis:
         deviance: Gain in held-out deviance.
         joints: Joints or bodies that show it, strongest first.
         alarm: The alarm for the user.
+        shift: Change of the estimates where the fit may have this effect, too: of each parameter in its own
+            scale, then of the latency [s], (K + 1,); empty where it was not estimated.
     """
 
     cause: Cause
@@ -136,23 +106,18 @@ class Diagnosis:
     deviance: float
     joints: tuple[str, ...]
     alarm: Alarm
+    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-
-@dataclass(frozen=True, slots=True)
-class PlayFit:
-    """A fit with play in every gear, to a part of the recordings.
-
-    Attributes:
-        of: The recordings, without play among the parameters.
-        plays: The plays.
-        fit: The fit.
-        prediction: The fitted values on the samples that were not fitted.
-    """
-
-    of: Problem
-    plays: Sequence[Parameter]
-    fit: Refined
-    prediction: Refined
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "cause": self.cause,
+            "share": self.share,
+            "deviance": self.deviance,
+            "joints": list(self.joints),
+            "alarm": dataclasses.asdict(self.alarm),
+            "shift": self.shift.tolist(),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +156,7 @@ class Evidence:
         period_s: Sampling period [s].
         time_s: Time of each sample in its recording, per episode (W, H) [s].
         names: Names of the recordings, per episode.
+        searched: What the fit searched.
     """
 
     rows: Sequence[WindowRows]
@@ -200,6 +166,7 @@ class Evidence:
     period_s: float
     time_s: Sequence[FloatArray]
     names: Sequence[str]
+    searched: SearchedKinds = field(default_factory=SearchedKinds)
 
     @cached_property
     def _following(self) -> list[FloatArray]:
@@ -246,6 +213,20 @@ class Evidence:
         found = self.coefficients(taken)
         return [r - x @ found for x, r in zip(self._design(taken), self._rest, strict=True)]
 
+    def without(self, taken: Sequence[Signature]) -> list[WindowRows]:
+        """Return the rows without what signatures explain beside the parameters; start states stay free."""
+        found = self.coefficients(taken)[len(self.prior) :]
+        left = []
+        for e, rows in enumerate(self.rows):
+            residual, first = rows.residual.copy(), 0
+            for signature in taken:
+                columns = signature.columns[e]
+                n = columns.shape[2]
+                residual[:, : columns.shape[1]] -= columns @ found[first : first + n]
+                first += n
+            left.append(dataclasses.replace(rows, residual=residual))
+        return left
+
     @cached_property
     def count(self) -> int:
         """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
@@ -269,17 +250,19 @@ class Evidence:
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
-def diagnose(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> tuple[Diagnosis, ...]:
+def diagnose(problem: Problem, refined: Refined, fitted: WiderFit | None = None) -> tuple[Diagnosis, ...]:
     """Return the causes of a fit's residual, best supported first; the fit has linearised residuals.
 
     ``fitted`` is a fit with play, if there is one of this problem.
     """
     found_play = find_play(problem, refined, fitted)
-    play = None if found_play is None else found_play.diagnosis
-    if play is not None and play.share >= SETTINGS.decisive:
-        return (play,)
-    found = name_causes(evidence(problem, refined))
-    return tuple(sorted((*found, *((play,) if play else ())), key=lambda f: -f.deviance))
+    wider = [found_play.diagnosis] if found_play is not None else []
+    if not any(one.share >= SETTINGS.decisive for one in wider):
+        wider += find_zero(problem, refined)
+    decisive = [one for one in wider if one.share >= SETTINGS.decisive]
+    if decisive:
+        return tuple(decisive)
+    return tuple(sorted((*name_causes(evidence(problem, refined)), *wider), key=lambda f: -f.deviance))
 
 
 def evidence(problem: Problem, refined: Refined) -> Evidence:
@@ -300,10 +283,11 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
             for e, d in zip(episodes, data, strict=True)
         ],
         names=[e.name for e in episodes],
+        searched=SearchedKinds.of(problem, refined.theta),
     )
 
 
-def fit_play(problem: Problem) -> PlayFit | None:
+def fit_play(problem: Problem) -> WiderFit | None:
     """Fit a model with play in every gear to a part of the recordings; None where it cannot be fitted."""
     description, names = problem.robot.description, problem.robot.actuator_names
     known = any(p.kind == "servo_play" for p in problem.space.parameters)
@@ -326,21 +310,10 @@ def fit_play(problem: Problem) -> PlayFit | None:
         for name, joint, most in zip(names, description.actuated, span, strict=True)
         if most > 0
     ]
-    wide = problem.with_more(plays)
-    total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
-    seen = [e.usable for e in part.episodes]
-    rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
-    try:
-        fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.play_s,))
-        length = samples_in(problem, SETTINGS.play_s)
-        prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
-    except (InsufficientDataError, CalibrationError):
-        return None
-    return PlayFit(problem, plays, fit, prediction)
+    return fit_wider(problem, plays)
 
 
-def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None) -> Play | None:
+def find_play(problem: Problem, refined: Refined, fitted: WiderFit | None = None) -> Play | None:
     """Compare predictions with play in the gears and without, of samples that the fit with play has not seen.
 
     The fit without play, ``refined``, has used all recordings. ``fitted`` is the fit with play; it is made
@@ -349,44 +322,54 @@ def find_play(problem: Problem, refined: Refined, fitted: PlayFit | None = None)
     wide = fitted if fitted is not None and fitted.of is problem else fit_play(problem)
     if wide is None:
         return None
-    plays, fit, with_play = wide.plays, wide.fit, wide.prediction
-    own, found = np.split(fit.theta, [len(problem.space)])
-    seen, unseen = (
-        problem.part([e.usable for e in part.shooting.problem.episodes]) for part in (fit, with_play)
-    )
-    length = with_play.shooting.length
-
-    def decides(without: Refined) -> tuple[float, float] | None:
-        share = 1 - with_play.chi2 / without.chi2
-        deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
-        enough = deviance > MISMATCH.evidence and share > SETTINGS.noticed
-        return (share, deviance) if enough else None
-
-    try:
-        without = at_parameters(unseen, refined.theta, refined.latency_s, length)
-        if decides(without) is None:
-            return None
-        # The wider fit may have left another minimum; a fit from there without play then predicts as well.
-        bare = refine(seen, own, fit.latency_s, (SETTINGS.play_s,))
-        again = at_parameters(unseen, bare.theta, bare.latency_s, length)
-    except (InsufficientDataError, CalibrationError):
+    gained = gain_of(wide, refined)
+    if gained is None:
         return None
-    without = again if again.chi2 < without.chi2 else without
-    decided = decides(without)
-    if decided is None:
-        return None
-    share, deviance = decided
+    plays, fit, found = wide.more, wide.fit, wide.found
     order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
     named = [plays[k] for k in order]
     joints = [play.elements[0] for play in named]
     sizes = listed([f"{found[k]:.2g} {plays[k].unit} at {plays[k].elements[0]}" for k in order])
     seen_words = (
         f"With play in the gears ({sizes}) the model predicts motion that it was not fitted to with chi2 "
-        f"{with_play.chi2:.3g} instead of {without.chi2:.3g}: backlash."
+        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: backlash."
     )
-    cause = _finding("backlash", share, deviance, joints, listed(joints), seen_words)
+    looks = LOOKS["backlash"]
+    alarm = Alarm(seen_words, looks[1], looks[2].replace("{}", listed(joints)))
+    cause = Diagnosis("backlash", gained.share, gained.deviance, tuple(joints), alarm, wide.shift_of(refined))
     theta = np.concatenate([fit.theta[: len(problem.space)], found[order]])
-    return Play(cause, problem.with_more(named), theta, fit.latency_s, with_play.chi2)
+    return Play(cause, problem.with_more(named), theta, fit.latency_s, wide.prediction.chi2)
+
+
+def find_zero(problem: Problem, refined: Refined) -> list[Diagnosis]:
+    """Compare predictions with the parameters that are 0 in the model, and were not searched, and without.
+
+    They come as one cause, that of the parameter which explains most.
+    """
+    more = zero_parameters(problem)
+    wide = fit_wider(problem, more) if more and not problem.noise_free else None
+    gained = None if wide is None else gain_of(wide, refined)
+    if wide is None or gained is None:
+        return []
+    sure = wide.significance()
+    order = [k for k in np.argsort(-sure) if sure[k] > SETTINGS.sure]
+    if not order:
+        return []
+    named = [more[k] for k in order]
+    values = listed([f"{p.name} = {wide.found[k]:.2g} {p.unit}" for p, k in zip(named, order, strict=True)])
+    seen = (
+        f"With {values} the model predicts motion that it was not fitted to with chi2 "
+        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}."
+    )
+    alarm = Alarm(
+        seen,
+        "In your model this is 0, so it was not searched. Other values compensate for it.",
+        "Write a value above 0 into the MJCF, such as this one, and calibrate again. Or give it a nominal "
+        "value and a range in a parameter file (--parameters).",
+    )
+    joints = tuple(dict.fromkeys(joint for p in named for joint in p.elements))
+    cause = ZERO_CAUSES[named[0].kind]
+    return [Diagnosis(cause, gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))]
 
 
 def name_causes(known: Evidence) -> list[Diagnosis]:
@@ -395,15 +378,18 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
     taken: list[Signature] = []
     groups = _groups(known.found)
     while groups and len(found) < SETTINGS.most:
+        groups = [group for group in groups if _possible(known, taken, group)]
         gains = [known.gain(taken, group) for group in groups]
+        if not gains or max(gains) <= MISMATCH.evidence:
+            break
         group = groups[int(np.argmax(gains))]
         share = 1 - float(np.exp(-max(gains) / known.count))
-        if max(gains) <= MISMATCH.evidence or share <= SETTINGS.noticed:
+        if share <= SETTINGS.noticed:
             break
         found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
-    varying = _varying_delay(known)
+    varying = _varying_delay(known, taken)
     if varying is not None:
         found.append(varying)
     bursts = _bursts(known, known.residual(taken))
@@ -421,14 +407,15 @@ def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
     ]
 
 
-def _finding(
-    cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str, seen: str = ""
-) -> Diagnosis:
-    looks, means, do = LOOKS[cause]
-    if not seen:
-        seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: {cause}."
-    alarm = Alarm(seen, means, do.replace("{}", where))
-    return Diagnosis(cause, float(share), float(deviance), tuple(joints), alarm)
+def _possible(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> bool:
+    """Return whether a cause leaves every mass above 0."""
+    return group[0].cause != "mass" or _mass_change(known, taken, group[0]) > -1.0
+
+
+def _mass_change(known: Evidence, taken: Sequence[Signature], body: Signature) -> float:
+    """Return the change of a body's mass that the residual asks for, as a share of it."""
+    # The signature is a change per share of the mass; the residual is prediction minus measurement.
+    return -float(known.coefficients([*taken, body])[-1])
 
 
 def _cause_diagnosis(
@@ -436,44 +423,71 @@ def _cause_diagnosis(
 ) -> Diagnosis:
     cause = group[0].cause
     if cause == "mass":
-        return _mass_diagnosis(known, taken, share, deviance)
-    gains = np.array([known.gain(taken, [signature]) for signature in group])
-    order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
-    joints = [group[k].where for k in order[:4]]
-    return _finding(cause, share, deviance, joints, listed(joints))
+        found = _mass_diagnosis(known, taken, share, deviance)
+    else:
+        gains = np.array([known.gain(taken, [signature]) for signature in group])
+        order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
+        joints = [group[k].where for k in order[:4]]
+        found = _diagnosis(known, cause, share, deviance, joints)
+    P = len(known.prior)
+    before, after = (known.coefficients(these)[:P] for these in (taken, [*taken, *group]))
+    # The residual is prediction minus measurement: a parameter moves against its coefficient.
+    return dataclasses.replace(found, shift=before - after)
+
+
+def _diagnosis(
+    known: Evidence, cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str = ""
+) -> Diagnosis:
+    means, do = advice(cause, joints, where or listed(joints), known.searched)
+    looks = LOOKS[cause][0]
+    seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: {cause}."
+    return Diagnosis(cause, float(share), float(deviance), tuple(joints), Alarm(seen, means, do))
 
 
 def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
-    """Name each body that explains about as much: without a known torque, motion shows mass ratios only."""
-    bodies = [s for s in known.found if s.cause == "mass"]
-    gains = {k: known.gain(taken, [body]) for k, body in enumerate(bodies)}
-    alike = sorted(
-        (k for k, gain in gains.items() if gain >= SETTINGS.alike * deviance), key=lambda k: -gains[k]
-    )
-    # The signature is a change per share of the mass; the residual is prediction minus measurement.
-    change = {k: -float(known.coefficients([*taken, bodies[k]])[-1]) for k in alike}
+    """Name each body that explains about as much: without a known torque, motion shows mass ratios only.
+
+    A rotor's inertia at a joint may explain as much, too.
+    """
+
+    def alike(cause: Cause) -> list[Signature]:
+        gains = [(known.gain(taken, [s]), s) for s in known.found if s.cause == cause]
+        enough = [(gain, s) for gain, s in gains if gain >= SETTINGS.alike * deviance]
+        return [s for _, s in sorted(enough, key=lambda pair: -pair[0])]
+
+    bodies = [s for s in alike("mass") if _possible(known, taken, [s])]
+    change = [_mass_change(known, taken, body) for body in bodies]
     ways = [
-        f"{bodies[k].where} {percent(abs(change[k]))} {'heavier' if change[k] > 0 else 'lighter'}"
-        for k in alike
+        f"{body.where} {percent(abs(c))} {'heavier' if c > 0 else 'lighter'}"
+        for body, c in zip(bodies, change, strict=True)
     ]
+    rotors = [s.where for s in alike("inertia")]
+    rotor = f" (another inertia at {listed(rotors)} explains as much)" if rotors else ""
     seen = (
         f"With {' or '.join(ways)} the model predicts left-out motion with {percent(share)} less squared "
-        "residual: another mass."
+        f"residual: another mass{rotor}."
     )
-    names = [bodies[k].where for k in alike]
-    return _finding("mass", share, deviance, names, " and ".join(names), seen)
+    names = [body.where for body in bodies]
+    _, means, do = LOOKS["mass"]
+    do = do.replace("{}", " and ".join(names))
+    if rotors:
+        do += f" If it is a rotor's inertia, free dof_armature of {listed(rotors)}."
+    return Diagnosis("mass", float(share), float(deviance), tuple(names), Alarm(seen, means, do))
 
 
-def _varying_delay(known: Evidence) -> Diagnosis | None:
-    """Return whether each command seems to have its own delay; see :mod:`.random_delay`."""
-    found = random_delay(known.rows, known.answers, known.period_s)
+def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
+    """Return whether commands seem to have delays of their own beside other causes; see `.random_delay`."""
+    found = random_delay(known.without(taken), known.answers, known.period_s)
     if found is None or not (found.gain > MISMATCH.evidence and found.share > SETTINGS.noticed):
         return None
     seen = (
         f"{percent(found.share)} of the squared residual comes where commands change fast, as if each "
         f"had its own delay (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
     )
-    return _finding("delay", found.share, found.deviance, (), "", seen)
+    _, means, do = LOOKS["delay"]
+    return Diagnosis(
+        "delay", float(found.share), float(found.deviance), (), Alarm(seen, means, do.replace("{}", ""))
+    )
 
 
 def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None:
@@ -505,7 +519,7 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     ]
     where = ", ".join(stretches[:5]) + (" and more" if len(stretches) > 5 else "")
     deviance = -len(each) * float(np.log(max(1 - share, 1e-300)))
-    return _finding("contact", share, deviance, (), where)
+    return _diagnosis(known, "contact", share, deviance, (), where)
 
 
 def _stretches(numbers: Sequence[int], unit_s: float) -> list[str]:

@@ -49,8 +49,7 @@ class SharedErrorSettings:
         first: Step after which a fit ends that is far behind the recordings as they are. On 16 recordings
             with a known error its correction had at most 0.74 times their residual after two steps.
         behind: Ratio of its mean squared residual to theirs above which it is far behind [-].
-        decisive: Least share of the held-out squared residual that it explains [-].
-        noticed: The same where only noise remains [-].
+        noticed: Least share of the held-out squared residual that it explains, where only noise remains [-].
         alike: Largest ratio of the held-out squared residual to the best one's for candidates that are named
             together [-].
     """
@@ -63,7 +62,6 @@ class SharedErrorSettings:
     iterations: int = 8
     first: int = 3
     behind: float = 3.0
-    decisive: float = 0.5
     noticed: float = 0.2
     alike: float = 1.1
 
@@ -177,6 +175,15 @@ class FoundError:
             f"{' Or: '.join(error.do for error in self.errors)} Check it at the robot.",
         )
 
+    @property
+    def withdrawn(self) -> str:
+        """The message where a simulator predicts the recordings as well without the correction."""
+        words = ", or ".join(error.words for error in self.errors)
+        return (
+            f"withdrawn: the recordings looked as if {words}. A simulator was found that predicts them as "
+            "well as they are, so they are right."
+        )
+
     def confirmed(self, theta: FloatArray, latency_s: float) -> bool:
         """Return whether an estimate predicts the original recordings no better, at a latency [s]."""
         chi2 = _predicted(self.test, theta, latency_s, self.length)
@@ -266,23 +273,44 @@ def _where(names: Sequence[str], group: Sequence[int]) -> tuple[str, str, tuple[
     return f"positions of {', '.join(at)}", f" for {', '.join(at)}", at
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedErrorCheck:
+    """Result of the check for shared errors.
+
+    Attributes:
+        found: The error, if there is one.
+        tried: Number of corrections that were fitted.
+        of: Number of those worth it. The rest would have taken more steps than allowed.
+    """
+
+    found: FoundError | None = None
+    tried: int = 0
+    of: int = 0
+
+
 def find_shared_error(
-    problem: Problem, local: Refined | None, tell: Callable[[int, int], None] | None = None
-) -> FoundError | None:
-    """Return the error whose correction makes unpredictable recordings predictable.
+    problem: Problem,
+    local: Refined | None,
+    tell: Callable[[int, int], None] | None = None,
+    most_steps: float = math.inf,
+) -> SharedErrorCheck:
+    """Find the error whose correction makes unpredictable recordings predictable.
 
     ``local`` is the fit of the original recordings; None where it diverged. ``tell`` is called before each
-    fit, with the number of those that are done and of all.
+    fit, with the number of those that are done and of all. No fit begins after ``most_steps`` physics steps.
     """
     if problem.robot.base is not None or problem.noise_free:
-        return None
+        return SharedErrorCheck()
+    before = problem.steps
     settings = SETTINGS
     parts = [s for e in problem.episodes for s in stretches(e, settings.stretch_s) if s.usable.any()]
     seen, unseen = (spread(parts[k::2], settings.part_s) for k in (0, 1))
     length = samples_in(problem, settings.window_s)
     same = ChannelChange.none(len(problem.robot.description.joint_names))
     if not unseen:
-        return None
+        return SharedErrorCheck()
+    if most_steps <= 0:
+        return SharedErrorCheck(of=settings.tried)
     tell = tell or (lambda done, total: None)
     tell(0, 1 + settings.tried)
     try:
@@ -292,31 +320,34 @@ def find_shared_error(
         if local is not None:
             as_recorded = min(as_recorded, _predicted(test, local.theta, local.latency_s, length))
     except InsufficientDataError:
-        return None
+        return SharedErrorCheck()
     ranked = sorted(shared_errors(problem), key=lambda e: _screened(problem, e.undo, seen, length))
     found: dict[SharedError, float] = {}
     for error in ranked[: settings.tried]:
+        if problem.steps - before >= most_steps:
+            break
         tell(1 + len(found), 1 + settings.tried)
         hopeless = settings.behind * trained
         found[error] = _fitted(problem, error.undo, seen, unseen, length, hopeless)[1]
-    best = min(found, key=lambda e: found[e])
-    if not _decides(as_recorded, found[best], count):
-        return None
+    check = SharedErrorCheck(tried=len(found), of=min(len(ranked), settings.tried))
+    best = min(found, key=lambda e: found[e], default=None)
+    if best is None or not _decides(as_recorded, found[best], count):
+        return check
     alike = sorted((e for e in found if found[e] <= settings.alike * found[best]), key=lambda e: found[e])
     deviance = count * math.log(as_recorded / found[best])
-    return FoundError(tuple(alike), found[best], as_recorded, deviance, test, length)
+    error_found = FoundError(tuple(alike), found[best], as_recorded, deviance, test, length)
+    return dataclasses.replace(check, found=error_found)
 
 
 def _decides(before: float, after: float, count: int) -> bool:
     """Return whether the prediction improves so much that the candidate is named.
 
-    Residuals far below the noise need no explanation.
+    Only noise may remain: from a fit that explains neither, no cause can be named. Residuals far below the
+    noise need no explanation.
     """
-    settings = SETTINGS
-    if before <= MISMATCH.negligible_chi2:
+    if before <= MISMATCH.negligible_chi2 or not after <= MISMATCH.chi2:
         return False
-    share = settings.noticed if after <= MISMATCH.chi2 else settings.decisive
-    if not np.isfinite(after) or not after < (1 - share) * before:
+    if not after < (1 - SETTINGS.noticed) * before:
         return False
     return not np.isfinite(before) or count * math.log(before / after) > MISMATCH.evidence
 

@@ -7,6 +7,7 @@ between joints counts. For a body, the mass itself is changed.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +16,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.parameters import Parameter
+from deal_hw.sim.engine.inverse_dynamics import link_torques
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
@@ -32,6 +34,7 @@ class SignatureSettings:
         low_speeds: Speeds at which friction's excess at low speed falls to 1/e, as parts of a joint's rms
             speed [-].
         still: Part of the rms speed below which a velocity has no direction [-].
+        plays: Plays whose crossing is simulated [rad or m]: the time of a crossing grows with the play.
         nudge: Change of a set-point for one sample that shows a joint's response [rad or m].
     """
 
@@ -39,6 +42,7 @@ class SignatureSettings:
     heavier: float = 0.02
     low_speeds: tuple[float, ...] = (0.1, 0.4)
     still: float = 1e-3
+    plays: tuple[float, ...] = (0.005, 0.02, 0.06)
     nudge: float = 1e-3
 
 
@@ -103,20 +107,21 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             forces = _forces(velocity[..., c], speed[c])
             forces["inertia"] = [acceleration[..., c] / max(float(np.std(acceleration[..., c])), 1e-300)]
             size = SETTINGS.push * _inertia(problem, c) * float(np.std(acceleration[..., c]))
+            geared = name in problem.robot.description.actuated and problem.robot.base is None
+            if geared:
+                forces["backlash"] = _crossing(problem, data, states[data.episode], c, size)
             each = [(cause, shape) for cause, shapes in forces.items() for shape in shapes]
             force = np.zeros((1 + len(each), *velocity.shape[:2], C))
             force[1:, ..., c] = size * np.stack([shape for _, shape in each])
             pushed = _predict(problem, fit, data, e, np.repeat(path, len(force), axis=0), force)
             columns = np.moveaxis(_changes(pushed, data), 0, -1)
-            for cause in forces:
-                mine = [k for k, (own, _) in enumerate(each) if own == cause]
-                found.setdefault((cause, name), []).append(columns[..., mine])
-            seen = np.flatnonzero(problem.channels == c)
-            offset = np.zeros((*data.measured.shape, 1))
-            moving = held_direction(states[data.episode][1][data.windows.samples()][..., c], speed[c])
-            # The sensor is on the motor's side of the play.
-            offset[:, :, seen, 0] = (moving[..., None] / data.std[:, :, seen]) * problem.noise_std[c]
-            found.setdefault(("backlash", name), []).append(offset.reshape(len(offset), -1, 1))
+            number = {cause: [k for k, (own, _) in enumerate(each) if own == cause] for cause in forces}
+            of_cause = {cause: columns[..., mine] for cause, mine in number.items()}
+            if geared:
+                offset = _offset(problem, data, states[data.episode][1], c, speed[c])
+                of_cause["backlash"] = np.concatenate([of_cause["backlash"], offset], axis=2)
+            for cause, mine in of_cause.items():
+                found.setdefault((cause, name), []).append(mine)
     return [Signature(cause, where, tuple(columns)) for (cause, where), columns in found.items()]
 
 
@@ -160,6 +165,61 @@ def _forces(velocity: FloatArray, speed: float) -> dict[Cause, list[FloatArray]]
         "damping": [-v, -v * np.abs(v)],
         "load": [np.ones_like(v)],
     }
+
+
+def _offset(problem: Problem, data: WindowData, velocity: FloatArray, c: int, speed: float) -> FloatArray:
+    """Return an offset of a joint's sensor with the direction of motion, whitened, (W, H M, 1).
+
+    A gear in which friction decides on which side of the play the joint lies shows it.
+    """
+    seen = np.flatnonzero(problem.channels == c)
+    offset = np.zeros((*data.measured.shape, 1))
+    moving = held_direction(velocity[data.windows.samples()][..., c], speed)
+    offset[:, :, seen, 0] = (moving[..., None] / data.std[:, :, seen]) * problem.noise_std[c]
+    return offset.reshape(len(offset), -1, 1)
+
+
+def _crossing(
+    problem: Problem, data: WindowData, states: tuple[FloatArray, FloatArray], c: int, size: float
+) -> list[FloatArray]:
+    """Return the forces on a motor whose link crosses plays, in the windows, (W, S), in units of ``size``.
+
+    The encoder is on the motor's side. Where the load turns round, the link crosses the play, and the motor
+    does not feel it until it arrives: the force is the link's inertia times its acceleration relative to the
+    motor. There is one force for each play of `plays`, divided by it.
+    """
+    windows, episode = data.windows, problem.episodes[data.episode]
+    at = windows.start[:, None] * windows.stride + np.arange(windows.length * windows.stride)
+    position, velocity = states
+    acceleration = np.gradient(velocity, episode.period_s, axis=0)
+    load = link_torques(problem.robot, position, velocity, acceleration)[:, c]
+    rotor = float(problem.robot.model.dof_armature[list(problem.robot.qvel)[c]])
+    inertia = max(_inertia(problem, c) - rotor, 1e-9)
+    rows = np.arange(len(load)) * windows.stride
+    fine = np.interp(np.arange(rows[-1] + windows.stride), rows, load)
+    found = []
+    for play in SETTINGS.plays:
+        place = place_in_play(fine / inertia, episode.step_s, play)
+        relative = np.gradient(np.gradient(place, episode.step_s), episode.step_s)
+        found.append(-inertia * relative[at] / play * SETTINGS.plays[0] / size)
+    return found
+
+
+def place_in_play(acceleration: FloatArray, step_s: float, play: float) -> FloatArray:
+    """Return the place of a link within its play, (S,), whose load needs this acceleration, (S,).
+
+    Between the stops the link is free, so it falls behind the motor by that acceleration. A stop ends its
+    relative motion.
+    """
+    place, speed, half = play / 2, 0.0, play / 2
+    found = np.empty(len(acceleration))
+    for k, a in enumerate(acceleration.tolist()):
+        speed -= a * step_s
+        place += speed * step_s
+        if abs(place) >= half:
+            place, speed = math.copysign(half, place), 0.0
+        found[k] = place
+    return found
 
 
 def _bodies(problem: Problem) -> list[Parameter]:
@@ -210,13 +270,19 @@ def _changes(observed: FloatArray, data: WindowData) -> FloatArray:
 
 def _along(problem: Problem, data: WindowData, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return velocities and accelerations at the device periods of each window, (W, H * stride, C) each."""
-    windows, period_s = data.windows, problem.episodes[data.episode].period_s
+    period_s = problem.episodes[data.episode].period_s
+    of_velocity, of_acceleration = _between(data, velocity, np.gradient(velocity, period_s, axis=0))
+    return of_velocity, of_acceleration
+
+
+def _between(data: WindowData, *values: FloatArray) -> list[FloatArray]:
+    """Return values at samples, (T, ...), at the device periods of each window, (W, H * stride, ...)."""
+    windows = data.windows
     samples = np.concatenate([windows.start[:, None], windows.samples()], axis=1)
     at = np.arange(windows.length * windows.stride) / windows.stride
     before = at.astype(int)
-    part = (at - before)[:, None]
-
-    def between(values: FloatArray) -> FloatArray:
-        return np.asarray((1 - part) * values[samples[:, before]] + part * values[samples[:, before + 1]])
-
-    return between(velocity), between(np.gradient(velocity, period_s, axis=0))
+    found = []
+    for value in values:
+        part = (at - before).reshape(-1, *[1] * (value.ndim - 1))
+        found.append((1 - part) * value[samples[:, before]] + part * value[samples[:, before + 1]])
+    return found

@@ -166,10 +166,13 @@ class StepSettings:
         clearly: Chi-square difference that decides between two steps [-]. If the finer step is in truth d
             standard deviations worse, the difference is -d^2 with a spread of 2 d. So by chance it is above 4
             in at most 2.3 % of recordings, for any d.
+        noticed: Least share of the squared residual by which half the step must lower it for an alarm [-], as
+            for a cause of the residual. Intervals are widened by the step's shift without an alarm, too.
         most_steps: Most physics steps of the comparison.
     """
 
     clearly: float = 4.0
+    noticed: float = 0.03
     most_steps: float = 3e8
 
 
@@ -184,19 +187,26 @@ class StepCheck:
         step_s: The model's physics step [s].
         bias: Shift by the step of each parameter, in its own scale, and of the latency [s], (K + 1,).
         gain: Decrease of chi-square with half the step; negative for an increase.
+        share: The same as a share of chi-square [-].
         note: Why nothing was compared.
     """
 
     step_s: float
     bias: FloatArray = field(default_factory=lambda: np.zeros(0))
     gain: float = 0.0
+    share: float = 0.0
     note: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         if self.note:
             return {"step_s": self.step_s, "note": self.note}
-        return {"step_s": self.step_s, "bias": self.bias.tolist(), "chi2_gain": self.gain}
+        return {
+            "step_s": self.step_s,
+            "bias": self.bias.tolist(),
+            "chi2_gain": self.gain,
+            "share": self.share,
+        }
 
 
 def check_step(problem: Problem, refined: Refined, settings: StepSettings | None = None) -> StepCheck:
@@ -222,7 +232,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
     cost, where = _refitted(rows, belief)
     finer_cost, finer_where = _refitted(moved, belief)
     # First order: half the step removes half of what the whole step is off.
-    return StepCheck(step_s, 2.0 * (finer_where - where), cost - finer_cost)
+    return StepCheck(step_s, 2.0 * (finer_where - where), cost - finer_cost, 1.0 - finer_cost / cost)
 
 
 def counted(problem: Problem, known: Uncertainty, found: StepCheck) -> Uncertainty:
@@ -240,7 +250,7 @@ def counted(problem: Problem, known: Uncertainty, found: StepCheck) -> Uncertain
 
 def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
     """Return the alarm of a step that is too coarse, if it is; ``known`` is without the step's shift."""
-    if found.note or not found.gain > STEP.clearly:
+    if found.note or not (found.gain > STEP.clearly and found.share > STEP.noticed):
         return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
     moved = np.abs(found.bias[:-1]) > half_width

@@ -25,10 +25,12 @@ from deal_hw.testing.plain_robots import (
     CAUSES,
     FAULTS,
     KINDS,
+    RIGHT_MODELS,
     SHARED,
     SIGN_WORDS,
     Fault,
     PlainRobot,
+    RightModel,
     SharedFault,
     has_shared,
     make_robot,
@@ -41,7 +43,7 @@ from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 KEY = ("task", "fault", "seed")
 RIGHT = ""
-"""The fault of a right model."""
+"""The fault of a right model with white noise on its positions."""
 NONE = "none"
 """The name of that among chosen faults."""
 
@@ -54,13 +56,13 @@ def cells(
     Args:
         seeds: Seeds of the truths.
         kinds: Names in `KINDS`; all by default.
-        faults: "none", names in `FAULTS` (all of these by default) and in `SHARED`.
+        faults: "none", names in `FAULTS` (all of these by default), in `RIGHT_MODELS` and in `SHARED`.
 
     Raises:
         UnknownNameError: There is no such robot or fault.
     """
     usual = {NONE: RIGHT} | {fault: fault for fault in FAULTS}
-    known = usual | {fault: fault for fault in SHARED}
+    known = usual | {fault: fault for fault in (*RIGHT_MODELS, *SHARED)}
     for what, given, names in (("robot", kinds, KINDS), ("fault", faults, known)):
         for name in given:
             if name not in names:
@@ -85,12 +87,12 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
 
     Args:
         kind: A name in `KINDS`.
-        fault: A name in `FAULTS` or `SHARED`, or "".
+        fault: A name in `FAULTS`, `SHARED` or `RIGHT_MODELS`, or "".
         seed: Seed of the truth, and of everything random in the calibration.
         budget: Limits of a search.
         threads: Simulation threads.
     """
-    robot = make_robot(kind, seed, _fault(fault) or _shared(fault))
+    robot = make_robot(kind, seed, _fault(fault) or _shared(fault) or _right(fault))
     said: list[str] = []
     row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as name:
@@ -136,6 +138,10 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
 
 def _fault(name: str) -> Fault | None:
     return next((fault for fault in FAULTS if fault == name), None)
+
+
+def _right(name: str) -> RightModel | None:
+    return next((right for right in RIGHT_MODELS if right == name), None)
 
 
 def _shared(name: str) -> SharedFault | None:
@@ -193,7 +199,7 @@ def against_truth(robot: PlainRobot, result: CalibrationResult) -> dict[str, Any
 def line(row: Mapping[str, Any]) -> str:
     """Return one row in words."""
     what = row["fault"] or "right model"
-    named = "" if not row["fault"] else ", named" if row["named"] else ", NOT named"
+    named = "" if not row["fault"] or _right(row["fault"]) else ", named" if row["named"] else ", NOT named"
     text = f"{row['task']} seed {row['seed']}, {what}: {row['colour']}{named}"
     if "seconds" in row:
         text += f", chi2 {row['chi2']:.3g}, search {row['search']}, {row['seconds']:.0f} s"
@@ -203,7 +209,7 @@ def line(row: Mapping[str, Any]) -> str:
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a line for each fault: colours, and how often it was named."""
     found = []
-    for fault in (RIGHT, *FAULTS, *SHARED):
+    for fault in (RIGHT, *RIGHT_MODELS, *FAULTS, *SHARED):
         mine = [r for r in rows if r["fault"] == fault and not r["error"]]
         if not mine:
             continue
@@ -211,11 +217,11 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         counts = ", ".join(
             f"{colours.count(c)} {c}" for c in ("green", "amber", "red", "said", "refused") if c in colours
         )
-        shared = _shared(fault)
+        shared, right = _shared(fault), _right(fault)
         known = SHARED[shared][0] if shared else FAULTS[own] if (own := _fault(fault)) else ""
-        words = f"{fault}: {known}" if known else "the model is right"
+        words = f"{fault}: {known}" if known else RIGHT_MODELS[right] if right else "the model is right"
         text = f"{words}: {len(mine)} robots, {counts}"
-        if fault:
+        if known:
             text += f"; named {sum(bool(r['named']) for r in mine)} times"
         else:
             held = [r["coverage90"] for r in mine if r.get("coverage90") is not None]

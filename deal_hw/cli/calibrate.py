@@ -11,7 +11,7 @@ from pathlib import Path
 import tyro
 
 from deal_hw.calibration import Progress
-from deal_hw.cli.calibrate_output import print_files, print_result, show_progress
+from deal_hw.cli.calibrate_output import print_files, print_result, print_verdict, show_progress
 from deal_hw.cli.json_output import only_document
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.best_so_far import (
@@ -163,6 +163,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         print_result(report.result, work.advice, work.name)
         print_files(report.files)
         _print_next(report, work.name, folder.parent)
+        print_verdict(report.result)
     return report
 
 

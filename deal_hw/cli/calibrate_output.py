@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import Alarm, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
+ALARM_LINES = 20
+"""Most lines of alarms and verdict: they fit a terminal of 24 lines, above the prompt."""
 CHI2 = "chi2 is the squared prediction error over that of the sensor noise; chi2 1: sensor noise only"
 
 
@@ -71,7 +74,7 @@ def print_files(files: Mapping[str, Path]) -> None:
 
 
 def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
-    """Print the parameters with their intervals, and the combinations that the data do not determine.
+    """Print the parameters, what the data do not determine, what to record next, and the held-out error.
 
     Args:
         result: The result.
@@ -80,14 +83,11 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.markup import escape
-    from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
 
     from deal_hw.calib.design.advice import next_step
     from deal_hw.calib.fit.intervals import MISMATCH
-    from deal_hw.calib.report.verdict import trust
 
     table = Table(
         title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}",
@@ -106,7 +106,9 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         table.add_column(heading, justify="right" if align == "right" else "left")
     for k, p in enumerate(result.space):
         low, high = result.interval[k]
-        verdict = result.verdicts[k] if result.verdicts else "-"
+        verdict: str = result.verdicts[k] if result.verdicts else "-"
+        if p.name in result.biased:
+            verdict += f", biased by {result.biased[p.name]}"
         table.add_row(
             Text(f"{p.name} [{p.unit}]"),
             f"{p.nominal:.4g}",
@@ -116,12 +118,11 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         )
     low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
     latency = (f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}")
-    table.add_row(Text("latency [ms]"), "0", *latency, "")
+    bias = f"biased by {result.biased['latency']}" if "latency" in result.biased else ""
+    table.add_row(Text("latency [ms]"), "0", *latency, bias)
     console = Console()
     # A row of long names is broken by the terminal, which is easier to read than cells that are broken.
     Console(width=max(console.width, TABLE_WIDTH)).print(table)
-    overall = trust(result)
-    console.print(f"[bold]{overall.colour}:[/bold] {overall.sentence}")
     for words in result.null_directions:
         console.print(f"the data do not determine: {words}")
     dataset = result.provenance.get("dataset", "runs/first/dataset")
@@ -130,9 +131,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
         console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))
-    for alarm in result.alarms:
-        console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
-        console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
+    for check, why in result.provenance.get("checks_left_out", {}).items():
+        console.print(f"check of {check}: {why} (--checks all)")
     step = result.provenance.get("physics_step", {})
     if "note" in step:
         console.print(f"check of the physics step, {1e3 * step['step_s']:g} ms: {step['note']}")
@@ -148,3 +148,52 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
             f"{name} {'diverged' if value is None else f'{value:.4g}'}" for name, value in rmse.items()
         )
         console.print(f"held-out RMSE in rad or m, mean over the joints: {errors}")
+
+
+def print_verdict(result: CalibrationResult) -> None:
+    """Print the alarms, then the verdict: the last lines above the prompt are what matters most.
+
+    Alarms take at most `ALARM_LINES` lines. Of all but the first, only what was seen is printed. Those with
+    the same remedy are one entry.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from deal_hw.calib.report.verdict import trust
+
+    console = Console()
+    width = max(console.width, 40)
+    overall = trust(result)
+    last = wrapped(f"{overall.colour}: {overall.sentence}", width, "")
+    if result.alarms and result.alarms[0].seen not in overall.sentence:
+        first = result.alarms[0]
+        last += wrapped(f"first alarm: {first.seen} {first.means}", width, "  ")
+        last += wrapped(f"do: {first.do}", width, "  ")
+    for line in (*other_alarms(result.alarms[1:], width, ALARM_LINES - len(last)), *last):
+        console.print(escape(line), highlight=False, soft_wrap=True)
+
+
+def other_alarms(alarms: Sequence[Alarm], width: int, room: int) -> list[str]:
+    """Return what alarms saw in at most ``room`` lines, the most important one last.
+
+    Alarms with the same remedy are one entry. What finds no room is counted, and stands in the report.
+    """
+    groups: dict[str, list[str]] = {}
+    for alarm in alarms:
+        groups.setdefault(alarm.do, []).append(alarm.seen)
+    lines: list[str] = []
+    hidden = 0
+    for seen in groups.values():
+        entry = wrapped(f"alarm: {' '.join(dict.fromkeys(seen))}", width, "")
+        if hidden or len(lines) + len(entry) + 1 > room:
+            hidden += len(seen)
+        else:
+            lines = entry + lines
+    if hidden:
+        lines = [f"{hidden} more alarm{'s' * (hidden > 1)}: see result.json or the report", *lines]
+    return lines
+
+
+def wrapped(text: str, width: int, indent: str) -> list[str]:
+    """Return a text in lines; all but the first are indented by two more spaces."""
+    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=f"{indent}  ")

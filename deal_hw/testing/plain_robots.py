@@ -6,6 +6,7 @@ calibrated model is the same text with other numbers, or lacks the effect of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,8 @@ import numpy as np
 from deal_hw.errors import UnknownNameError
 from deal_hw.types import FloatArray
 
-Fault = Literal["friction", "backlash", "jitter", "mass", "sign"]
+Fault = Literal["friction", "backlash", "motor-play", "jitter", "mass", "sign"]
+RightModel = Literal["encoders"]
 SharedFault = Literal[
     "mirrored", "swapped", "fast-clock", "slow-clock", "degrees", "doubled", "doubled-joint"
 ]
@@ -25,11 +27,20 @@ SharedFault = Literal[
 FAULTS: Mapping[Fault, str] = {
     "friction": "dry friction is four times as high at rest and falls with speed (Stribeck)",
     "backlash": "a gear with a play of 0.06 rad between servo and joint",
+    "motor-play": "a gear with a play of 1 degree in the last joint, behind the motor's encoder of 12 bits",
     "jitter": "the delay of each command is between none and twice the mean",
     "mass": "the last link weighs 50 % more than in the model",
     "sign": "the last servo turns the other way",
 }
 """Faults by name, with their descriptions."""
+
+RIGHT_MODELS: Mapping[RightModel, str] = {
+    "encoders": "the model is right; encoders of 12 bits, a PD at 1 kHz, physics steps of 2 ms in the model",
+}
+"""Robots inside the model's class by name, with their descriptions."""
+
+WITH_ENCODERS = ("encoders", "motor-play")
+"""Robots whose only noise is the rounding of their encoders: 1 degree of play would hide in white noise."""
 
 SHARED: Mapping[SharedFault, tuple[str, ...]] = {
     "mirrored": (
@@ -53,6 +64,7 @@ SHARED: Mapping[SharedFault, tuple[str, ...]] = {
 CAUSES: Mapping[Fault, tuple[str, ...]] = {
     "friction": ("friction",),
     "backlash": ("backlash",),
+    "motor-play": ("backlash",),
     "jitter": ("delay",),
     "mass": ("mass",),
     "sign": (),
@@ -67,6 +79,16 @@ STRIBECK_SPEED = 0.15
 
 STRIBECK_EXTRA = 3.0
 PLAY = 0.06
+MOTOR_PLAY = {"hinge": math.radians(1.0), "slide": 2e-3}
+"""Play behind the encoder of the motor [rad or m]."""
+COUNTS = {"hinge": 2 * math.pi / 4096, "slide": 1.0 / 4096}
+"""A count of an encoder of 12 bits, of a turn or of 1 m [rad or m]."""
+CONTROL_S = 0.001
+"""Period of the PD that holds its torque, of the robot with encoders [s]."""
+FINE_S = 0.00025
+"""Physics step of that robot [s]."""
+COARSE_S = 0.002
+"""Physics step of its model [s]: no divisor of the sampling period, as in many published models."""
 RATE_HZ = 200.0
 NOISE = 1e-3
 """Standard deviation of a position sample [rad or m]."""
@@ -151,7 +173,7 @@ class PlainRobot:
         robot: MJCF of the robot.
         truth: The robot's values by the names that ``deal-hw calibrate --model`` gives them.
         delay_s: Mean delay of the commands, a whole number of physics steps [s].
-        fault: Effect that the model lacks, or fault of its recordings, or None.
+        fault: Effect that the model lacks, or fault of its recordings, or a right model's kind, or None.
         seed: Of truth, motions and noise.
     """
 
@@ -160,11 +182,11 @@ class PlainRobot:
     robot: str
     truth: Mapping[str, float]
     delay_s: float
-    fault: Fault | SharedFault | None
+    fault: Fault | SharedFault | RightModel | None
     seed: int
 
 
-def make_robot(kind: str, seed: int, fault: Fault | SharedFault | None = None) -> PlainRobot:
+def make_robot(kind: str, seed: int, fault: Fault | SharedFault | RightModel | None = None) -> PlainRobot:
     """Return a robot with a truth of its own.
 
     Raises:
@@ -184,10 +206,11 @@ def make_robot(kind: str, seed: int, fault: Fault | SharedFault | None = None) -
                 truth[f"{joint.name}.{'servo_stiffness' if name == 'kp' else name}"] = own[name]
         values[joint.name] = own
     delay_s = made.step_s * int(rng.integers(2, 16))
+    nominal = {j.name: {n: getattr(j, n) for n in SPREAD} for j in made.joints}
     return PlainRobot(
         kind=kind,
-        model=_mjcf(kind, made, {j.name: {n: getattr(j, n) for n in SPREAD} for j in made.joints}, 1.0),
-        robot=_mjcf(kind, made, values, 1.5 if fault == "mass" else 1.0),
+        model=_mjcf(kind, made, nominal, step_s=COARSE_S if fault in WITH_ENCODERS else made.step_s),
+        robot=_mjcf(kind, made, values, fault, step_s=FINE_S if fault in WITH_ENCODERS else made.step_s),
         truth=truth,
         delay_s=delay_s,
         fault=fault,
@@ -195,10 +218,21 @@ def make_robot(kind: str, seed: int, fault: Fault | SharedFault | None = None) -
     )
 
 
-def _mjcf(kind: str, made: _Kind, values: Mapping[str, Mapping[str, float]], heavier: float) -> str:
+def _mjcf(
+    kind: str,
+    made: _Kind,
+    values: Mapping[str, Mapping[str, float]],
+    fault: str | None = None,
+    *,
+    step_s: float,
+) -> str:
     bodies, actuators = made.bodies, []
+    driven = [joint.name for joint in made.joints if joint.kp]
     for joint in made.joints:
-        own = values[joint.name]
+        own = dict(values[joint.name])
+        if fault in WITH_ENCODERS and joint.kp:
+            # The PD damps in the joint's place.
+            own["damping"] = 0.0
         start = bodies.index("{" + joint.name)
         end = bodies.index("}", start) + 1
         _, _, axis = bodies[start + 1 : end - 1].partition(":")
@@ -206,15 +240,23 @@ def _mjcf(kind: str, made: _Kind, values: Mapping[str, Mapping[str, float]], hea
         text = f'<joint name="{joint.name}" {place} ' + " ".join(
             f'{name}="{own[name]:.9g}"' for name in ("damping", "frictionloss", "armature")
         )
-        bodies = bodies[:start] + text + "/>" + bodies[end:]
-        if joint.kp:
+        text += "/>"
+        if fault == "motor-play" and joint.name == driven[-1]:
+            half = MOTOR_PLAY["slide" if axis == "slide" else "hinge"] / 2
+            # The rotor moves with the joint; the link follows it within the play.
+            text += f'<joint name="{joint.name}.play" {place} limited="true" range="{-half:.9g} {half:.9g}"/>'
+        bodies = bodies[:start] + text + bodies[end:]
+        if joint.kp and fault in WITH_ENCODERS:
+            actuators.append(f'<motor name="{joint.name}" joint="{joint.name}"/>')
+        elif joint.kp:
             actuators.append(f'<position name="{joint.name}" joint="{joint.name}" kp="{own["kp"]:.9g}"/>')
     start = bodies.index("{mass:")
     end = bodies.index("}", start)
+    heavier = 1.5 if fault == "mass" else 1.0
     bodies = bodies[:start] + f"{heavier * float(bodies[start + 6 : end]):.9g}" + bodies[end + 1 :]
     return (
         f'<mujoco model="{kind}"><compiler angle="radian"/>'
-        f'<option timestep="{made.step_s:g}" integrator="implicitfast"/>'
+        f'<option timestep="{step_s:g}" integrator="implicitfast"/>'
         f"<worldbody>{bodies}</worldbody><actuator>{''.join(actuators)}</actuator></mujoco>\n"
     )
 
@@ -237,13 +279,22 @@ def record(robot: PlainRobot, number: int, seconds: float) -> str:
     if robot.fault == "jitter":
         late = rng.uniform(0.0, 2.0 * robot.delay_s / step_s, rows)
         arrives = np.maximum.accumulate(substeps * np.arange(rows) + late.astype(np.int64))
+    names = [joint.name for joint in KINDS[robot.kind].joints]
     joint = model.actuator_trnid[:, 0]
+    moved = [model.joint(int(i)).name for i in joint]
     dof, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
-    positions = np.empty((rows, model.nq))
+    seen = np.array([int(model.joint(name).qposadr[0]) for name in names])
+    slides = [int(model.joint(name).type[0]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for name in names]
+    count = np.array([COUNTS["slide" if slide else "hinge"] for slide in slides])
+    at = [names.index(name) for name in moved]
+    stiffness = np.array([robot.truth[f"{name}.servo_stiffness"] for name in moved])
+    damping = np.array([robot.truth[f"{name}.damping"] for name in moved])
+    held = round(CONTROL_S / step_s)
+    positions = np.empty((rows, len(names)))
     next_row, engaged = 0, data.qpos[place].copy()
     for step in range(rows * substeps):
         if step % substeps == 0:
-            positions[step // substeps] = data.qpos
+            positions[step // substeps] = data.qpos[seen]
         while next_row < rows and arrives[next_row] <= step:
             next_row += 1
         wanted = commands[max(next_row - 1, 0)].copy()
@@ -253,16 +304,22 @@ def record(robot: PlainRobot, number: int, seconds: float) -> str:
             wanted = engaged
         if robot.fault == "sign":
             wanted[-1] = -wanted[-1]
-        data.ctrl[:] = wanted
+        if robot.fault in WITH_ENCODERS:
+            if step % held == 0:
+                read = np.round(data.qpos[place] / count[at]) * count[at]
+                data.ctrl[:] = stiffness * (wanted - read) - damping * data.qvel[dof]
+        else:
+            data.ctrl[:] = wanted
         if robot.fault == "friction":
             speed = data.qvel[dof]
             extra = STRIBECK_EXTRA * model.dof_frictionloss[dof] * np.exp(-np.abs(speed) / STRIBECK_SPEED)
             data.qfrc_applied[dof] = -extra * np.tanh(speed / 0.01)
         mujoco.mj_step(model, data)
-    measured = positions + NOISE * rng.standard_normal(positions.shape)
+    if robot.fault in WITH_ENCODERS:
+        measured = np.round(positions / count) * count
+    else:
+        measured = positions + NOISE * rng.standard_normal(positions.shape)
     time, measured, commands = _shared(robot.fault, time, measured, commands)
-    names = [model.joint(i).name for i in range(model.njnt)]
-    moved = [model.joint(int(i)).name for i in joint]
     header = ",".join(["time", *names, *(f"{name}.command" for name in moved)])
     lines = [
         ",".join(f"{value:.7g}" for value in (t, *position, *command))

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
 from deal_hw.errors import ConfigurationError
@@ -110,7 +110,15 @@ class Calibration:
         require_other(path, robot.description.mjcf)
         source = f"method {result.method}, distribution {self.distribution.digest()}"
         write_calibrated_mjcf(
-            robot, result.space, result.estimate, path, result.latency_s, source, result.without_value
+            robot,
+            result.space,
+            result.estimate,
+            path,
+            result.latency_s,
+            source,
+            result.without_value,
+            self.colour,
+            result.biased,
         )
         return path
 
@@ -176,6 +184,7 @@ def calibrate(
     spike_ratio: float = CalibrateSettings.spike_ratio,
     heldout_window_s: float = HELDOUT_WINDOW_S,
     method: str = DEFAULT,
+    checks: Literal["usual", "all"] = CalibrateSettings.checks,
     refine: bool = True,
     population: int | None = None,
     generations: int | None = None,
@@ -219,6 +228,8 @@ def calibrate(
             fastest motion.
         heldout_window_s: Held-out predictions restart from the measured state after this time [s].
         method: Name of the method; by default chosen from the recordings.
+        checks: "usual" ends the checks of recordings that the model does not explain where they take more
+            physics steps than the fits; "all" runs them to their end.
         refine: Follow the search by multiple shooting on prediction error.
         population: Members of the search; the method's usual number by default.
         generations: Most generations of the search.
@@ -272,6 +283,7 @@ def calibrate(
             episodes=tuple(episodes),
             heldout_window=heldout_window_s,
             method=method,
+            checks=checks,
             policy=policy,
             space=space,
             free=(free,) if isinstance(free, str) else tuple(free),

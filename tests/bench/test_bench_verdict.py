@@ -13,7 +13,7 @@ from deal_hw.bench.verdict import cells, line, names, run_cell, summary
 from deal_hw.calibration import Budget
 from deal_hw.errors import UnknownNameError
 from deal_hw.testing import plain_robots
-from deal_hw.testing.plain_robots import FAULTS, KINDS, NOISE, PlainRobot, make_robot, record, write
+from deal_hw.testing.plain_robots import COUNTS, FAULTS, KINDS, NOISE, PlainRobot, make_robot, record, write
 from deal_hw.types import FloatArray
 
 
@@ -38,10 +38,26 @@ def test_a_robot_is_its_model_with_other_numbers(kind: str) -> None:
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_changes_the_recording_beyond_noise(fault: plain_robots.Fault) -> None:
-    """Commands are the same, positions differ by more than ten times the noise (a jitter by five)."""
-    right, wrong = (samples(make_robot("double-pendulum", 1, f)) for f in (None, fault))
+    """Commands are the same, positions differ by more than ten times the noise (a jitter by five).
+
+    A play of 1 degree behind the encoder changes what it reads by a count or two.
+    """
+    usual: plain_robots.RightModel | None = "encoders" if fault == "motor-play" else None
+    right, wrong = (samples(make_robot("double-pendulum", 1, f)) for f in (usual, fault))
     assert np.array_equal(right[:, 3:], wrong[:, 3:])
-    assert np.abs(right[:, 1:3] - wrong[:, 1:3]).max() > (5 if fault == "jitter" else 10) * NOISE
+    least = {"jitter": 5 * NOISE, "motor-play": 0.9 * COUNTS["hinge"]}.get(fault, 10 * NOISE)
+    assert np.abs(right[:, 1:3] - wrong[:, 1:3]).max() > least
+
+
+def test_a_robot_with_encoders_has_whole_counts_and_its_models_values() -> None:
+    """The PD's damping stands in for the joint's: both robots move alike; the model is coarse."""
+    plain, encoders = (make_robot("arm", 1, fault) for fault in (None, "encoders"))
+    assert plain.truth == encoders.truth and encoders.delay_s == plain.delay_s
+    first, second = samples(plain)[:, 1:4], samples(encoders)[:, 1:4]
+    count = COUNTS["hinge"]
+    assert np.allclose(second / count, np.round(second / count), atol=1e-4)
+    assert np.abs(first - second).max() < 5 * NOISE
+    assert mujoco.MjModel.from_xml_string(encoders.model).opt.timestep == 0.002
 
 
 def test_the_mass_fault_makes_the_last_link_half_as_heavy_again() -> None:

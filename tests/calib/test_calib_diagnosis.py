@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +17,20 @@ from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
-from deal_hw.calib.validation.checks import with_causes
+from deal_hw.calib.validation.cause_words import SearchedKinds
+from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
 from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
 from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
+from deal_hw.calib.validation.signatures import (
+    Cause,
+    Signature,
+    SignatureResponse,
+    held_direction,
+    place_in_play,
+)
+from deal_hw.calib.validation.wider_models import zero_parameters
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
@@ -145,6 +155,68 @@ def test_two_causes_are_named_and_the_larger_first() -> None:
     found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
     assert [f.cause for f in found] == ["load", "damping"]
     assert found[0].deviance > found[1].deviance > MISMATCH.evidence
+
+
+def _with_masses(wrong: FloatArray, **effect: FloatArray) -> Evidence:
+    """Return evidence with bodies whose mass has these effects on the prediction, (W, H) of twice it."""
+    known = _evidence(wrong)
+    bodies = [Signature("mass", name, (x[..., None] / STD,)) for name, x in effect.items()]
+    return dataclasses.replace(known, found=[*(s for s in known.found if s.cause != "inertia"), *bodies])
+
+
+def test_no_mass_below_zero_is_named() -> None:
+    """A residual as of a cart 1.6 times heavier is also that of a pole 1.6 times lighter: impossible."""
+    v, _ = _motion()
+    effect = _moved_by(v * np.abs(v) + 0.3)
+    found = name_causes(_with_masses(-1.6 * effect, cart=effect, pole=-effect))
+    assert found[0].cause == "mass" and found[0].joints == ("cart",)
+    assert "cart 160 % heavier" in found[0].alarm.seen and "pole" not in found[0].alarm.seen
+    assert not any(f.cause == "mass" for f in name_causes(_with_masses(-1.6 * effect, pole=-effect)))
+
+
+def test_a_rotor_is_named_beside_the_mass_that_moves_alike() -> None:
+    """A force with acceleration at a slide is as much a heavier cart: both stand in one alarm."""
+    _, a = _motion()
+    effect = _moved_by(0.05 * a)
+    known = _with_masses(effect, cart=-effect)
+    rotor = Signature("inertia", "slide", ((effect + _moved_by(0.002 + 0 * a))[..., None] / STD,))
+    (found,) = name_causes(dataclasses.replace(known, found=[*known.found, rotor]))[:1]
+    assert found.cause == "mass" and "cart 100 % heavier" in found.alarm.seen
+    assert "another inertia at slide explains as much" in found.alarm.seen
+    assert "free dof_armature of slide" in found.alarm.do
+
+
+def test_advice_frees_only_what_is_not_free() -> None:
+    """Damping that is searched follows another law; at its bound the range is too narrow."""
+    v, _ = _motion()
+    known = _evidence(_moved_by(-0.3 * v))
+    free = frozenset({("dof_damping", "knee"), ("servo_damping", "knee")})
+    searched = dataclasses.replace(known, searched=SearchedKinds(free))
+    assert "searched already" in name_causes(searched)[0].alarm.do
+    half = dataclasses.replace(known, searched=SearchedKinds(frozenset({("dof_damping", "knee")})))
+    assert name_causes(half)[0].alarm.do == "Free servo_damping of knee (--parameters)."
+    ended = SearchedKinds(free, (("knee.damping", "dof_damping", "knee"),))
+    alarm = name_causes(dataclasses.replace(known, searched=ended))[0].alarm
+    assert "knee.damping ended at the bound" in alarm.means and "--range" in alarm.do
+
+
+def test_a_value_that_compensates_for_a_cause_is_marked(small_problem: Callable[..., Problem]) -> None:
+    """What takes part of a load moves once the load is named: that widens its interval, and marks it."""
+    v, _ = _motion()
+    load = _moved_by(np.full_like(v, 0.3))
+    (found,) = _named(load + _moved_by(-0.1 * v), (0.5 * load + _moved_by(0.2 * v),))[:1]
+    assert abs(found.shift[0]) > 0.1
+    problem = small_problem()
+    fit = with_rows(refine(problem, problem.space.nominal, 0.0, (0.2,), iterations=2))
+    known = uncertainty_at(problem, fit)
+    std = np.sqrt(np.diag(known.covariance))
+    shift = np.array([2 * std[0], 0.1 * std[1], 0.0])
+    wider = biased(problem, known, [dataclasses.replace(found, cause="load", shift=shift)])
+    names = problem.space.names
+    assert wider.biased == {names[0]: "load"} and "identifiable" != wider.verdicts[0] != known.verdicts[0]
+    (low, high), center = problem.space.to_scale(wider.interval.T), problem.space.to_scale(known.theta)
+    assert np.all(low <= center - np.abs(shift[:2])) and np.all(high >= center + np.abs(shift[:2]))
+    assert biased(problem, known, ()) is known
 
 
 def test_contact_comes_in_bursts() -> None:
@@ -273,6 +345,14 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
 Truth = tuple[PlainRobot, Problem, Refined]
 
 
+def problem_of(robot: PlainRobot, folder: Path) -> Problem:
+    """Return the problem of two recordings of 3 s of a robot."""
+    model, paths, held_out = write(robot, folder, seconds=3.0)
+    recordings = Recordings(model=model, data=tuple(paths))
+    work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    return Problem(work.robot, work.space, work.episodes, threads=1)
+
+
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | None], Truth]:
     """Return what makes a simulated robot's recordings, and a fit from its own values; each pair once."""
@@ -280,11 +360,8 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | No
     @functools.cache
     def make(kind: str, fault: Fault | None) -> Truth:
         robot = make_robot(kind, 3, fault)
-        model, paths, held_out = write(robot, tmp_path_factory.mktemp("robot"), seconds=3.0)
-        recordings = Recordings(model=model, data=tuple(paths))
-        work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
-        problem = Problem(work.robot, work.space, work.episodes, threads=1)
-        theta = np.array([robot.truth[name] for name in work.space.names])
+        problem = problem_of(robot, tmp_path_factory.mktemp("robot"))
+        theta = np.array([robot.truth[name] for name in problem.space.names])
         return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
 
     return make
@@ -305,6 +382,29 @@ def test_faults_of_a_simulated_robot_are_named(truth: Callable[[str, Fault | Non
     _, problem, fit = truth("pendulum", "jitter")
     jitter = name_causes(evidence(problem, fit))
     assert jitter[0].cause == "delay" and "its own delay" in jitter[0].alarm.seen
+
+
+def test_a_link_crosses_its_play_as_a_free_body() -> None:
+    """Half of 0.02 rad ahead, 2 rad/s^2: 0.02 = 2 t^2 / 2 takes 0.141 s to the other stop, where it stays.
+
+    A load that turns round brings it back in the same time.
+    """
+    needed = np.repeat([2.0, -2.0], 1000)
+    place = place_in_play(needed, 1e-3, 0.02)
+    assert place[0] == pytest.approx(0.01, abs=1e-5) and place[999] == -0.01
+    first, back = np.flatnonzero(place == -0.01)[0], 1000 + np.flatnonzero(place[1000:] == 0.01)[0]
+    assert first == pytest.approx(141, abs=2) and back == pytest.approx(1141, abs=2)
+    # On its way, half of the time is a quarter of the path.
+    assert place[70] == pytest.approx(0.01 - 0.02 / 4, abs=3e-4)
+
+
+def test_play_behind_the_motors_encoder_is_named(truth: Callable[[str, Fault | None], Truth]) -> None:
+    """1 degree in the elbow, which no set-point's play explains: backlash there, not a heavier link."""
+    _, problem, fit = truth("double-pendulum", "motor-play")
+    found = name_causes(evidence(problem, fit))
+    assert found[0].cause == "backlash" and found[0].joints == ("elbow",)
+    assert "servo_play" in found[0].alarm.do and "on either side" in found[0].alarm.means
+    assert not any(f.cause == "mass" for f in found)
 
 
 def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Truth]) -> None:
@@ -384,3 +484,23 @@ def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault 
     asked = result.restricted(problem.space)
     assert asked.space.names == problem.space.names and len(asked.verdicts) == len(asked.estimate)
     np.testing.assert_array_equal(asked.distribution().mean, result.distribution().mean[:-1])
+
+
+def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Path) -> None:
+    """A rotor of 0.01 kg m^2 behind a pendulum of 0.0075; the model has none, so nothing searches it."""
+    robot = make_robot("pendulum", 3)
+    without, rotor = (
+        re.sub('armature="[^"]*"', f'armature="{value}"', text)
+        for text, value in ((robot.model, 0), (robot.robot, 0.01))
+    )
+    problem = problem_of(dataclasses.replace(robot, model=without, robot=rotor), tmp_path)
+    fit = with_rows(refine(problem, problem.space.nominal, robot.delay_s, (0.2,), iterations=8))
+    assert "pivot.armature" not in problem.space.names and unexplained(fit)
+    assert [p.name for p in zero_parameters(problem)] == ["pivot.armature"]
+    (found,) = diagnosis.find_zero(problem, fit)
+    value = float(re.findall(r"pivot.armature = (\S+) kg", found.alarm.seen)[0])
+    assert value == pytest.approx(0.01, rel=0.1)
+    assert found.cause == "inertia" and found.joints == ("pivot",) and found.share > 0.5
+    assert "was not searched" in found.alarm.means and "MJCF" in found.alarm.do
+    # The others made up for it.
+    assert np.abs(found.shift[:-1]).max() > 0.1

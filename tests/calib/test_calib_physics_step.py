@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import mujoco
@@ -91,6 +92,9 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
     assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
     assert found.gain > STEP.clearly
     (alarm,) = step_alarm(known, found)
+    # A shift that hardly changes predictions widens the intervals without an alarm.
+    same = dataclasses.replace(found, share=0.02)
+    assert step_alarm(known, same) == () and np.array_equal(counted(problem, known, same).interval, wider)
     assert "2.5 ms is too coarse" in alarm.means and "--physics-step 0.00125" in alarm.do
     assert "hinge.armature" in alarm.seen or "hinge.damping" in alarm.seen
     # Half the error is removed by half the step: corrected, the estimate is nearer the truth.
@@ -115,8 +119,8 @@ def test_a_check_that_would_take_too_long_says_so(tmp_path: Path) -> None:
 
 
 def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:
-    """The model itself is not touched; steps are counted apart."""
+    """The model itself is not touched; steps count together, so a check is charged for them."""
     problem, *_ = checked(tmp_path, STEP_S)
     finer = halved(problem)
     assert finer.robot.step_s == STEP_S / 2 and problem.robot.step_s == STEP_S
-    assert finer.starts is problem.starts and finer.steps == 0
+    assert finer.starts is problem.starts and finer.steps == problem.steps > 0

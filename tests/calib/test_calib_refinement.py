@@ -25,10 +25,10 @@ from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.fit.solver import correlated_samples
 from deal_hw.calib.pipeline import stages
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.methods import make_method, usual_budget
 from deal_hw.calib.pipeline.stages import (
     CalibrationPipeline,
-    CalibrationRun,
     Refinement,
     RestartSettings,
     conclusive,
@@ -335,6 +335,20 @@ def test_rounding_of_an_encoder_is_no_jitter() -> None:
     found = noise_model([(np.round(motion / count) * count)[:, None]], [speed[:, None]])
     assert found.timing_std_s < 1e-5
     assert found.position_std[0] == pytest.approx(count / np.sqrt(12), rel=0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_saw_tooth_of_slow_motion_is_no_jitter(seed: int) -> None:
+    """Three joints with 12 bits a turn, less than a count a sample, exact stamps: 4 to 5 ms were found."""
+    rng = np.random.default_rng(seed)
+    t, count = np.arange(0, 28, 5e-3), 2 * np.pi / 4096
+    frequency, size, phase = rng.uniform((0.1, 0.003, 0), (1.0, 0.017, 6.28), (3, 6, 3)).transpose(2, 0, 1)
+    angle = 2 * np.pi * frequency[..., None] * t + phase[..., None]
+    motion = np.sum(size[..., None] * np.sin(angle), axis=1).T
+    speed = np.sum((2 * np.pi * frequency * size)[..., None] * np.cos(angle), axis=1).T
+    found = noise_model([np.round(motion / count) * count], [speed])
+    assert found.timing_std_s == 0.0
+    assert found.position_std == pytest.approx(np.full(3, count / np.sqrt(12)), rel=0.3)
 
 
 def test_filled_gaps_are_no_measurements() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
@@ -172,6 +172,7 @@ def test_plain_values_have_none_where_there_is_none(result: CalibrationResult) -
         "value": 4.0,
         "interval": [3.6, 4.4],
         "nominal": 2.0,
+        "biased_by": None,
     }
     assert values["known"] == {"m1.delay": 0.004} and values["latency"]["value"] == 0.0125
 
@@ -183,7 +184,33 @@ def test_files_are_yaml(robot: RobotModel, result: CalibrationResult, tmp_path: 
     for name, wanted in zip(
         names, (actuator_tables(robot, result), urdf_values(robot, result), plain_values(result)), strict=True
     ):
-        assert yaml.safe_load((tmp_path / name).read_text(encoding="utf-8")) == wanted
+        found = yaml.safe_load((tmp_path / name).read_text(encoding="utf-8"))
+        assert found == wanted | {"alarms": [], "biased": {}}
+
+
+def test_verdict_alarms_and_biased_values_stand_in_each_file(
+    robot: RobotModel, result: CalibrationResult, tmp_path: Path
+) -> None:
+    """Whoever takes a value into another program sees that a named cause moved it."""
+    doubtful = dataclasses.replace(
+        result,
+        alarms=(Alarm("0.25 kg at the tip.", "Another mass.", "Weigh it."),),
+        biased={"shoulder.stiffness": "mass", "latency": "mass"},
+    )
+    for name in write_exports(tmp_path, robot, doubtful, {"verdict": "amber", "verdict_reason": "because"}):
+        found = yaml.safe_load((tmp_path / name).read_text(encoding="utf-8"))
+        assert found["verdict"] == "amber" and found["verdict_reason"] == "because"
+        assert found["alarms"] == ["0.25 kg at the tip."]
+        assert found["biased"] == {"shoulder.stiffness": "mass", "latency": "mass"}
+    assert found["parameters"]["shoulder.stiffness"]["biased_by"] == "mass"
+    path = tmp_path / "calibrated.xml"
+    write_calibrated_mjcf(
+        robot, result.space, result.estimate, path, 0.01, verdict="amber", biased=doubtful.biased
+    )
+    text = path.read_text(encoding="utf-8")
+    assert "verdict: amber" in text and "biased by mass: shoulder.stiffness" in text
+    assert '<text name="deal_hw.verdict" data="amber"/>' in text
+    assert '<text name="deal_hw.biased" data="shoulder.stiffness latency"/>' in text
 
 
 def test_parameters_without_a_value_are_marked_in_the_model(

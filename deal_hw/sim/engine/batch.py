@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -52,6 +53,13 @@ def default_threads() -> int:
     return len(os.sched_getaffinity(0))
 
 
+@dataclass(slots=True)
+class StepCount:
+    """Number of simulated physics steps, which several simulators may share."""
+
+    steps: int = 0
+
+
 class ServoBatch:
     """N simulations of one robot; calibrator and trainer use the engine only through this class.
 
@@ -60,13 +68,19 @@ class ServoBatch:
         space: The parameters in which members differ.
         count: Members N.
         threads: Threads; None for all CPUs.
+        counted: Counts the physics steps; None for a count of its own.
 
     Attributes:
         play: Width of the play before each joint, (N, A) [rad or m]; None if no parameter is a play.
     """
 
     def __init__(
-        self, robot: RobotModel, space: ParameterSpace, count: int, threads: int | None = None
+        self,
+        robot: RobotModel,
+        space: ParameterSpace,
+        count: int,
+        threads: int | None = None,
+        counted: StepCount | None = None,
     ) -> None:
         self.robot = robot
         self.space = space
@@ -86,7 +100,7 @@ class ServoBatch:
             "servo_effort_limit": np.array(description.effort_limit),
             "servo_speed_limit": np.array(description.speed_limit),
         }
-        self.steps = 0
+        self._counted = counted or StepCount()
         self.set_parameters(np.repeat(space.nominal[None], count, axis=0))
 
     def set_parameters(self, theta: FloatArray, where: npt.NDArray[np.intp] | None = None) -> None:
@@ -255,7 +269,7 @@ class ServoBatch:
             control = np.concatenate([control, applied], axis=2)
             spec |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
         before = self._warnings()
-        self.steps += count * steps
+        self._counted.steps += count * steps
         if not every:
             # Stepping by rollout with a record of one field costs no more than bare stepping.
             every = steps
@@ -294,23 +308,29 @@ class BatchPool:
         space: The parameters in which members differ.
         threads: Threads of all simulators; None for all CPUs.
         most: Most sizes that are kept.
+        counted: Counts the steps; None for a count of its own.
     """
 
     def __init__(
-        self, robot: RobotModel, space: ParameterSpace, threads: int | None = None, most: int = SIZES_KEPT
+        self,
+        robot: RobotModel,
+        space: ParameterSpace,
+        threads: int | None = None,
+        most: int = SIZES_KEPT,
+        counted: StepCount | None = None,
     ) -> None:
         self._robot, self._space, self._most = robot, space, most
         self._threads = threads or default_threads()
         self._kept: dict[tuple[int, int], list[ServoBatch]] = {}
-        self._steps = 0
+        self.counted = counted or StepCount()
 
     def __len__(self) -> int:
         return len(self._kept)
 
     @property
     def steps(self) -> int:
-        """Physics steps of all simulators so far, including dropped ones."""
-        return self._steps + sum(batch.steps for kept in self._kept.values() for batch in kept)
+        """Physics steps of all simulators so far, including dropped ones and those with the same count."""
+        return self.counted.steps
 
     def get(self, count: int) -> ServoBatch:
         """Return the simulator of ``count`` members; parameters and state are those of its last user."""
@@ -328,9 +348,11 @@ class BatchPool:
         key = count, parts
         sizes = [count // parts + (i < count % parts) for i in range(parts)]
         threads = max(self._threads // parts, 1)
-        kept = self._kept.pop(key, None) or [ServoBatch(self._robot, self._space, n, threads) for n in sizes]
+        kept = self._kept.pop(key, None) or [
+            ServoBatch(self._robot, self._space, n, threads, self.counted) for n in sizes
+        ]
         # Last in order is last used.
         self._kept[key] = kept
         if len(self._kept) > self._most:
-            self._steps += sum(batch.steps for batch in self._kept.pop(next(iter(self._kept))))
+            self._kept.pop(next(iter(self._kept)))
         return kept

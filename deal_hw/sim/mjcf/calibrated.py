@@ -26,6 +26,8 @@ from deal_hw.types import FloatArray
 SPEED_LIMIT_NUMERIC = "deal_hw.speed_limit"
 LATENCY_NUMERIC = "deal_hw.latency_s"
 WITHOUT_VALUE_TEXT = "deal_hw.without_value"
+VERDICT_TEXT = "deal_hw.verdict"
+BIASED_TEXT = "deal_hw.biased"
 
 ROUNDS = 4
 """Most rounds of writing. Writing one value may disable another one of the compiler (``dampratio``,
@@ -43,6 +45,8 @@ def write_calibrated_mjcf(
     latency_s: float,
     source: str = "",
     without_value: Sequence[str] = (),
+    verdict: str = "",
+    biased: Mapping[str, str] | None = None,
 ) -> tuple[Path, ...]:
     """Write the robot's MJCF with calibrated values.
 
@@ -50,7 +54,8 @@ def write_calibrated_mjcf(
     ``<custom>`` lists them in the ``<text>`` :data:`WITHOUT_VALUE_TEXT`. Values without a MuJoCo field go
     into ``<custom>``, too. The latency is ``deal_hw.latency_s``. Each kind of parameter outside MuJoCo (speed
     limit, encoder bias) has one number per element, beside a ``<text>`` of the same name that lists the
-    elements.
+    elements. The verdict and the biased values are marked like unidentified parameters, in the comment and in
+    the ``<text>`` of :data:`VERDICT_TEXT` and :data:`BIASED_TEXT`.
 
     Args:
         robot: The robot's model.
@@ -60,6 +65,8 @@ def write_calibrated_mjcf(
         latency_s: Total latency [s].
         source: Source of the values, for the comment at the top.
         without_value: Names of the unidentified parameters.
+        verdict: The calibration's verdict: green, amber or red; "" if there is none.
+        biased: Cause of the residual that a value compensates for, by the value's name.
 
     Returns:
         The files written, ``path`` first.
@@ -70,8 +77,11 @@ def write_calibrated_mjcf(
     """
     check_kinds(space)
     values = dict(zip(space.names, theta, strict=True))
+    biased = biased or {}
     remarks = [
-        f"no value: {name}; {values[name]:.5g} {space[name].unit} stands here" for name in without_value
+        *([f"verdict: {verdict}"] if verdict else ()),
+        *(f"no value: {name}; {values[name]:.5g} {space[name].unit} stands here" for name in without_value),
+        *(f"biased by {cause}: {name}" for name, cause in biased.items()),
     ]
     return change_mjcf(
         robot.description.mjcf,
@@ -80,7 +90,11 @@ def write_calibrated_mjcf(
         device_values(space, theta) | {LATENCY_NUMERIC: ([latency_s], [])},
         source,
         # A file that was calibrated before may have a list: it is replaced, also by "none".
-        {WITHOUT_VALUE_TEXT: " ".join(without_value) or "none"},
+        {
+            WITHOUT_VALUE_TEXT: " ".join(without_value) or "none",
+            VERDICT_TEXT: verdict or "none",
+            BIASED_TEXT: " ".join(biased) or "none",
+        },
         remarks,
     )
 

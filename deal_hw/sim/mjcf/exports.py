@@ -61,17 +61,32 @@ _URDF = (
 )
 
 
-def write_exports(folder: Path, robot: RobotModel, result: CalibrationResult) -> list[str]:
-    """Write the values for other programs into a folder; return the files' names."""
+def write_exports(
+    folder: Path, robot: RobotModel, result: CalibrationResult, judged: Mapping[str, Any] | None = None
+) -> list[str]:
+    """Write the values for other programs into a folder; return the files' names.
+
+    Args:
+        folder: Folder to write to.
+        robot: The nominal model.
+        result: The result.
+        judged: What to put behind the format of each file: the verdict on the result; plain values.
+    """
     tables = {
         ACTUATORS: actuator_tables(robot, result),
         URDF: urdf_values(robot, result),
         VALUES: plain_values(result),
     }
     for name, values in tables.items():
-        text = yaml.safe_dump(values, sort_keys=False, width=110)
+        marked = {"format": values["format"], **(judged or {}), **_marks(result), **values}
+        text = yaml.safe_dump(marked, sort_keys=False, width=110)
         (folder / name).write_text(text, encoding="utf-8")
     return list(tables)
+
+
+def _marks(result: CalibrationResult) -> dict[str, Any]:
+    """Return the reasons to distrust the values: what each alarm saw, and biased values with their causes."""
+    return {"alarms": [alarm.seen for alarm in result.alarms], "biased": dict(result.biased)}
 
 
 def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
@@ -173,6 +188,7 @@ def plain_values(result: CalibrationResult) -> dict[str, Any]:
             "value": float(estimate) if has else None,
             "interval": [float(low), float(high)],
             "nominal": parameter.nominal,
+            "biased_by": result.biased.get(parameter.name),
         }
     low, high = result.latency_interval_s
     return {

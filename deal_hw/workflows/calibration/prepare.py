@@ -93,6 +93,7 @@ def calibrate_inputs(
         work.holdout,
         method=method,
         budget=settings.budget,
+        thorough=settings.checks == "all",
         rng=np.random.default_rng(settings.seed),
         latency_s=settings.latency,
         latency_range_s=settings.latency_range,

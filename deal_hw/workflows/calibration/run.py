@@ -115,6 +115,7 @@ def calibrate_episodes(
     heldout_window_s: float = HELDOUT_WINDOW_S,
     smoothing_s: float | None = None,
     policy: PopulationPolicy | None = None,
+    thorough: bool = False,
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid, without writing results.
 
@@ -139,6 +140,7 @@ def calibrate_episodes(
         heldout_window_s: Held-out predictions restart from the measured state after this time [s].
         smoothing_s: Time over which start states are smoothed [s]; None for the default.
         policy: The policy that moved the robot all the time, for methods that need it.
+        thorough: Run checks to their end where they take more physics steps than the fits.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -178,7 +180,7 @@ def calibrate_episodes(
 
     judge = None if held_out is None else lambda *fit, of=held_out: errors(of, *fit).nrmse
     best = BestSoFar(space, judge, say)
-    searcher = make_method(method, refine=budget.refine)
+    searcher = make_method(method, refine=budget.refine, thorough=thorough)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
     with (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from deal_hw.calib.pipeline.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
@@ -164,6 +164,10 @@ class CalibrateSettings(Checked):
 
     generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of the search."""
+
+    checks: Literal["usual", "all"] = "usual"
+    """Checks of recordings that the model does not explain: usual ends them where they take more physics
+    steps than the fits; all runs them to their end."""
 
     refine: bool = True
     """After the search, refine by multiple shooting on the prediction error."""

@@ -1,0 +1,116 @@
+"""State that the stages of one calibration share, what they cost, and the result of a fitting strategy."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import Uncertainty
+from deal_hw.calib.fit.refinement import Refined
+from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation.checks import Validation
+from deal_hw.calib.validation.wider_models import WiderFit
+from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.fit.output_error import OutputErrorFit
+
+PLAY = "play in the gears"
+SHARED_ERRORS = "errors that commands and measurements share"
+AFTER_FIT = "after the fit"
+"""Names of checks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitOutcome:
+    """Result of a fitting strategy.
+
+    Attributes:
+        searched: Result of the search, or its substitute.
+        theta: The estimate, (K,).
+        latency_s: Its latency [s].
+        chi2: Mean squared residual over the noise variance.
+        known: Uncertainty of the estimate.
+        facts: More entries for the provenance: plain JSON values.
+    """
+
+    searched: CalibrationResult
+    theta: FloatArray
+    latency_s: float
+    chi2: float
+    known: Uncertainty
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def but(
+        self, *first: Alarm, last: Sequence[Alarm] = (), chi2: float | None = None, **facts: Any
+    ) -> FitOutcome:
+        """Return it with more alarms, before and after its own, and with more facts."""
+        chi2 = self.chi2 if chi2 is None else chi2
+        known = self.known.with_alarms(*first, last=last)
+        return dataclasses.replace(self, chi2=chi2, known=known, facts={**self.facts, **facts})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationRun:
+    """State shared by the stages of one calibration.
+
+    Attributes:
+        problem: Recordings and simulator.
+        budget: Limits of the searches.
+        rng: The only source of randomness.
+        attempts: Runs the search on all recordings and stores its results.
+        settings: Which checks to run.
+        local: The local fit, if there is one.
+        play: The fit with play in the gears, if there is one.
+        progress: Receives progress reports.
+        first_steps: Physics steps of the problem before this calibration.
+        checks: Physics steps of each check so far, by its name.
+    """
+
+    problem: Problem
+    budget: Budget
+    rng: np.random.Generator
+    attempts: Restarts
+    settings: Validation
+    local: Refined | None = None
+    play: WiderFit | None = None
+    progress: ProgressCallback | None = None
+    first_steps: int = 0
+    checks: dict[str, int] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def check(self, name: str) -> Iterator[None]:
+        """Count what runs inside as a check."""
+        before = self.problem.steps
+        try:
+            yield
+        finally:
+            self.checks[name] = self.checks.get(name, 0) + self.problem.steps - before
+
+    @property
+    def fit_steps(self) -> int:
+        """Physics steps of the fits so far."""
+        return self.problem.steps - self.first_steps - sum(self.checks.values())
+
+    @property
+    def check_steps_left(self) -> int:
+        """Physics steps that checks may take: together no more than the fits."""
+        return self.fit_steps - sum(self.checks.values())
+
+    def say(self, stage: str, message: str = "", done: int = 0, total: int = 1, **candidate: Any) -> None:
+        """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""
+        if self.progress is not None:
+            self.progress(Progress(stage, done, total, message, **candidate))
+
+    def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
+        """Report a candidate estimate and the stage that found it."""
+        theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
+        candidate = {"estimate": theta, "latency_s": found.latency_s, "values": {"chi2": found.chi2}}
+        self.say(stage, f"chi2 {found.chi2:.3g}", 1, 1, **candidate)

@@ -1,0 +1,147 @@
+"""Words of each cause of a residual: how it looks, what it means, and what to do about it.
+
+What to do depends on the calibration: a parameter that is searched already is not advised, and one that ended
+at the bound of its range has too narrow a range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import ended_at_bound
+from deal_hw.calib.validation.signatures import Cause
+from deal_hw.calibration import listed
+from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.parameters.kind import joint_of
+from deal_hw.types import FloatArray
+
+LOOKS: Mapping[Cause, tuple[str, str, str]] = {
+    "friction": (
+        "a force against slow motion",
+        "Friction depends on speed (Stribeck), or creeps where it should hold.",
+        "Free dof_friction_creep, dof_frictionloss and dof_damping of {} (--parameters).",
+    ),
+    "backlash": (
+        "play in the gear",
+        "Motor and joint do not move as one where the motion or the load turns round. The encoder may be on "
+        "either side.",
+        "Repair the gear of {}, or free servo_play there (--parameters).",
+    ),
+    "delay": (
+        "a timing error that changes",
+        "The delay of commands or sensors varies; the model's is constant.",
+        "End other programs on the computer that sends, send at an even pace, or time-stamp commands where "
+        "they are received{}.",
+    ),
+    "damping": (
+        "a force that grows with speed",
+        "Damping was not free, or follows another law (the square of speed).",
+        "Free dof_damping or servo_damping of {} (--parameters); if they are free already, check the law.",
+    ),
+    "inertia": (
+        "a force in proportion to acceleration",
+        "An inertia or a gain was not free, or its range is too narrow.",
+        "Free dof_armature, body_mass or the actuator's gain of {} (--parameters).",
+    ),
+    "load": (
+        "a constant force",
+        "A mass, its centre or an encoder's zero was not free.",
+        "Free encoder_bias, body_mass or body_ipos of {} (--parameters).",
+    ),
+    "mass": (
+        "another mass",
+        "The ratio of the bodies' masses is not the model's.",
+        "Weigh {}, correct the model, or free body_mass there (--parameters).",
+    ),
+    "contact": (
+        "bursts",
+        "The robot may touch something that the model does not have.",
+        "Look at {}. If it touched something, record without that. Recordings in files (--data) can leave it "
+        "out (--leave-out).",
+    ),
+}
+"""For each cause: how the residual looks, what it means, and what to do, with {} for the place."""
+
+FREES: Mapping[Cause, tuple[str, ...]] = {
+    "friction": ("dof_friction_creep", "dof_frictionloss", "dof_damping"),
+    "damping": ("dof_damping", "servo_damping"),
+    "inertia": ("dof_armature", "body_mass", "servo_stiffness", "motor_gain"),
+    "load": ("encoder_bias", "body_mass", "body_ipos_x", "body_ipos_y", "body_ipos_z"),
+}
+"""Kinds of parameters that have the effect of a cause."""
+
+FREE_ALREADY: Mapping[Cause, str] = {
+    "friction": "The parameters of friction are searched already: MuJoCo has no friction law that fits. "
+    "Trust predictions more than single values.",
+    "damping": "The damping is searched already: check its law, such as the square of speed.",
+    "inertia": "Armature, mass and gain are searched already: look for a mass that moves on its own, such as "
+    "a load, a belt or a cable.",
+    "load": "Mass, its centre and the encoder's zero are searched already: look for a spring, a cable or a "
+    "contact.",
+}
+"""What to do where all of these kinds are searched."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchedKinds:
+    """What a calibration searched.
+
+    Attributes:
+        free: Kind and joint of each searched parameter.
+        ended: Name, kind and joint of those that ended at a bound of their range.
+    """
+
+    free: frozenset[tuple[str, str]] = frozenset()
+    ended: tuple[tuple[str, str, str], ...] = ()
+
+    @classmethod
+    def of(cls, problem: Problem, theta: FloatArray) -> SearchedKinds:
+        """Return what was searched and where it ended, theta (K,)."""
+        space, model = problem.space, problem.robot.model
+        each = [
+            [(p.kind, joint) for element in p.elements for joint in _joints(model, p.kind, element)]
+            for p in space
+        ]
+        ended = [
+            (p.name, kind, joint)
+            for p, places, end in zip(space, each, ended_at_bound(space, theta), strict=True)
+            for kind, joint in places
+            if end
+        ]
+        return cls(frozenset(place for places in each for place in places), tuple(ended))
+
+
+def advice(cause: Cause, joints: Sequence[str], where: str, searched: SearchedKinds) -> tuple[str, str]:
+    """Return what a cause means and what to do about it, for joints or bodies and their description."""
+    _, means, do = LOOKS[cause]
+    kinds = FREES.get(cause, ())
+    ended = dict.fromkeys(name for name, kind, joint in searched.ended if kind in kinds and joint in joints)
+    if ended:
+        return (
+            f"{listed(list(ended))} ended at the bound of the search range, so it cannot explain more.",
+            "Widen that range (--range NAME LOW HIGH) if such a value is possible, or check the model.",
+        )
+    missing = [k for k in kinds if not all((k, joint) in searched.free for joint in joints)]
+    if kinds and not missing:
+        return means, FREE_ALREADY[cause]
+    if kinds and len(missing) < len(kinds) and cause in ("friction", "damping"):
+        do = f"Free {' or '.join(missing)} of {{}} (--parameters)."
+    return means, do.replace("{}", where)
+
+
+def _joints(model: Any, kind: str, element: str) -> list[str]:
+    """Return the joints that a parameter's element moves."""
+    of = KIND_TABLE[kind].element
+    if of == "joint":
+        return [element]
+    if of == "actuator":
+        joint = joint_of(model, model.actuator(element).id)
+        return [model.joint(joint).name] if joint >= 0 else []
+    if of == "body":
+        body = model.body(element)
+        first, count = int(body.jntadr[0]), int(body.jntnum[0])
+        return [model.joint(j).name for j in range(first, first + count)]
+    return []

@@ -1,0 +1,179 @@
+"""Wider models as candidates: with more parameters, fitted to a part of the data, they predict the rest.
+
+The model as it is gets two chances: its fit to all recordings, and a fit to the same part that begins where
+the wider one ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.fit.intervals import MISMATCH
+from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
+from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.parameters import Parameter
+from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.parameters.template import left_at_zero
+from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WiderSettings:
+    """Settings of :func:`fit_wider` and :func:`gain_of`.
+
+    Attributes:
+        window_s: Windows of the fits [s].
+        noticed: Least share of the held-out squared residual that more parameters explain [-].
+        most_inertia: Largest armature that is tried where the model has 0, in inertias of the joint [-]. A
+            real cart has six times its mass.
+        most_force: The same of dry friction, and of damping at the joint's rms speed, in rms forces that its
+            inertia needed [-].
+    """
+
+    window_s: float = 0.2
+    noticed: float = 0.03
+    most_inertia: float = 20.0
+    most_force: float = 5.0
+
+
+SETTINGS = WiderSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class WiderFit:
+    """A fit with more parameters, to a part of the recordings.
+
+    Attributes:
+        of: The recordings, without these parameters.
+        more: The parameters.
+        fit: The fit.
+        prediction: The fitted values on the samples that were not fitted.
+    """
+
+    of: Problem
+    more: Sequence[Parameter]
+    fit: Refined
+    prediction: Refined
+
+    @property
+    def found(self) -> FloatArray:
+        """Values of the further parameters."""
+        return self.fit.theta[len(self.of.space) :]
+
+    def shift_of(self, refined: Refined) -> FloatArray:
+        """Return the change of the own parameters, in their scales, and of the latency [s], (K + 1,)."""
+        space = self.of.space
+        own = space.to_scale(self.fit.theta[: len(space)]) - space.to_scale(refined.theta)
+        return np.append(own, self.fit.latency_s - refined.latency_s)
+
+    def significance(self) -> FloatArray:
+        """Return the further parameters' values in their standard deviations."""
+        K, count = len(self.of.space), len(self.more)
+        covariance = np.linalg.pinv(self.fit.normal.hessian) * max(self.fit.chi2, 1.0)
+        std = np.sqrt(np.maximum(np.diag(covariance)[K : K + count], 1e-300))
+        return np.asarray(self.found / std)
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """What more parameters explain of motion that was not fitted.
+
+    Attributes:
+        share: Share of the squared residual.
+        deviance: Gain in deviance.
+        before: Mean squared residual over the noise variance without them.
+    """
+
+    share: float
+    deviance: float
+    before: float
+
+
+def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
+    """Fit with more parameters to a part of the recordings; None where it cannot be fitted."""
+    wide = problem.with_more(more)
+    total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
+    part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
+    seen = [e.usable for e in part.episodes]
+    rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
+    try:
+        fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.window_s,))
+        length = samples_in(problem, SETTINGS.window_s)
+        prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
+    except (InsufficientDataError, CalibrationError):
+        return None
+    return WiderFit(problem, more, fit, prediction)
+
+
+def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
+    """Return what a wider fit gains over the model as it is; None where that is too little.
+
+    The fit without the parameters, ``refined``, has used all recordings.
+    """
+    problem, fit, prediction = wide.of, wide.fit, wide.prediction
+    seen, unseen = (
+        problem.part([e.usable for e in part.shooting.problem.episodes]) for part in (fit, prediction)
+    )
+    length = prediction.shooting.length
+
+    def gained(without: Refined) -> Gain | None:
+        share = 1 - prediction.chi2 / without.chi2
+        deviance = -without.normal.count * float(np.log(prediction.chi2 / without.chi2))
+        enough = deviance > MISMATCH.evidence and share > SETTINGS.noticed
+        return Gain(share, deviance, without.chi2) if enough else None
+
+    try:
+        without = at_parameters(unseen, refined.theta, refined.latency_s, length)
+        if gained(without) is None:
+            return None
+        # The wider fit may have left another minimum; a fit from there without more then predicts as well.
+        bare = refine(seen, fit.theta[: len(problem.space)], fit.latency_s, (SETTINGS.window_s,))
+        again = at_parameters(unseen, bare.theta, bare.latency_s, length)
+    except (InsufficientDataError, CalibrationError):
+        return None
+    return gained(again if again.chi2 < without.chi2 else without)
+
+
+def zero_parameters(problem: Problem) -> list[Parameter]:
+    """Return friction, damping and armature of joints that have none in the model and were not searched."""
+    robot, searched = problem.robot, {(p.kind, e) for p in problem.space.parameters for e in p.elements}
+    if robot.base is not None:
+        return []
+    names = list(robot.description.joint_names)
+    inertia = robot.model.dof_M0[list(robot.qvel)]
+    joints = range(problem.coordinates)[robot.joints]
+    speed, push = np.zeros(len(names)), np.zeros(len(names))
+    for j, c in enumerate(joints):
+        moved = [s.velocity[:, c] for s in problem.starts]
+        speed[j] = np.sqrt(np.mean(np.concatenate(moved) ** 2))
+        accelerations = [np.gradient(v, e.period_s) for v, e in zip(moved, problem.episodes, strict=True)]
+        push[j] = inertia[j] * np.std(np.concatenate(accelerations))
+    most = {
+        "dof_armature": SETTINGS.most_inertia * inertia,
+        "dof_frictionloss": SETTINGS.most_force * push,
+        "dof_damping": SETTINGS.most_force * push / np.maximum(speed, 1e-9),
+    }
+    found = []
+    for kind, elements in left_at_zero(robot.model).items():
+        for name in elements:
+            if name not in names or (kind, name) in searched:
+                continue
+            quantity, j = KIND_TABLE[kind], names.index(name)
+            found.append(
+                Parameter(
+                    name=f"{name}.{quantity.quantity}",
+                    kind=kind,
+                    elements=(name,),
+                    unit=quantity.unit_of(robot.model, robot.model.joint(name).id),
+                    nominal=0.0,
+                    low=0.0,
+                    high=float(most[kind][j]),
+                    scale="linear",
+                )
+            )
+    return found
