@@ -63,7 +63,8 @@ def corrupt_advice(local: bool, load: Load) -> str:
     """Return the likely cause of corrupt or lost states, and what to do; arguments as :func:`late_advice`."""
     if local:
         return (
-            "the robot is a program on this computer (an emulator), so no cable is at fault: it was told to "
-            f"spoil frames (`emulate --corrupt`, `--drop`), or it was late ({load})"
+            "the robot is a program on this computer (an emulator), so no cable is at fault: it spoils "
+            "frames on purpose (`emulate --profile realistic`, `--corrupt`, `--drop`), or it was late "
+            f"({load})"
         )
     return "check cable, connectors and grounding"

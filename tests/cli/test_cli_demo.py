@@ -183,10 +183,14 @@ def test_the_demo_ends_with_the_right_remedy(
 ) -> None:
     """After five attempts; neither a longer recording nor a cable helps where all is emulated."""
     calls = []
-    with pytest.raises(
-        SafetyError, match=f"no rich of 5 can be used .*{re.escape(end[1])}.*{remedy}"
-    ) as raised:
-        recorded(lambda gentler: calls.append(gentler) or run_of(ended(len(calls), *end)), "rich")
+
+    def record(gentler: int) -> RunReport:
+        calls.append(gentler)
+        return run_of(ended(len(calls), *end))
+
+    said = f"no rich of 5 can be used .*{re.escape(end[1])}.*{remedy}"
+    with pytest.raises(SafetyError, match=said) as raised:
+        recorded(record, "rich")
     assert len(calls) == 5 and not_said not in str(raised.value) and "2 s" not in str(raised.value)
 
 
@@ -213,7 +217,7 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     run = deployed(deploy, 3, "deployment")
     assert asked == [3, 2] and numbers(run) == (0, 2, 3)
     assert capsys.readouterr().err.count("it is made again") == 1
-    late = deployed(lambda count: run_of(ended(0, *OLD)), 1, "deployment")
+    late = deployed(lambda _: run_of(ended(0, *OLD)), 1, "deployment")
     assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
 
 
