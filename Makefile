@@ -60,11 +60,13 @@ avr-tools: ## install gcc-avr and simavr
 arm-tools: ## install gcc-arm-none-eabi and qemu-system-arm (60 MB to fetch, 490 MB on the disk)
 	@tools/install_arm_tools.sh
 
-firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
-	@$(BIN)/python -m deal_hw.drivers.cartpole.native avr build/firmware
+# The file and not the module: the package around it needs numpy, and a board needs no environment of 3 GB.
+BUILD_FIRMWARE := PYTHONPATH=. $(PYTHON) drivers/cartpole/native.py
+firmware: avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
+	@$(BUILD_FIRMWARE) avr build/firmware
 
-firmware-arm: $(STAMP) arm-tools ## cartpole-stm32.bin and pole-encoder-stm32.bin in build/firmware for the STM32F103C8, and their memory use
-	@$(BIN)/python -m deal_hw.drivers.cartpole.native stm32 build/firmware
+firmware-arm: arm-tools ## cartpole-stm32.bin and pole-encoder-stm32.bin in build/firmware for the STM32F103C8, and their memory use
+	@$(BUILD_FIRMWARE) stm32 build/firmware
 
 check: $(STAMP) typing coverage-safety docs ## format, lint, types, declared imports, layers, safety coverage, docs, distributions
 	$(BIN)/ruff format --check --output-format concise .

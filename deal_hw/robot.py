@@ -24,6 +24,8 @@ class Robot(abc.ABC):
     watchdog_s: ClassVar[float] = 0.0
     """The device itself switches its motors off after this time without a command [s]. 0: it holds the last
     command for ever; if the connection is cut or this computer fails, only the robot's side can stop it."""
+    stopped_by: ClassVar[str] = "its power switch"
+    """What still stops a robot that holds its last command, once no connection is left."""
     homes_by_motor: ClassVar[bool] = True
     """Whether ``home`` moves the motors by this driver's commands; a run must then end passive."""
 
@@ -108,6 +110,16 @@ class Robot(abc.ABC):
     @abc.abstractmethod
     def passive(self) -> None:
         """Send the least harmful command that this robot has (motor off, or damping). Never blocks."""
+
+    @property
+    def if_cut(self) -> str:
+        """What the robot does if the connection is cut and no passive command reaches it."""
+        if self.watchdog_s:
+            return f"If the cable is cut, its own watchdog has stopped the motor after {self.watchdog_s:g} s"
+        return (
+            "If the connection is lost, it still holds its last command, with stiff motors: only "
+            f"{self.stopped_by} can stop it"
+        )
 
     @property
     def operator_stop(self) -> str:

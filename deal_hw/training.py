@@ -23,13 +23,14 @@ class TrainingStatus:
     Attributes:
         steps: Environment steps done.
         total: Environment steps to do.
-        mean_return: Mean return of the last hundred episodes; 0 before the first ends.
+        mean_return: Mean return of the last hundred episodes. Before the first ends, a resumed training has
+            that of its checkpoint; else None.
         measures: Latest measures of the task, by name with unit, such as ``velocity_error_m_s``.
     """
 
     steps: int
     total: int
-    mean_return: float
+    mean_return: float | None
     measures: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -45,7 +46,8 @@ class TrainingFiles:
         start: A checkpoint whose networks are the start of a new training (a fine-tune); None: from scratch.
         resume: Continue from ``checkpoint``.
         log: Folder for TensorBoard's files; None: none are written.
-        stop: Called between updates; if it returns True, the training ends with the current policy.
+        stop: Called at each step of the environment and of an optimiser; if it returns True, the training
+            ends at once, with the current policy.
     """
 
     checkpoint: Path | None = None

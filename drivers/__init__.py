@@ -161,6 +161,28 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
     return f"{transport_name} on {port}"
 
 
+def on_this_computer(transport_name: str, port: str) -> bool:
+    """Return whether a port leads to a program on this computer, such as an emulator: there is no cable."""
+    if transport_name == "zenoh":
+        from deal_hw.drivers.transports.zenoh_session import parse_endpoints
+
+        return all(end.loopback for end in parse_endpoints(port))
+    if transport_name == "dds":
+        from deal_hw.drivers.transports.interfaces import list_interfaces
+
+        return any(one.loopback and port in (one.name, *one.addresses) for one in list_interfaces())
+    path = port.partition("?")[0]
+    if transport_name in CAN_BUSES:
+        from deal_hw.drivers.transports.can_bus import CanAddress
+
+        address = CanAddress.parse(path)
+        if address.interface == "virtual" or address.channel.startswith("vcan"):
+            return True
+        path = address.channel
+    # A pseudo-terminal, or an emulator's link to one.
+    return _resolved(path).startswith("/dev/pts/")
+
+
 def walked(name: str, trajectory: Trajectory) -> Track | None:
     """Return a robot's path by its own sensors; None if it does not walk or has no odometry."""
     if name not in ODOMETRY:

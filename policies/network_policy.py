@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,45 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+class _StoppedError(Exception):
+    """The training was asked to stop."""
+
+
+@contextlib.contextmanager
+def ended_by(stop: Callable[[], bool], *optimisers: torch.optim.Optimizer) -> Iterator[Callable[[], None]]:
+    """End the block as soon as ``stop`` returns True.
+
+    An update of a network is hundreds of steps of an optimiser, minutes on a busy computer, and a library
+    makes them. So ``stop`` is also called before each of them. Weights between two steps are whole.
+
+    Args:
+        stop: Whether to end.
+        optimisers: Those of the training.
+
+    Yields:
+        A function that ends the block if ``stop`` returns True, to call at each step of the environment.
+    """
+
+    def check(*_: object) -> None:
+        if stop():
+            raise _StoppedError
+
+    hooks = [optimiser.register_step_pre_hook(check) for optimiser in optimisers]
+    try:
+        yield check
+    except _StoppedError:
+        pass
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def mean_return(recent: Iterable[float], before: float | None) -> float | None:
+    """Return the mean of the recent episodes' returns; without any, that of the resumed training."""
+    values = list(recent)
+    return float(np.mean(values)) if values else before
 
 
 def check_config(config: Any, positive: str, shares: str) -> None:

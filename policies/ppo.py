@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -19,7 +20,9 @@ from deal_hw.policies.network_policy import (
     NetworkPolicy,
     check_config,
     diverged,
+    ended_by,
     is_finite,
+    mean_return,
     one_thread,
     trained_spec,
 )
@@ -115,21 +118,22 @@ class PpoTrainer:
                 seed = int(np.random.default_rng([seed, learner.steps]).integers(2**31))
                 torch.manual_seed(seed)
             learner.begin(seed)
-            while learner.steps < config.steps and not files.stop():
-                losses = learner.update()
-                if not learner.is_finite:
-                    raise diverged(learner.steps, files.checkpoint)
-                status = TrainingStatus(
-                    steps=min(learner.steps, config.steps),
-                    total=config.steps,
-                    mean_return=learner.mean_return,
-                    measures=env.measures(),
-                )
-                log.write(status, losses)
-                if files.checkpoint is not None and learner.updates % config.checkpoint_updates == 0:
-                    write_checkpoint(files.checkpoint, learner.checkpoint(), env.layout)
-                if progress is not None:
-                    progress(status)
+            with ended_by(files.stop, learner.optimiser) as check:
+                while learner.steps < config.steps:
+                    losses = learner.update(check)
+                    if not learner.is_finite:
+                        raise diverged(learner.steps, files.checkpoint)
+                    status = TrainingStatus(
+                        steps=min(learner.steps, config.steps),
+                        total=config.steps,
+                        mean_return=learner.mean_return,
+                        measures=env.measures(),
+                    )
+                    log.write(status, losses)
+                    if files.checkpoint is not None and learner.updates % config.checkpoint_updates == 0:
+                        write_checkpoint(files.checkpoint, learner.checkpoint(), env.layout)
+                    if progress is not None:
+                        progress(status)
             if files.checkpoint is not None:
                 write_checkpoint(files.checkpoint, learner.checkpoint(), env.layout)
         spec = trained_spec(
@@ -170,16 +174,19 @@ class _Learner:
         self.steps = self.updates = 0
         self._return = np.zeros(env.num_envs)
         self._recent: collections.deque[float] = collections.deque(maxlen=100)
+        self._before: float | None = None
+        self.optimiser: torch.optim.Optimizer = self._ppo.optimizer
 
     def begin(self, seed: int) -> None:
         """Start the episodes."""
         self._seen = self._batch(self._env.reset(seed=seed)[0])
 
-    def update(self) -> dict[str, float]:
-        """Roll out once, learn from it, and return the losses."""
+    def update(self, check: Callable[[], None]) -> dict[str, float]:
+        """Roll out once, learn from it, and return the losses; call ``check`` before each step."""
         config, ppo = self._config, self._ppo
         with torch.no_grad():
             for _ in range(config.rollout):
+                check()
                 action = ppo.act(self._seen)
                 seen, reward, terminated, truncated, _ = self._env.step(action.numpy().astype(np.float64))
                 over = terminated | truncated
@@ -197,9 +204,9 @@ class _Learner:
         return {**losses, "learning_rate": ppo.learning_rate, "exploration": self._exploration()}
 
     @property
-    def mean_return(self) -> float:
-        """Mean return of the last hundred episodes; 0 before the first ends."""
-        return float(np.mean(self._recent)) if self._recent else 0.0
+    def mean_return(self) -> float | None:
+        """See :class:`~deal_hw.training.TrainingStatus`."""
+        return mean_return(self._recent, self._before)
 
     @property
     def is_finite(self) -> bool:
@@ -224,6 +231,7 @@ class _Learner:
             "steps": self.steps,
             "updates": self.updates,
             "learning_rate": self._ppo.learning_rate,
+            "mean_return": self.mean_return,
             "hidden": list(self._config.hidden),
         }
         return Checkpoint(tensors=tensors, notes=notes)
@@ -244,6 +252,7 @@ class _Learner:
         self._ppo.learning_rate = groups[0]["lr"] = float(found.notes["learning_rate"])
         self._ppo.optimizer.load_state_dict({"state": state, "param_groups": groups})
         self.steps, self.updates = int(found.notes["steps"]), int(found.notes["updates"])
+        self._before = found.notes.get("mean_return")
 
     def _batch(self, observation: Observation) -> TensorDict:
         parts = {"observation": observation, "privileged": self._env.privileged().astype(np.float32)}

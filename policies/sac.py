@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import collections
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,9 @@ from deal_hw.policies.network_policy import (
     NetworkPolicy,
     check_config,
     diverged,
+    ended_by,
     is_finite,
+    mean_return,
     one_thread,
     trained_spec,
 )
@@ -126,12 +128,14 @@ class SacTrainer:
                     found.check_resumed(env.layout, config.steps)
                 _load(model, config, found)
                 model.num_timesteps = done
+                adapter.before = found.notes.get("mean_return") if files.resume else None
             if files.resume and files.checkpoint is not None:
                 restore_optimisers(model_path(files.checkpoint), model)
             mean = _MeanActor(config.steps * (1.0 - config.averaged))
             report = _Report(adapter, config, progress, files, log)
-            model.learn(config.steps - done, callback=[mean, report], reset_num_timesteps=False)
-            report.keep()
+            with ended_by(files.stop, *_optimisers(model)) as adapter.check:
+                model.learn(config.steps - done, callback=[mean, report], reset_num_timesteps=False)
+            report.end()
         actor = mean.apply(model)
         network = torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh())
         spec = trained_spec(
@@ -143,6 +147,10 @@ class SacTrainer:
             torch=str(torch.__version__),
         )
         return NetworkPolicy(network, spec)
+
+
+def _optimisers(model: Any) -> list[torch.optim.Optimizer]:
+    return [model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer]
 
 
 def _load(model: SAC, config: SacConfig, found: Checkpoint) -> None:
@@ -186,16 +194,21 @@ class _Adapter(VecEnv):
         self._seed = seed
         self._return = np.zeros(env.num_envs)
         self._recent: collections.deque[float] = collections.deque(maxlen=100)
+        self.before: float | None = None
+        """Mean return of the training that is resumed."""
+        self.check: Callable[[], None] = lambda: None
+        """Called before each step."""
 
     @property
-    def mean_return(self) -> float:
-        """Mean return of the last hundred episodes; 0 before the first ends."""
-        return float(np.mean(self._recent)) if self._recent else 0.0
+    def mean_return(self) -> float | None:
+        """See :class:`~deal_hw.training.TrainingStatus`."""
+        return mean_return(self._recent, self.before)
 
     def reset(self) -> Observation:
         return self.env.reset(seed=self._seed)[0]
 
     def step_async(self, actions: FloatArray) -> None:
+        self.check()
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, FloatArray, np.ndarray[Any, Any], list[dict[str, Any]]]:
@@ -267,7 +280,7 @@ class _MeanActor(BaseCallback):
 
 
 class _Report(BaseCallback):
-    """Reports, writes checkpoints and asks whether to stop, about a hundred times in total."""
+    """Reports and writes checkpoints about a hundred times in total, and at the end."""
 
     def __init__(
         self,
@@ -280,13 +293,26 @@ class _Report(BaseCallback):
         super().__init__()
         self._adapter, self._config, self._progress, self._files = adapter, config, progress, files
         self._log = log
-        self._next = 0
+        self._next = self._told = 0
+
+    def _on_training_start(self) -> None:
+        self._told = self.model.num_timesteps
 
     def _on_step(self) -> bool:
-        done, total = self.num_timesteps, self._config.steps
-        if done < self._next and done < total:
-            return True
-        self._next = done + max(1, total // 100)
+        if self.num_timesteps >= min(self._next, self._config.steps):
+            self._tell()
+        return True
+
+    def end(self) -> None:
+        """Report the last steps, if the training was stopped, and write the checkpoint."""
+        if self.model.num_timesteps > self._told:
+            self._tell()
+        else:
+            self._keep()
+
+    def _tell(self) -> None:
+        done, total = self.model.num_timesteps, self._config.steps
+        self._next, self._told = done + max(1, total // 100), done
         if not is_finite(self.model.policy):
             raise diverged(done, self._files.checkpoint)
         status = TrainingStatus(
@@ -296,18 +322,21 @@ class _Report(BaseCallback):
             measures=self._adapter.env.measures(),
         )
         self._log.write(status, _losses(self.model))
-        self.keep()
+        self._keep()
         if self._progress is not None:
             self._progress(status)
-        return not self._files.stop()
 
-    def keep(self) -> None:
-        """Write the checkpoint, if requested."""
+    def _keep(self) -> None:
         if self._files.checkpoint is None:
             return
         model: Any = self.model
         tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
-        notes = {"trainer": SacTrainer.name, "steps": self.num_timesteps, "hidden": list(self._config.hidden)}
+        notes = {
+            "trainer": SacTrainer.name,
+            "steps": model.num_timesteps,
+            "mean_return": self._adapter.mean_return,
+            "hidden": list(self._config.hidden),
+        }
         found = Checkpoint(tensors={**tensors, "entropy.log": model.log_ent_coef}, notes=notes)
         write_checkpoint(self._files.checkpoint, found, self._adapter.env.layout)
         write_model(model_path(self._files.checkpoint), model)

@@ -36,7 +36,7 @@ class TrainingLog:
         """Write the values after an update."""
         if self._writer is None:
             return
-        rows = {"train/mean_return": status.mean_return}
+        rows = {} if status.mean_return is None else {"train/mean_return": status.mean_return}
         rows |= {f"task/{name}": value for name, value in status.measures.items()}
         rows |= {f"losses/{name}": value for name, value in losses.items()}
         for name, value in rows.items():

@@ -17,6 +17,7 @@ import argparse
 import dataclasses
 import hashlib
 import json
+import math
 import platform
 import time
 from pathlib import Path
@@ -103,7 +104,7 @@ def _progress() -> Any:
         measures = " ".join(f"{name}={value:.3f}" for name, value in status.measures.items())
         print(
             f"{time.process_time() - started:6.0f} cpu-s {status.steps:9d}/{status.total} "
-            f"return {status.mean_return:8.1f} {measures}",
+            f"return {math.nan if status.mean_return is None else status.mean_return:8.1f} {measures}",
             flush=True,
         )
 

@@ -233,11 +233,6 @@ def read_truth(path: Path) -> dict[str, Any]:
     return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
 
 
-def first_episode(dataset: Path) -> Path:
-    """Return a dataset's first recording."""
-    return dataset / "episodes" / "000000.mcap"
-
-
 def show_episode(folder: RunFolder, episode: Path) -> Path:
     """Write a recording with the predictions of both models; return the file."""
     from deal_hw.cli.inspect_ import Inspect, inspect

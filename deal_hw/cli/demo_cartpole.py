@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, first_episode, read_truth, show_episode
+from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_episode
+from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.cli.train import Train, train
+from deal_hw.control.excitation_level import LOWEST_LEVEL
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.types import FloatArray
 from deal_hw.workflows.emulation.process import EmulatorProcess
@@ -20,7 +28,8 @@ from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import LinkOptions
 from deal_hw.workflows.shipped import required_policy
 
-EPISODES = 3
+EPISODES: Final = 3
+TRUTH_FILE: Final = "truth.json"
 
 
 def check(config: Demo) -> None:
@@ -31,65 +40,44 @@ def check(config: Demo) -> None:
 def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     """Collect, calibrate, train, deploy, inspect. See :class:`deal_hw.cli.demo.Part`."""
     udr = required_policy("cartpole")
-    out, transport, episodes = config.folder, config.transport or "serial", config.episodes or EPISODES
-    truth_file = out / "truth.json"
-    options = ("--transport", transport, "--firmware", config.firmware, "--reveal-to", str(truth_file))
-    hidden = ("--profile", config.profile, "--seed", str(config.seed))
-    link = LinkOptions(transport=transport)
-    with EmulatorProcess("cartpole", *options, *hidden) as emulator:
-        port = emulator.port
-        print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
+    out, episodes = config.folder, config.episodes or EPISODES
+    # The emulator has real-time priority: it runs only while the robot is needed.
+    with _emulated(config) as robot:
         with stages.stage("collect", "4 s of informative motion, and 4 s of other motion as held-out data"):
-            for kind in ("rich", "chirp"):
-                collect(
-                    Collect(robot="cartpole", port=port, link=link, out=out, motion=kind, seed=config.seed)
-                )
-        with stages.stage("calibrate", "search, refinement, latency, intervals"):
-            found = calibrate(Calibrate(dataset=folder.dataset, out=out, seed=config.seed))
-        with (
-            stages.stage("calibrate deal", "the adversarial search alone, for comparison"),
-            PipedProgress("calibrate deal", sys.stderr.isatty()),
-        ):
-            beside = calibrate(
-                Calibrate(
-                    dataset=folder.dataset,
-                    out=out / "deal",
-                    method="deal",
-                    refine=False,
-                    seed=config.seed,
-                    quiet=True,
-                )
+            rich, chirp = (recorded(partial(robot.collect, kind), kind) for kind in ("rich", "chirp"))
+    calibration = Calibrate(
+        dataset=folder.dataset, out=out, episodes=numbers(rich), holdout=numbers(chirp), seed=config.seed
+    )
+    with stages.stage("calibrate", "search, refinement, latency, intervals"):
+        found = calibrate(calibration)
+    with (
+        stages.stage("calibrate deal", "the adversarial search alone, for comparison"),
+        PipedProgress("calibrate deal", sys.stderr.isatty()),
+    ):
+        beside = calibrate(
+            dataclasses.replace(calibration, out=out / "deal", method="deal", refine=False, quiet=True)
+        )
+    policy = folder.policies / "calibrated.onnx"
+    with stages.stage("train", "a policy under the calibrated distribution"):
+        train(
+            Train(
+                robot="cartpole",
+                distribution=found.files["distribution.json"],
+                out=policy,
+                steps=config.steps,
+                seed=config.seed,
             )
-        policy = folder.policies / "calibrated.onnx"
-        with stages.stage("train", "a policy under the calibrated distribution"):
-            train(
-                Train(
-                    robot="cartpole",
-                    distribution=found.files["distribution.json"],
-                    out=policy,
-                    steps=config.steps,
-                    seed=config.seed,
-                )
-            )
-        runs: dict[str, RunReport] = {}
+        )
+    runs: dict[str, RunReport] = {}
+    with _emulated(config) as robot:
         for name, file in (("udr", udr), ("retrained", policy)):
             with stages.stage(f"deploy {name}", f"{episodes} times 10 s over the port"):
-                runs[name] = deploy(
-                    Deploy(
-                        robot="cartpole",
-                        port=port,
-                        link=link,
-                        policy=file,
-                        dataset=out / f"deploy_{name}",
-                        episodes=episodes,
-                        task="balance",
-                    )
-                )
+                runs[name] = deployed(partial(robot.deploy, name, file), episodes, "deployment")
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
-        episode = first_episode(folder.dataset)
+        episode = rich.paths[0]
         rrd = show_episode(folder, episode)
-    truth = read_truth(truth_file)
-    scores = {name: task_scores(out / f"deploy_{name}", episodes) for name in runs}
+    truth = read_truth(out / TRUTH_FILE)
+    scores = {name: task_scores(run, episodes) for name, run in runs.items()}
     return Demonstrated(
         found=found,
         truth=truth["parameters"],
@@ -108,6 +96,60 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Emulated:
+    """An emulated cart-pole on its wire."""
+
+    config: Demo
+    port: str
+
+    @property
+    def _link(self) -> LinkOptions:
+        return LinkOptions(transport=_transport(self.config))
+
+    def collect(self, motion: Literal["rich", "chirp"], gentler: int) -> RunReport:
+        """Record a motion, some steps gentler where there are levels."""
+        asked = Collect(
+            robot="cartpole",
+            port=self.port,
+            link=self._link,
+            out=self.config.folder,
+            motion=motion,
+            seed=self.config.seed,
+        )
+        level = max(-float(gentler), LOWEST_LEVEL)
+        return collect(dataclasses.replace(asked, excitation_level=level) if motion == "rich" else asked)
+
+    def deploy(self, name: str, policy: Path, episodes: int) -> RunReport:
+        """Deploy a policy."""
+        return deploy(
+            Deploy(
+                robot="cartpole",
+                port=self.port,
+                link=self._link,
+                policy=policy,
+                dataset=self.config.folder / f"deploy_{name}",
+                episodes=episodes,
+                task="balance",
+            )
+        )
+
+
+@contextmanager
+def _emulated(config: Demo) -> Iterator[_Emulated]:
+    """Yield the robot of the demo's seed, at rest; each time the same one."""
+    hidden = ("--profile", config.profile, "--seed", str(config.seed))
+    wire = ("--transport", _transport(config), "--firmware", config.firmware)
+    truth = ("--reveal-to", str(config.folder / TRUTH_FILE))
+    with EmulatorProcess("cartpole", *wire, *truth, *hidden) as emulator:
+        print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {emulator.port}")
+        yield _Emulated(config=config, port=emulator.port)
+
+
+def _transport(config: Demo) -> str:
+    return config.transport or "serial"
+
+
 def held(run: RunReport) -> str:
     """Return how long a policy held the pole up, over all deployments."""
     judged = [episode.balance for episode in run.episodes if episode.balance is not None]
@@ -119,20 +161,19 @@ def held(run: RunReport) -> str:
     )
 
 
-def task_scores(dataset: Path, episodes: int) -> FloatArray:
+def task_scores(run: RunReport, episodes: int) -> FloatArray:
     """Return mean |pole angle| [rad] and mean |cart speed| [m/s] of each deployment, (E, 2).
 
     If the safety filter ended a run early, the missing part counts as fallen: pi rad, and a cart at rest.
     """
     from deal_hw.control.balance import TASK_SECONDS, balance_result
-    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.reader import read_trajectory
 
-    store = Dataset.open(dataset)
     scores = []
-    for index in range(len(store.episodes)):
-        recorded = store.read(index).trajectory
-        period_s = float(np.median(np.diff(recorded.device_s)))
-        result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
+    for path in run.paths:
+        motion = read_trajectory(path)
+        period_s = float(np.median(np.diff(motion.device_s)))
+        result = balance_result(motion.position, motion.velocity, period_s, TASK_SECONDS)
         scores.append((result.angle_error_rad, result.cart_speed_m_s))
     # After a trip no more episodes run. These count like the worst episode before.
     scores += [(np.pi, 0.0)] * (episodes - len(scores))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -14,19 +14,18 @@ import numpy as np
 from deal_hw.calib.report.verdict import trust
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, first_episode, read_truth, show_episode
+from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_episode
+from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.train import Train, train
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.data.recording.telemetry_checks import Severity
-from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.documentation import page
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
-from deal_hw.errors import ConfigurationError, SafetyError
+from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.emulation.go2 import read_track
 from deal_hw.workflows.emulation.process import EmulatorProcess
@@ -39,8 +38,6 @@ from deal_hw.workflows.train import read_distribution
 STEPS: Final = 300_000
 """Steps of the fine-tune: about a minute of one processor."""
 PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
-ATTEMPTS: Final = 3
-"""Most walks until one can be used for the calibration."""
 
 
 def check(config: Demo) -> None:
@@ -70,7 +67,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
             with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities as held-out data"):
                 judge = robot.whole_walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
     if config.on_stand:
-        found, distribution = _on_stand(config, folder, stages)
+        found, distribution, episode = _on_stand(config, folder, stages)
     else:
         with stages.stage("calibrate", "gains and friction from joints, feet and IMU; payload from efforts"):
             found = calibrate(
@@ -78,12 +75,12 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
                     dataset=folder.dataset,
                     out=out,
                     space="walk",
-                    episodes=walks["udr"].numbers,
-                    holdout=judge.numbers,
+                    episodes=numbers(walks["udr"].report),
+                    holdout=numbers(judge.report),
                     seed=config.seed,
                 )
             )
-        distribution = found.files["distribution.json"]
+        distribution, episode = found.files["distribution.json"], walks["udr"].report.paths[0]
     policies = _fine_tuned(config, folder, stages, distribution, udr)
     with _emulated(config, "after") as robot:
         for name, policy in policies.items():
@@ -92,7 +89,6 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
                     policy, profile, PROFILE_S, out / f"walk_{_in_paths(name)}", episodes
                 )
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
-        episode = first_episode(out / "dataset_on_stand" if config.on_stand else folder.dataset)
         rrd = show_episode(folder, episode)
     truth = read_truth(out / "truth_after.json")
     true = truth["parameters_at_kp20_kd1.5" if config.on_stand else "walk_parameters"]
@@ -119,11 +115,6 @@ class _Walked:
     report: RunReport
     track: Path
 
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """Numbers of the episodes in their dataset."""
-        return tuple(int(episode.path.stem) for episode in self.report.episodes if episode.path is not None)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Emulated:
@@ -134,8 +125,22 @@ class _Emulated:
     track: Path
 
     def walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
-        """Run a policy on the robot."""
-        report = deploy(
+        """Run a policy on the robot; a walk that only came late is walked again."""
+        once = partial(self._walk, policy, script, seconds, dataset)
+        return _Walked(report=deployed(once, times, "walk"), track=self.track)
+
+    def whole_walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
+        """Run a policy; repeat if a walk ended early or its recording cannot be used for calibration.
+
+        Raises:
+            SafetyError: No walk could be used.
+        """
+        once = partial(self._walk, policy, script, seconds, dataset)
+        report = recorded(lambda _: once(times), "walk", times)
+        return _Walked(report=report, track=self.track)
+
+    def _walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> RunReport:
+        return deploy(
             Deploy(
                 robot="go2",
                 port=self.port,
@@ -148,34 +153,6 @@ class _Emulated:
                 task="walk",
             )
         )
-        return _Walked(report=report, track=self.track)
-
-    def whole_walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
-        """Run a policy; repeat if a walk ended early or its recording cannot be used for calibration.
-
-        Raises:
-            SafetyError: No walk could be used.
-        """
-        for left in reversed(range(ATTEMPTS)):
-            walked = self.walk(policy, script, seconds, dataset, times)
-            reason = next(filter(None, map(_unusable, walked.report.episodes)), "")
-            if not reason:
-                return walked
-            again = "; it is walked again" if left else ""
-            print(f"warning: the walk cannot be used for calibration ({reason}){again}", file=sys.stderr)
-        raise SafetyError(
-            f"no walk of {ATTEMPTS} can be used for calibration; the last one: {reason}. A busy computer, "
-            "or one that pauses, causes old states and clock jumps (see `deal-hw doctor`); end other "
-            "programs, or try another --seed"
-        )
-
-
-def _unusable(episode: EpisodeReport) -> str:
-    """Return why a walk cannot be used for calibration; "" if it can."""
-    if episode.outcome is not Outcome.FINISHED or episode.path is None:
-        return episode.reason
-    verdicts = check_recording(read_episode(episode.path).trajectory)
-    return "; ".join(v.message for v in verdicts if v.severity is Severity.FAIL)
 
 
 @contextmanager
@@ -193,37 +170,47 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
         yield _Emulated(port=emulator.port, link=link, track=track)
 
 
-def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path]:
+def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path, Path]:
     """Record the same robot on a stand and calibrate from that.
 
     Returns:
-        The calibration, and the file of its distribution for the robot on the floor.
+        The calibration, the file of its distribution for the robot on the floor, and the fitted recording.
     """
     out, dataset = config.folder, config.folder / "dataset_on_stand"
+    runs: list[RunReport] = []
     with _emulated(config, "on_stand", "--on-stand") as robot:
         with stages.stage("collect on a stand", "10 s of a multisine, and 8 s of a sweep as held-out data"):
             for excite, seconds in (("multisine", 10.0), ("chirp", 8.0)):
-                collect(
-                    Collect(
-                        robot="go2_on_stand",
-                        port=robot.port,
-                        link=robot.link,
-                        dataset=dataset,
-                        excite=excite,
-                        seconds=seconds,
-                        seed=config.seed,
-                    )
+                motion = Collect(
+                    robot="go2_on_stand",
+                    port=robot.port,
+                    link=robot.link,
+                    dataset=dataset,
+                    excite=excite,
+                    seconds=seconds,
+                    seed=config.seed,
                 )
+                runs.append(recorded(partial(_collected, motion), excite))
     with stages.stage("calibrate", "gains, friction and armature of each joint"):
         found = calibrate(
             Calibrate(
-                dataset=dataset, out=out, holdout=(1,), method="local", sample_hz=100.0, seed=config.seed
+                dataset=dataset,
+                out=out,
+                episodes=numbers(runs[0]),
+                holdout=numbers(runs[1]),
+                method="local",
+                sample_hz=100.0,
+                seed=config.seed,
             )
         )
     file = out / "distribution_floor.json"
     values = on_floor(read_distribution(found.files["distribution.json"])).to_json()
     write_json(file, values | {"verdict": trust(found.result).colour})
-    return found, file
+    return found, file, runs[0].paths[0]
+
+
+def _collected(motion: Collect, gentler: int) -> RunReport:
+    return collect(motion)
 
 
 def _fine_tuned(

@@ -13,7 +13,8 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TextIO, cast
@@ -361,6 +362,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return EXIT_PIPE
 
 
+@contextlib.contextmanager
+def _terminated_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM end the verb as Ctrl-C does: files become whole, and child processes end.
+
+    A verb that drives or emulates a robot takes signals itself.
+    """
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 def _to_nowhere(stream: TextIO) -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
@@ -420,7 +440,8 @@ def _answer(given: list[str]) -> int:
 
             print(completion(given[1] if len(given) > 1 else "", VERBS), end="")
             return EXIT_OK
-        return run(given[0], given[1:])
+        with _terminated_like_ctrl_c():
+            return run(given[0], given[1:])
     except KeyboardInterrupt:
         print("deal-hw: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

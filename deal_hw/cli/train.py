@@ -60,11 +60,12 @@ def _print(training: Training) -> None:
     print(f"policy: {training.path}")
     print(f"record: {training.record}")
     print(f"checkpoint: {training.checkpoint}")
-    if training.status is not None and training.first_return is not None:
+    reached = None if training.status is None else training.status.mean_return
+    if training.status is not None and reached is not None and training.first_return is not None:
         share = training.status.measures.get("time_up")
         up = "" if share is None else f"; {share:.0%} of an episode's time passes before a fall"
         print(
-            f"return: {training.status.mean_return:.1f}, at first {training.first_return:.1f}{up} (means of "
+            f"return: {reached:.1f}, at first {training.first_return:.1f}{up} (means of "
             f"up to 100 episodes; {page('how-to/training.md')} says what is good)"
         )
 
@@ -74,7 +75,7 @@ def _with_bar(config: Train) -> Training:
         TextColumn("training"),
         BarColumn(),
         TextColumn("{task.completed}/{task.total} steps"),
-        TextColumn("return {task.fields[recent]:.1f} {task.fields[measures]}"),
+        TextColumn("{task.fields[reached]}"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
@@ -88,27 +89,22 @@ def _with_bar(config: Train) -> Training:
 
 
 def _words(status: TrainingStatus) -> str:
-    # The return is 0 until the first episode ends.
-    reached = f"return {status.mean_return:.1f} " if status.mean_return else ""
-    return f"{status.steps}/{status.total} steps, {reached}{_measures(status)}".rstrip(", ")
+    return f"{status.steps}/{status.total} steps, {_reached(status)}".rstrip(", ")
 
 
-def _measures(status: TrainingStatus) -> str:
-    return ", ".join(f"{name} {value:.2f}" for name, value in [*status.measures.items()][:SHOWN_MEASURES])
+def _reached(status: TrainingStatus) -> str:
+    """Return the mean return, once an episode has ended, and some measures."""
+    reached = "" if status.mean_return is None else f"return {status.mean_return:.1f} "
+    shown = [*status.measures.items()][:SHOWN_MEASURES]
+    return reached + ", ".join(f"{name} {value:.2f}" for name, value in shown)
 
 
 def _follow(bar: Progress) -> TrainingProgress:
-    row = bar.add_task("training", total=None, recent=0.0, measures="")
+    row = bar.add_task("training", total=None, reached="")
 
     def follow(status: TrainingStatus) -> None:
         # Not before, since a refused training has no bar.
         bar.start()
-        bar.update(
-            row,
-            completed=status.steps,
-            total=status.total,
-            recent=status.mean_return,
-            measures=_measures(status),
-        )
+        bar.update(row, completed=status.steps, total=status.total, reached=_reached(status))
 
     return follow

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from deal_hw.control.behaviours import Behaviour, centre, position_command
+from deal_hw.control.centring import Centring
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.schema import STRICT
@@ -114,7 +115,7 @@ class RichBehaviour:
         self._balance = balance
         self._config = config
         self._seed = seed
-        self._centre = centre(description)
+        self._centre, self._centring = centre(description), Centring(description)
         self.action: FloatArray | None = None
         self.reset()
 
@@ -140,7 +141,8 @@ class RichBehaviour:
                 self._centre + self._rng.uniform(-1.0, 1.0, self._centre.shape) * self._config.amplitude
             )
             self._until_s = time_s + self._rng.uniform(*self._config.hold_s)
-        return self._scaled(position_command(self._description, self._target), time_s)
+        target = self._centring.added(self._target, state)
+        return self._scaled(position_command(self._description, target), time_s)
 
     def _scaled(self, command: JointCommand, time_s: float) -> JointCommand:
         return segment_command(command, self._config.segments, time_s / self._config.duration_s)
@@ -172,7 +174,7 @@ class ChirpBehaviour:
     def __init__(self, description: RobotDescription, config: ChirpConfig | None = None) -> None:
         self._description = description
         self._config = config or ChirpConfig()
-        self._centre = centre(description)
+        self._centre, self._centring = centre(description), Centring(description)
 
     def reset(self) -> None:
         """No memory to clear."""
@@ -182,4 +184,5 @@ class ChirpBehaviour:
         c = self._config
         slope = (c.high_hz - c.low_hz) / c.duration_s
         phase = 2 * math.pi * (c.low_hz * time_s + 0.5 * slope * time_s**2)
-        return position_command(self._description, self._centre + c.amplitude * math.sin(phase))
+        target = self._centring.added(self._centre + c.amplitude * math.sin(phase), state)
+        return position_command(self._description, target)

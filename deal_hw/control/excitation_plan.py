@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from deal_hw.control.behaviours import Behaviour, centre, position_command
+from deal_hw.control.centring import Centring
 from deal_hw.control.excitation import Segment, segment_command
 from deal_hw.control.excitation_limits import fit_to_limits, room
 from deal_hw.control.waveforms import (
@@ -315,7 +316,7 @@ class ExcitationBehaviour:
             )
         self._plan, self._description = plan, description
         self._balance = balance if plan.balance_s > 0 else None
-        self._centre = centre(description)
+        self._centre, self._centring = centre(description), Centring(description)
         self.action: FloatArray | None = None
         self.reset()
 
@@ -336,6 +337,7 @@ class ExcitationBehaviour:
         self.action = None
         offset = self._plan.offsets(np.array([max(time_s, self._plan.balance_s)]))[0]
         target = self._centre + offset + self._left(time_s) * (self._last - self._centre)
+        target = self._centring.added(target, state)
         return self._scaled(position_command(self._description, target), time_s)
 
     def _left(self, time_s: float) -> float:

@@ -80,6 +80,7 @@ class ControlLoop:
         self._events: list[Event] = []
         self._clipped: dict[str, int] = {}
         self._noted_flags: tuple[str, ...] = ()
+        self._passive_flags: tuple[str, ...] = ()
         self._states = self._blind = self._losses = self._sent = self._errors_seen = 0
 
     def request_stop(self, reason: str = "stopped by the operator") -> None:
@@ -118,6 +119,7 @@ class ControlLoop:
                 # The connection is lost while commands are sent. This counts as a trip of the safety module:
                 # it is latched, and the passive command is sent over any connection there is.
                 outcome, reason, error = Outcome.TRIPPED, f"the connection is lost: {reason}", ""
+                self._passive_flags = ("link_lost",)
                 self.note("passive", reason, flags=["link_lost"])
         finally:
             # The robot comes first, before any step that might fail.
@@ -133,6 +135,7 @@ class ControlLoop:
             clipped=self._clipped,
             cycles_sent=self._sent,
             error=error,
+            flags=self._passive_flags,
         )
 
     def _prepare(self) -> None:
@@ -248,6 +251,7 @@ class ControlLoop:
             self._errors_seen = self._robot.transport_errors
             flags |= CycleFlag.LINK_ERROR
         if verdict.state is SafetyState.PASSIVE:
+            self._passive_flags = verdict.flags
             self.note("passive", verdict.reason, flags=list(verdict.flags))
         elif verdict.flags and verdict.flags != self._noted_flags:
             self.note("would trip", "while disarmed: " + ", ".join(verdict.flags), flags=list(verdict.flags))

@@ -63,6 +63,7 @@ class LoopReport:
         clipped: Number of cycles in which a limit changed the command, by limit.
         cycles_sent: Commands sent.
         error: Name of the error's class, after a failure.
+        flags: Failed checks of the safety module that ended it.
     """
 
     outcome: Outcome
@@ -72,6 +73,7 @@ class LoopReport:
     clipped: dict[str, int]
     cycles_sent: int
     error: str = ""
+    flags: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -83,4 +85,5 @@ class LoopReport:
             "clipped": self.clipped,
             "cycles_sent": self.cycles_sent,
             "error": self.error,
+            "flags": list(self.flags),
         }

@@ -289,8 +289,8 @@ class Safety:
         count = errors - window[0][1]
         if count > self._errors_due:
             found["transport_errors"] = (
-                f"{count} transport errors in {self._config.transport_error_window_s:g} s: "
-                "check cable and connectors"
+                f"{count} transport errors in {self._config.transport_error_window_s:g} s, at most "
+                f"{self._errors_due:g} are allowed"
             )
 
     def _check_command_age(self, cycle: CycleInput, found: dict[str, str]) -> None:

@@ -158,23 +158,27 @@ def published_together(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Let Ctrl-C take effect at the end of the block. Works in the main thread only; no effect in others.
+    """Let Ctrl-C and SIGTERM take effect at the end of the block; only in the main thread.
 
     Raises:
-        KeyboardInterrupt: At the end, if there was a Ctrl-C.
+        KeyboardInterrupt: At the end, if there was a Ctrl-C, or a SIGTERM in a verb of the command line.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    before = {
+        number: signal.signal(number, lambda number, frame: pressed.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         if pressed:
             # Passed to the previous handler, which may be another block of this kind.
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(pressed[0])
 
 
 def _sync(file: Path) -> None:

@@ -18,6 +18,8 @@ from deal_hw.training import PolicyTrainer, TrainingFiles, TrainingProgress, Tra
 
 _SEED = 3
 _SAME = 1e-5
+_STEPS_TO_STOP = 8
+"""In the middle of the first updates of SAC (three optimisers) and of PPO (20 steps an update)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,24 +157,54 @@ class TrainerSuite:
         assert second.reports[-1] == (case.short_config.steps, case.short_config.steps)
 
     def test_a_stopped_training_goes_on_where_it_was(self, case: TrainerCase, tmp_path: Path) -> None:
-        """Stopped after its first report it leaves a checkpoint; resumed, it does the remaining steps."""
-        file, reports = tmp_path / "checkpoint.safetensors", [0, 0]
+        """Stopped after its first episodes it leaves a checkpoint; resumed, it does the remaining steps.
 
-        def count(status: TrainingStatus) -> None:
-            reports[0], reports[1] = reports[0] + 1, status.steps
-
-        stop = TrainingFiles(checkpoint=file, log=tmp_path / "log", stop=lambda: reports[0] > 0)
-        case.train(case.config, progress=count, files=stop)
-        stopped = reports[1]
-        assert 0 < stopped < case.config.steps and list((tmp_path / "log").iterdir())
-        config = dataclasses.replace(case.config, steps=stopped + case.short_config.steps)
-        first: list[int] = []
-        case.train(
-            config,
-            progress=lambda status: first.append(status.steps),
-            files=TrainingFiles(checkpoint=file, resume=True),
+        No episode has ended by the resumed training's first report: it has the return of the checkpoint.
+        """
+        file = tmp_path / "checkpoint.safetensors"
+        reports: list[TrainingStatus] = []
+        stop = TrainingFiles(
+            checkpoint=file,
+            log=tmp_path / "log",
+            stop=lambda: bool(reports) and reports[-1].mean_return is not None,
         )
-        assert stopped < first[0] and first[-1] == config.steps
+        case.train(case.config, progress=reports.append, files=stop)
+        assert reports[0].mean_return is None
+        stopped = reports[-1]
+        assert 0 < stopped.steps < case.config.steps and list((tmp_path / "log").iterdir())
+        config = dataclasses.replace(case.config, steps=stopped.steps + case.short_config.steps)
+        resumed: list[TrainingStatus] = []
+        case.train(config, progress=resumed.append, files=TrainingFiles(checkpoint=file, resume=True))
+        assert stopped.steps < resumed[0].steps and resumed[-1].steps == config.steps
+        assert resumed[0].mean_return == stopped.mean_return
+
+    def test_a_request_to_stop_is_heard_within_an_update(self, case: TrainerCase, tmp_path: Path) -> None:
+        """On a slow computer an update takes minutes: no further optimiser step, whole files."""
+        from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+        file = tmp_path / "checkpoint.safetensors"
+        steps = 0
+
+        def count(*_: object) -> None:
+            nonlocal steps
+            steps += 1
+
+        # Called before the hooks of one optimiser.
+        counting = register_optimizer_step_pre_hook(count)
+        try:
+            files = TrainingFiles(checkpoint=file, stop=lambda: steps >= _STEPS_TO_STOP)
+            policy = case.train(case.config, files=files)
+        finally:
+            counting.remove()
+        assert steps == _STEPS_TO_STOP
+        assert policy.act(np.zeros(len(policy.spec.observation), dtype=np.float32)).shape
+        resumed: list[int] = []
+        case.train(
+            case.config,
+            progress=lambda status: resumed.append(status.steps),
+            files=TrainingFiles(checkpoint=file, resume=True, stop=lambda: bool(resumed)),
+        )
+        assert resumed
 
     def test_a_fine_tune_starts_from_the_networks_of_a_checkpoint(
         self, case: TrainerCase, second: KeptTraining, tmp_path: Path

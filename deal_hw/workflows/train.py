@@ -106,8 +106,8 @@ class Training:
         record: The .json file with the settings of the training.
         checkpoint: The .safetensors file from which a training can continue.
         status: Progress at the end; None if it ended before the first update.
-        first_return: Mean return of the first episodes of this run; None if none ended. A new policy is then
-            hardly trained.
+        first_return: Mean return of the first episodes; None if none ended. A new policy is then hardly
+            trained. A resumed training has the return at its checkpoint.
     """
 
     policy: OnnxPolicy
@@ -126,9 +126,9 @@ class Training:
 
     def _cells(self) -> list[tuple[str, Any]]:
         status = self.status
-        reached = (
-            {} if status is None else {"steps": status.steps, "mean return": f"{status.mean_return:.4g}"}
-        )
+        reached: dict[str, Any] = {} if status is None else {"steps": status.steps}
+        if status is not None and status.mean_return is not None:
+            reached["mean return"] = f"{status.mean_return:.4g}"
         if self.first_return is not None:
             reached["mean return at first"] = f"{self.first_return:.4g}"
         measures = {} if status is None else {n: f"{v:.4g}" for n, v in status.measures.items()}
@@ -188,18 +188,17 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
 
     def follow(status: TrainingStatus) -> None:
         reached[:] = [status]
-        # It is 0 until the first episode has ended.
-        if not first and status.mean_return:
+        if not first and status.mean_return is not None:
             first.append(status.mean_return)
         progress(status)
 
-    with _stopped_by_signal() as stopped:
+    with _stopped_by_signal() as stop:
         files = TrainingFiles(
             checkpoint=checkpoint,
             start=None if config.start is None else Path(config.start),
             resume=config.resume,
             log=path.with_name(path.stem + "_tensorboard"),
-            stop=lambda: bool(stopped),
+            stop=stop,
         )
         policy = train_policy(
             config.robot,
@@ -222,7 +221,7 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
         status=reached[0] if reached else None,
         first_return=first[0] if first else None,
     )
-    if stopped:
+    if stop.requested:
         raise InterruptedTrainingError(training)
     return training
 
@@ -405,16 +404,43 @@ def _space(robot: str) -> ParameterSpace:
     return next(iter(parameter_spaces(robot).values()))()
 
 
+class _Stop:
+    """Whether a signal asked the training to stop.
+
+    Attributes:
+        requested: Whether one came.
+    """
+
+    def __init__(self) -> None:
+        self.requested = self._asked = False
+
+    def __call__(self) -> bool:
+        """Return whether to stop, for the trainer, which asks from its first step on."""
+        self._asked = True
+        return self.requested
+
+    def note(self) -> None:
+        """Note a signal.
+
+        Raises:
+            KeyboardInterrupt: The trainer has not begun: there is nothing to keep, and the libraries that are
+                being loaded would take many seconds on a busy computer.
+        """
+        if not self._asked:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
 @contextlib.contextmanager
-def _stopped_by_signal() -> Iterator[list[int]]:
-    """Yield a list that gets the first SIGINT or SIGTERM; a second one acts as usual."""
-    seen: list[int] = []
+def _stopped_by_signal() -> Iterator[_Stop]:
+    """Yield what notes the first SIGINT or SIGTERM; a second one acts as usual."""
+    stop = _Stop()
     try:
         before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
         def note(number: int, frame: Any) -> None:
-            seen.append(number)
             signal.signal(number, before[signal.Signals(number)])
+            stop.note()
 
         for number in before:
             signal.signal(number, note)
@@ -422,7 +448,7 @@ def _stopped_by_signal() -> Iterator[list[int]]:
         # Only the main thread may set signal handlers.
         before = {}
     try:
-        yield seen
+        yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

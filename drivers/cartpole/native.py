@@ -1,4 +1,8 @@
-"""Builds the firmware's C sources on demand, into the user's cache."""
+"""Builds the firmware's C sources on demand, into the user's cache.
+
+Also a program of its own, for `make firmware`: it imports nothing but the standard library and the errors, so
+any Python 3.10 or newer runs it without an environment.
+"""
 
 from __future__ import annotations
 
@@ -182,6 +186,20 @@ def write_stm32_image(folder: Path) -> str:
     return "\n".join(lines)
 
 
+def main(chip: str, folder: str) -> int:
+    """Write a chip's images into a folder and print their memory use; return the exit code.
+
+    Args:
+        chip: "avr" or "stm32".
+        folder: The folder.
+    """
+    try:
+        print({"avr": write_image, "stm32": write_stm32_image}[chip](Path(folder)))
+    except ConfigurationError as error:
+        print(f"make firmware: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
 if __name__ == "__main__":
-    write = write_stm32_image if sys.argv[1] == "stm32" else write_image
-    print(write(Path(sys.argv[2])))
+    sys.exit(main(*sys.argv[1:]))

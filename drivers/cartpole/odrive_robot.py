@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import ClassVar, Final
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.can_link import accept
@@ -33,6 +33,8 @@ class OdriveRobot(CartpoleRobot):
         clock: The clock of the transport's stamps.
         settings: Numbers and mechanics of the parts.
     """
+
+    stopped_by: ClassVar[str] = "the power supply of its drive"
 
     def __init__(self, transport: Transport, clock: Clock, settings: OdriveSettings) -> None:
         super().__init__(transport, clock, link=lambda: OdriveLink(settings, clock))

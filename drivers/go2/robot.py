@@ -87,6 +87,9 @@ class Go2Robot(Robot):
     """
 
     description: ClassVar[RobotDescription] = DRIVER
+    stopped_by: ClassVar[str] = (
+        "a bridge on the robot's side (deal-hw bridge), its own remote (damping) or its power switch"
+    )
     homes_by_motor: ClassVar[bool] = False
     _has_services: ClassVar[bool] = True
 

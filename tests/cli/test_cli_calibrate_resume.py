@@ -185,15 +185,19 @@ FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "rep
 FILES |= {"actuators.yaml", "urdf.yaml", "values.yaml"}
 
 
-@pytest.mark.parametrize("moment", ["report.html", "moving"])
+@pytest.mark.parametrize(
+    ("moment", "number"),
+    [("report.html", signal.SIGTERM), ("moving", signal.SIGINT), ("moving", signal.SIGTERM)],
+)
 def test_an_interrupt_at_the_end_leaves_whole_results(
     dataset: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     moment: str,
+    number: signal.Signals,
 ) -> None:
-    """A real SIGINT while a file is written: all files are there, that is said, and the status is 130."""
+    """A real signal while a file is written: all files are there, that is said, and the status is 130."""
     hooks = {"report.html": (page, "write_report"), "moving": (shutil, "move")}
     where, name = hooks[moment]
     real = getattr(where, name)
@@ -202,7 +206,7 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     def interrupted(*arguments: Any, **named: Any) -> Any:
         if not pressed:
             pressed.append(True)
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return real(*arguments, **named)
 
     monkeypatch.setattr(where, name, interrupted)

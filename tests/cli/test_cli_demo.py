@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import mujoco
 import pytest
 
 from deal_hw.calib.pipeline import output_error_fits
-from deal_hw.cli import demo_cartpole, demo_go2
+from deal_hw.cli import demo_cartpole, demo_go2, demo_runs
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
-from deal_hw.cli.demo import Demo, demo
+from deal_hw.cli.demo import Demo, Stages, demo
+from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy
 from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
 from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
-from deal_hw.errors import ConfigurationError, SafetyError
+from deal_hw.data.run_folder import RunFolder
+from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
-from deal_hw.workflows.running.settings import LegOptions, LinkOptions
+from deal_hw.workflows.running.settings import LegOptions
 
 
 def beside_in_short(config: Calibrate) -> CalibrateReport:
@@ -114,28 +120,157 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     assert "the shipped policy missed the velocity by" in words
 
 
-def test_a_walk_with_a_clock_jump_is_walked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recording that calibration would refuse is as good as none; three of them end the demo."""
+def ended(
+    number: int, outcome: Outcome = Outcome.FINISHED, reason: str = "the run is over", *flags: str
+) -> EpisodeReport:
+    """Return the report on an episode."""
+    return EpisodeReport(
+        path=Path(f"{number:06d}.mcap"), outcome=outcome, reason=reason, passive_confirmed=True, flags=flags
+    )
+
+
+def run_of(*episodes: EpisodeReport) -> RunReport:
+    """Return the report on a run."""
+    return RunReport(dataset=Path("dataset"), episodes=episodes)
+
+
+OLD = (Outcome.TRIPPED, "the newest state is 76 ms old, at most 60 ms are allowed", "state_stale")
+FAST = (Outcome.TRIPPED, "joint 'cart' moves at 2.10 m/s, faster than 2", "velocity")
+
+
+@pytest.fixture
+def loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a load of 12.3 on two processors, and let each recording be sound."""
+    monkeypatch.setattr(os, "getloadavg", lambda: (12.3, 12.3, 12.3))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(demo_runs, "read_episode", lambda path: SimpleNamespace(trajectory=path))
+    monkeypatch.setattr(demo_runs, "check_recording", lambda _: [])
+
+
+def test_a_recording_that_tripped_is_made_again(loaded: None, capsys: pytest.CaptureFixture[str]) -> None:
+    """Late states: at the same level. Its own motion: gentler. No answer: again. Each with the load."""
+    ends: list[EpisodeReport | Exception] = [
+        ended(0, *OLD),
+        ended(1, *FAST),
+        TransportTimeoutError("no state within 3 s"),
+        ended(3),
+    ]
+    levels = []
+
+    def record(gentler: int) -> RunReport:
+        levels.append(gentler)
+        end = ends.pop(0)
+        if isinstance(end, Exception):
+            raise end
+        return run_of(end)
+
+    assert numbers(recorded(record, "rich")) == (3,)
+    assert levels == [0, 0, 1, 1]
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 3 and all("load 12.3 on 2 processors" in line for line in told)
+    assert "76 ms old" in told[0] and told[0].endswith("it is made again, 2 of 5")
+
+
+@pytest.mark.parametrize(
+    ("end", "remedy", "not_said"),
+    [
+        (OLD, "load 12.3 on 2 processors; .* no cable is at fault: .* end other programs", "--seed"),
+        (FAST, "try another --seed", "other programs"),
+    ],
+)
+def test_the_demo_ends_with_the_right_remedy(
+    end: tuple[Outcome, str, str], remedy: str, not_said: str, loaded: None
+) -> None:
+    """After five attempts; neither a longer recording nor a cable helps where all is emulated."""
+    calls = []
+
+    def record(gentler: int) -> RunReport:
+        calls.append(gentler)
+        return run_of(ended(len(calls), *end))
+
+    said = f"no rich of 5 can be used .*{re.escape(end[1])}.*{remedy}"
+    with pytest.raises(SafetyError, match=said) as raised:
+        recorded(record, "rich")
+    assert len(calls) == 5 and not_said not in str(raised.value) and "2 s" not in str(raised.value)
+
+
+def test_a_recording_with_a_clock_jump_is_made_again(loaded: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that calibration would refuse is as good as none; of several episodes each must be sound."""
     jump = CheckResult("clock", Severity.FAIL, "1 clock jumps (+60.0 ms at 3.00 s)")
-    left = [[jump], [], [jump], [jump], [jump]]
+    left = [[], [jump], [], [], *([[jump]] * 5)]
+    monkeypatch.setattr(demo_runs, "check_recording", lambda _: left.pop(0))
+    two = run_of(ended(0), ended(1))
+    assert recorded(lambda _: two, "walk", 2).episodes == two.episodes and len(left) == 5
+    with pytest.raises(SafetyError, match="the last one: 1 clock jumps"):
+        recorded(lambda _: two, "walk", 2)
 
-    def walk(_: object) -> RunReport:
-        episode = EpisodeReport(
-            path=tmp_path / f"{len(left)}.mcap",
-            outcome=Outcome.FINISHED,
-            reason="the run is over",
-            passive_confirmed=True,
-        )
-        return RunReport(dataset=tmp_path, episodes=(episode,))
 
-    monkeypatch.setattr(demo_go2, "deploy", walk)
-    monkeypatch.setattr(demo_go2, "read_episode", lambda path: SimpleNamespace(trajectory=path))
-    monkeypatch.setattr(demo_go2, "check_recording", lambda _: left.pop(0))
-    robot = demo_go2._Emulated(port="lo", link=LinkOptions(), track=tmp_path / "track.csv")
-    again = robot.whole_walk(tmp_path / "p.onnx", tmp_path / "v.csv", 6.0, tmp_path, 1)
-    assert again.report.paths == (tmp_path / "4.mcap",)
-    with pytest.raises(SafetyError, match="3 can be used for calibration; the last one: 1 clock jumps"):
-        robot.whole_walk(tmp_path / "p.onnx", tmp_path / "v.csv", 6.0, tmp_path, 1)
+def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.CaptureFixture[str]) -> None:
+    """A policy that hits a limit has its result, and is not deployed again; a late one is no result."""
+    ends = [run_of(ended(0), ended(1, *OLD)), run_of(ended(2), ended(3, *FAST))]
+    asked = []
+
+    def deploy(count: int) -> RunReport:
+        asked.append(count)
+        return ends.pop(0)
+
+    run = deployed(deploy, 3, "deployment")
+    assert asked == [3, 2] and numbers(run) == (0, 2, 3)
+    assert capsys.readouterr().err.count("it is made again") == 1
+    late = deployed(lambda _: run_of(ended(0, *OLD)), 1, "deployment")
+    assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
+
+
+@pytest.mark.parametrize("on_stand", [False, True])
+@pytest.mark.parametrize("robot", ["cartpole", "go2"])
+def test_the_emulator_runs_only_while_the_robot_is_needed(
+    robot: Any, on_stand: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Not while the demo computes: with its priority it would starve it. Each time it is the same robot."""
+    if robot == "cartpole" and on_stand:
+        return
+    part = {"cartpole": demo_cartpole, "go2": demo_go2}[robot]
+    alive: list[tuple[str, ...]] = []
+    hidden, seen = [], []
+
+    @contextlib.contextmanager
+    def emulator(*options: str) -> Iterator[SimpleNamespace]:
+        assert not alive
+        alive.append(options)
+        hidden.append({options[options.index(name) + 1] for name in ("--seed", "--profile")})
+        yield SimpleNamespace(port="port")
+        alive.clear()
+
+    def job(name: str, needed: bool, result: Any) -> None:
+        def work(*_: Any, **__: Any) -> Any:
+            seen.append(name)
+            assert bool(alive) is needed, name
+            return result
+
+        monkeypatch.setattr(part, name, work)
+
+    class EnoughError(Exception):
+        pass
+
+    monkeypatch.setattr(part, "EmulatorProcess", emulator)
+    job("recorded", True, run_of(ended(0)))
+    job("deployed", True, run_of(ended(1)))
+    job("calibrate", False, SimpleNamespace(files={"distribution.json": tmp_path / "d.json"}, result=None))
+    job("train", False, None)
+    for name in ("on_floor", "read_distribution", "write_json", "trust"):
+        if hasattr(part, name):
+            monkeypatch.setattr(part, name, lambda *_: MagicMock())
+
+    def stop(*_: Any) -> None:
+        assert not alive
+        raise EnoughError
+
+    monkeypatch.setattr(part, "show_episode", stop)
+    config = Demo(robot=robot, out=tmp_path, seed=7, on_stand=on_stand)
+    with pytest.raises(EnoughError):
+        part.run(config, RunFolder(tmp_path), Stages())
+    assert {"recorded", "deployed", "calibrate", "train"} == set(seen)
+    assert len(hidden) >= 2 and all(options == {"7", "realistic"} for options in hidden)
 
 
 @pytest.mark.parametrize(

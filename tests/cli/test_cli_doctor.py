@@ -24,7 +24,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Level
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.workflows.doctor import machine
-from deal_hw.workflows.doctor.examine import judge_interfaces
+from deal_hw.workflows.doctor.examine import DoctorReport, judge_interfaces
 from deal_hw.workflows.doctor.robot import examine_robot
 
 
@@ -121,14 +121,14 @@ def test_a_cable_that_is_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "multicast on" in found[1].remedy
 
 
-def listened(drop: float = 0.0) -> list[Finding]:
-    """Return what is found on an emulated cart-pole that loses a share of its frames."""
+def listened(drop: float = 0.0, corrupt: float = 0.0, local: bool = False) -> list[Finding]:
+    """Return what is found on an emulated cart-pole that loses or spoils a share of its frames."""
     clock = VirtualClock()
-    faults = FrameFaults(FaultRates(drop=drop), np.random.default_rng(0))
+    faults = FrameFaults(FaultRates(drop=drop, corrupt=corrupt), np.random.default_rng(0))
     wire = FaultyTransport(
         VirtualTransport(CartpoleDevice(nominal_truth("ideal")), clock), faults, clock=clock
     )
-    return list(examine_robot("cartpole", CartpoleRobot(wire, clock), clock, 2.0))
+    return list(examine_robot("cartpole", CartpoleRobot(wire, clock), clock, 2.0, local))
 
 
 def test_a_serial_robot_is_greeted_and_listened_to() -> None:
@@ -145,6 +145,16 @@ def test_a_bad_serial_cable_is_a_warning() -> None:
     found = [f for f in listened(0.2) if f.area == "states"]
     assert [f.level for f in found] == [Level.WARN, Level.WARN, Level.OK]
     assert all("cable" in f.remedy for f in found[:2])
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_a_link_on_which_no_run_lasts_is_a_failure(local: bool) -> None:
+    """Three frames of ten corrupt, 46 % of the states: the exit code says so; an emulator has no cable."""
+    found = listened(corrupt=0.3, local=local)
+    assert DoctorReport(findings=tuple(found)).exit_code == 1
+    (worst,) = [finding for finding in found if finding.level is Level.FAIL]
+    assert "a run trips at 30%" in worst.message
+    assert ("check cable" in worst.remedy) is not local and ("--corrupt" in worst.remedy) is local
 
 
 def test_what_is_printed_fits_the_terminal(

@@ -192,6 +192,8 @@ def computer(monkeypatch: pytest.MonkeyPatch) -> Callable[[SetUp], None]:
             (platform, "release", lambda: "6.8.0"),
             (platform, "machine", lambda: "x86_64"),
             (os, "cpu_count", lambda: 8),
+            (os, "getloadavg", lambda: (0.5, 0.5, 0.5)),
+            (os, "sched_getaffinity", lambda _: set(range(8))),
             (machine, "_version", lambda name: "1.2.3"),
             (machine, "_may_use_fifo", lambda: set_up.rights),
             (machine, "_user", lambda: "ada"),

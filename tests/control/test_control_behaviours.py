@@ -11,6 +11,7 @@ import pytest
 from fakes.linear_policy import LinearPolicy, feedback_spec
 
 from deal_hw.control.behaviours import HoldBehaviour, PolicyBehaviour, ReplayBehaviour
+from deal_hw.control.centring import Centring
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
@@ -148,12 +149,44 @@ def test_motions_of_motors_are_around_no_effort() -> None:
     """For a motor a command is an effort: its default pose, 0.1 rad here, is none."""
     motor = dataclasses.replace(DESCRIPTION, actuation="motor", default_position=(0.1, 0.0))
     assert HoldBehaviour(motor).command(NOWHERE, 0.0).position_target[0] == 0.0
-    assert ChirpBehaviour(motor).command(NOWHERE, 0.0).position_target[0] == 0.0
+    start = dataclasses.replace(NOWHERE, position=np.array([0.1, 0.0]))
+    assert ChirpBehaviour(motor).command(start, 0.0).position_target[0] == 0.0
     rich = RichBehaviour(motor, None, RichConfig(balance_s=0.0, amplitude=1e-6), seed=0)
-    assert abs(rich.command(NOWHERE, 0.0).position_target[0]) <= 1e-6
+    assert abs(rich.command(start, 0.0).position_target[0]) <= 1e-6
     spec = dataclasses.replace(SPEC, default_position=(0.1, 0.0))
     still = LinearPolicy(spec, disturb=lambda k, a: 0.0 * a)
     assert PolicyBehaviour(still, motor).command(NOWHERE, 0.0).position_target[0] == 0.0
+
+
+def test_an_effort_has_a_spring_and_a_damper_to_the_start() -> None:
+    """Track -0.5..0.5 m, start at 0.1 m: a reach of 0.9 * 0.4 = 0.36 m, at 0.9 m/s in 0.4 s.
+
+    At 0.28 m the spring is 0.18 / 0.36 = 0.5, at 0.45 m/s the damper 0.5; together they are at their limit.
+    """
+    limits = dataclasses.replace(
+        DESCRIPTION.limits, trip_position=((-0.5, 0.5), (-9.0, 9.0)), trip_velocity=(2.0, 99.0)
+    )
+    motor = dataclasses.replace(DESCRIPTION, actuation="motor", default_position=(0.1, 0.0), limits=limits)
+
+    def sent(position: float, velocity: float, asked: float = 0.0) -> float:
+        state = dataclasses.replace(
+            NOWHERE, position=np.array([position, 3.0]), velocity=np.array([velocity, 3.0])
+        )
+        return float(Centring(motor).added(np.array([asked]), state)[0])
+
+    assert sent(0.1, 0.0, 0.3) == 0.3
+    assert sent(0.28, 0.0) == pytest.approx(-0.5) and sent(0.1, 0.45) == pytest.approx(-0.5)
+    assert sent(0.28, 0.45, -0.2) == -1.0
+    # A start pose at an end: around the middle. No limits: no feedback. A servo: its own.
+    motor = dataclasses.replace(motor, default_position=(0.45, 0.0))
+    assert sent(0.0, 0.0) == 0.0
+    endless = dataclasses.replace(
+        limits, trip_position=((-math.inf, math.inf),) * 2, trip_velocity=(math.inf, math.inf)
+    )
+    motor = dataclasses.replace(motor, limits=endless)
+    assert sent(7.0, 7.0, 0.3) == 0.3
+    motor = DESCRIPTION
+    assert sent(0.28, 0.45, 0.3) == 0.3
 
 
 def test_chirp_follows_the_integral_of_its_frequency() -> None:

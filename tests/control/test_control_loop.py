@@ -274,6 +274,7 @@ def test_a_state_stream_that_stops_trips(rig: Any) -> None:
     assert report.outcome is Outcome.TRIPPED
     # Ages at the cycles after the last state: 20, 40, 60 (allowed), 80 ms.
     assert report.reason == "the newest state is 80 ms old, at most 60 ms are allowed"
+    assert report.flags == ("state_stale",)
     assert report.cycles_sent == 34
     assert rig.records[31].flags & CycleFlag.NO_STATE
     assert not report.passive_confirmed

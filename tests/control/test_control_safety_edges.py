@@ -174,7 +174,7 @@ def armed_with(description: RobotDescription, config: SafetyConfig | None = None
         (
             {"transport_errors": 61},
             "transport_errors",
-            "61 transport errors in 1 s: check cable and connectors",
+            "61 transport errors in 1 s, at most 60 are allowed",
         ),
     ],
 )

@@ -7,6 +7,7 @@ import re
 import shutil
 import struct
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,8 @@ from deal_hw.errors import ConfigurationError
 needs_compiler = pytest.mark.skipif(
     shutil.which(native.compiler()) is None, reason="no C compiler: apt-get install gcc libc6-dev"
 )
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "protocol-cartpole-serial.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "reference" / "protocol-cartpole-serial.md"
 I32 = st.integers(-(2**31), 2**31 - 1)
 U16, U32 = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
 NOMINAL = {p.name: p.nominal for p in parameter_space().parameters}
@@ -216,6 +218,54 @@ def test_a_host_without_compiler_is_told_what_to_install(monkeypatch: pytest.Mon
     monkeypatch.setenv("CC", "no-such-cc")
     with pytest.raises(ConfigurationError, match="no-such-cc, which is not installed; apt-get install gcc"):
         native.build("x", (native.compiler(),), (), "apt-get install gcc")
+
+
+@pytest.mark.parametrize(("target", "chip"), [("firmware", "avr"), ("firmware-arm", "stm32")])
+def test_an_image_needs_no_environment(target: str, chip: str, tmp_path: Path) -> None:
+    """The target installs no package, and its program runs on a Python without any; fake compilers."""
+    if shutil.which("make") is None:
+        pytest.skip("no make")
+    said = subprocess.run(
+        # As on a machine that never ran `make setup`.
+        ["make", "-n", "-W", "pyproject.toml", f"VENV={tmp_path / 'venv'}", target],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert "pip" not in said and str(tmp_path) not in said
+    _fake_tools(tmp_path)
+    environment = {"PYTHONPATH": ".", "PATH": f"{tmp_path}:/usr/bin:/bin", "XDG_CACHE_HOME": str(tmp_path)}
+    arguments = said.strip().splitlines()[-1].partition("drivers/")[2].split()[:-1]
+    command = [sys.executable, "-S", f"drivers/{arguments[0]}", *arguments[1:], str(tmp_path / "out")]
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, "") and arguments[1] == chip
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {
+        ".elf",
+        ".hex" if chip == "avr" else ".bin",
+    }
+    for tool in tmp_path.glob("a*-gcc"):
+        tool.unlink()
+    environment |= {"PATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "empty")}
+    refused = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert refused.returncode == 1 and refused.stderr.startswith("make firmware: the firmware needs a")
+
+
+def _fake_tools(folder: Path) -> None:
+    """Write compilers that make an empty file: of ``-o FILE``, and of objcopy's last argument."""
+    for prefix in ("avr", "arm-none-eabi"):
+        for tool, line in (
+            ("gcc", 'while [ "$1" != -o ]; do shift; done; : > "$2"'),
+            ("objcopy", 'for last; do :; done; : > "$last"'),
+            ("size", "echo; echo 1 2 3"),
+        ):
+            path = folder / f"{prefix}-{tool}"
+            path.write_text(f"#!/bin/sh\n{line}\n")
+            path.chmod(0o755)
 
 
 @needs_compiler

@@ -37,6 +37,7 @@ from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message
 from deal_hw.types import RobotState, Status
 from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND
 
 MS = 1_000_000
 PARTS = OdriveSettings()
@@ -335,6 +336,8 @@ def test_without_the_watchdogs_numbers_the_operator_is_told() -> None:
     wire = Wire(PARTS)
     robot = wire.armed()
     assert robot.watchdog_s == 0.0
+    said = HOLDS_LAST_COMMAND.format(robot="cartpole", stopped_by=robot.stopped_by) + robot.if_cut
+    assert said.count("the power supply of its drive") == 2 and "remote" not in said and "bridge" not in said
     robot.send_command(default_command(robot))
     wire.clock.advance_ns(1000 * MS)
     assert Status.ARMED in wire.newest().status

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import types
@@ -278,6 +279,26 @@ def test_an_error_is_one_bounded_line(
     assert cli.main(["probe"]) == 2
     told = capsys.readouterr().err
     assert told.startswith("deal-hw: error: a b ?[31mxxx") and told.count("\n") == 1 and len(told) < 2100
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_verb_by_its_own_way_out(
+    number: signal.Signals, add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The verb leaves its blocks, so its child processes end; afterwards the handlers are as before."""
+    left = []
+
+    def work(settings: Settings) -> None:
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            left.append(True)
+
+    add_verb(work)
+    before = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+    assert cli.main(["probe"]) == cli.EXIT_INTERRUPTED
+    assert left and capsys.readouterr().err == "deal-hw: interrupted\n"
+    assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
 
 
 def test_an_interrupt_after_the_end_changes_nothing() -> None:

@@ -93,6 +93,25 @@ def test_settings_that_contradict_each_other_are_refused(config: Train, words: s
         train(config)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_first_step_ends_at_once(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """While the libraries load there is nothing to keep; nothing is loaded or written after the signal."""
+    after = []
+
+    def load(*_: object, **__: object) -> None:
+        signal.raise_signal(number)
+        after.append("went on")
+
+    monkeypatch.setattr("deal_hw.workflows.train.train_policy", load)
+    before = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(KeyboardInterrupt):
+        train(Train(udr=True, out=tmp_path, quiet=True))
+    assert not after and not list(tmp_path.iterdir())
+    assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
+
+
 def test_a_go2_is_trained_stopped_and_resumed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

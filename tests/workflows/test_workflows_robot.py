@@ -10,6 +10,7 @@ import pytest
 
 import deal_hw
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
+from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import ConfigurationError, DatasetError
@@ -48,6 +49,32 @@ def test_from_two_files_to_an_inspected_calibration(made: Path, capsys: pytest.C
     shown = deal_hw.inspect(episode, calibration=made / "run" / "calibration")
     nominal, calibrated = (sum(v for v in row.values() if isinstance(v, float)) for row in shown.rows())
     assert shown.description.name == "swing" and calibrated < nominal
+
+
+CART = """<mujoco model="cart"><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body name="cart"><geom type="box" size="0.05 0.04 0.03" mass="0.5"/>
+<joint name="slide" type="slide" axis="1 0 0" range="-0.5 0.5" damping="2" frictionloss="0.3"/>
+<body><joint name="pole" axis="0 1 0" damping="0.004"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.008" mass="0.12"/></body></body></worldbody>
+<actuator><motor joint="slide" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("gear", [16, 30])
+def test_a_cart_with_a_motor_stays_on_its_track(gear: int, tmp_path: Path) -> None:
+    """25 and 50 m/s2, trips at 2 m/s: each excitation is played to its end, and the cart does move."""
+    (tmp_path / "cart.xml").write_text(CART.format(gear=gear), encoding="utf-8")
+    robot = tmp_path / "robot.yaml"
+    assert main(["robot", "new", str(tmp_path / "cart.xml"), "--out", str(robot)]) == EXIT_OK
+    text = robot.read_text(encoding="utf-8").replace("velocity_limit: null", "velocity_limit: 2.0", 1)
+    robot.write_text(text.replace("sensor_noise: 0.0", "sensor_noise: 0.0005"), encoding="utf-8")
+    for seed, excite in enumerate(("multisine", "chirp", "")):
+        simulation = deal_hw.SimulationOptions(simulated=True, truth_seed=seed)
+        report = deal_hw.collect(
+            str(robot), simulation=simulation, out=tmp_path / str(seed), seed=seed, excite=excite
+        )
+        (episode,) = report.episodes[-1:]
+        assert episode.outcome is Outcome.FINISHED, episode.reason
+        assert episode.motion is not None and episode.motion.position_range[0] > 0.03
 
 
 def test_a_dataset_and_the_files_themselves_give_the_same(made: Path) -> None:

@@ -14,6 +14,7 @@ from deal_hw.drivers import (
     default_transport,
     make_robot,
     make_topic_transport,
+    on_this_computer,
 )
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
@@ -122,7 +123,8 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
 
                 yield from examine_servos(config.port, clock)
             robot = make_robot(config.robot, name, config.port, clock, config.wire)
-            yield from examine_robot(config.robot, robot, clock, config.seconds)
+            local = on_this_computer(name, config.port)
+            yield from examine_robot(config.robot, robot, clock, config.seconds, local)
             return
         from deal_hw.drivers.go2.doctor import Go2Doctor
 

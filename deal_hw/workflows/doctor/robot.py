@@ -10,17 +10,23 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.control.clock_check import judge_clock
+from deal_hw.control.safety import SafetyConfig
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.findings import Finding, Level
 from deal_hw.robot import Robot
+from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
 
 _FEW_ERRORS = 0.01
 """Accepted share of corrupt and missing states."""
+_TRIPS = SafetyConfig().link_error_share
+"""Share of errors among the states due at which the safety module ends a run: no work is possible."""
 _SLOW = 0.9
 _PATIENCE_S = 1.0
 
 
-def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iterator[Finding]:
+def examine_robot(
+    name: str, robot: Robot, clock: Clock, seconds: float, local: bool = False
+) -> Iterator[Finding]:
     """Yield findings on a robot without motor commands; connecting may switch the motors off.
 
     Args:
@@ -28,10 +34,12 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
         robot: Its driver, not connected.
         clock: The clock of its stamps.
         seconds: How long to listen [s].
+        local: It is a program on this computer, such as an emulator.
 
     Raises:
         DealHwError: It cannot be reached, or it is another device.
     """
+    silent = "see what the emulator says" if local else "check the device's power and the cable"
     with robot:
         yield Finding("link", Level.OK, f"{name} answers{_info_text(getattr(robot, 'info', None))}")
         errors = robot.transport_errors
@@ -42,7 +50,7 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
             try:
                 state = robot.read_state(min(_PATIENCE_S, seconds))
             except TransportTimeoutError as error:
-                yield Finding("states", Level.FAIL, str(error), "check the device's power and the cable")
+                yield Finding("states", Level.FAIL, str(error), silent)
                 return
             host_ns.append(state.receive_ns)
             device_ns.append(state.device_ns)
@@ -53,15 +61,17 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
         "states",
         rate_hz < _SLOW * wanted_hz,
         f"{rate_hz:.0f} states a second of {wanted_hz:.0f}",
-        "try another cable or a less busy computer",
+        late_advice(local, Load.now()),
     )
     share = errors / (errors + len(host_ns))
-    yield Finding.judged(
-        "states",
-        share > _FEW_ERRORS,
-        f"{errors} of {errors + len(host_ns)} states corrupt or lost ({share:.1%})",
-        "check cable, connectors and grounding",
-    )
+    text = f"{errors} of {errors + len(host_ns)} states corrupt or lost ({share:.1%})"
+    # The measure of the safety module: errors among the states that were due.
+    due = max((host_ns[-1] - host_ns[0]) * 1e-9, _PATIENCE_S) * wanted_hz
+    if errors > _TRIPS * due:
+        advice = corrupt_advice(local, Load.now())
+        yield Finding("states", Level.FAIL, f"{text}; a run trips at {_TRIPS:.0%}", advice)
+    else:
+        yield Finding.judged("states", share > _FEW_ERRORS, text, corrupt_advice(local, Load.now()))
     yield judge_clock(np.array(host_ns), np.array(device_ns))
 
 

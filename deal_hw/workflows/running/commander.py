@@ -20,10 +20,9 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.say import Say
 
 HOLDS_LAST_COMMAND = (
-    "note: {robot} holds its last command for ever. deal-hw damps it when a run ends, when one of its two "
-    "processes dies, and when a lost connection comes back. If both processes are killed (out of memory, "
-    "kill -9, power) or the connection stays lost, only a bridge on the robot's side (deal-hw bridge), "
-    "its own remote or its power switch can stop it: keep the remote in your hand"
+    "note: {robot} holds its last command for ever. deal-hw makes it passive when a run ends, when one of "
+    "its two processes dies, and when a lost connection comes back. If both processes are killed (out of "
+    "memory, kill -9, power) or the connection stays lost, only {stopped_by} can stop it: keep it in reach"
 )
 
 

@@ -27,7 +27,7 @@ from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
-from deal_hw.drivers import BALANCE, ODOMETRY, balanced, walked
+from deal_hw.drivers import BALANCE, ODOMETRY, balanced, on_this_computer, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
 from deal_hw.signals import OPERATOR
@@ -124,7 +124,13 @@ class EpisodeRun:
             self._say_passive(end.passive_confirmed)
         self.signal = end.signal
         report = dataclasses.replace(
-            account(end, self._path, self._robot.watchdog_s), planned_s=self._plan.total_s
+            account(
+                end,
+                self._path,
+                self._robot.if_cut,
+                on_this_computer(self._plan.transport, self._plan.port),
+            ),
+            planned_s=self._plan.total_s,
         )
         report = dataclasses.replace(
             report, ran_s=report.cycles_sent / self._robot.description.control_rate_hz

@@ -9,6 +9,7 @@ from deal_hw.control.loop import Outcome
 from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.supervisor import ChildEnd
 from deal_hw.signals import OPERATOR, name
+from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.sleep_lock import ASLEEP
 
@@ -16,26 +17,30 @@ _LINK_WARNING = 0.01
 """Share of corrupt and missing state frames above which the operator gets a warning."""
 
 
-def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeReport:
-    """Return the report on an episode from the ends of its processes."""
+def account(end: ChildEnd, path: Path | None, if_cut: str, local: bool = False) -> EpisodeReport:
+    """Return the report on an episode from the ends of its processes.
+
+    Args:
+        end: How both ended.
+        path: The recording.
+        if_cut: What the robot does without a connection, as a sentence.
+        local: The robot is a program on this computer.
+    """
     result = end.result or {}
     outcome, reason, error = _verdict(end, result)
     warnings = list(result.get("warnings", ()))
     if not end.passive_confirmed:
-        cut = (
-            f"If the cable is cut, its own watchdog has stopped the motor after {watchdog_s:g} s"
-            if watchdog_s
-            else "If the connection is lost, it still holds its last command, with stiff motors: use its "
-            "remote (damping), then its switch"
-        )
-        warnings.append(f"the robot did not confirm that it is passive: switch it off by hand. {cut}")
+        warnings.append(f"the robot did not confirm that it is passive: switch it off by hand. {if_cut}")
     loop_timing = LoopTimingReport.from_json(result["loop_timing"]) if result.get("loop_timing") else None
     if loop_timing is not None and loop_timing.transport_errors > _LINK_WARNING * max(loop_timing.states, 1):
         share = loop_timing.transport_errors / (loop_timing.states + loop_timing.transport_errors)
         warnings.append(
             f"{loop_timing.transport_errors} transport errors, {share:.0%} of the state frames: "
-            "check cable, connectors and grounding"
+            f"{corrupt_advice(local, Load.now())}"
         )
+    flags = tuple(result.get("flags", ()))
+    if outcome is Outcome.TRIPPED and LATE.intersection(flags):
+        warnings.append(late_advice(local, Load.now()))
     if end.recorder is not None and not end.recorder.complete:
         why = "; ".join(end.recorder.errors) or "for an unknown reason"
         warnings.append(f"the recording is incomplete ({why}); repair it with `deal-hw data repair {path}`")
@@ -52,6 +57,7 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
         states_recorded=end.recorder.states if end.recorder is not None else 0,
         warnings=tuple(warnings),
         error=error,
+        flags=flags,
     )
 
 

@@ -37,6 +37,7 @@ class EpisodeReport:
         states_recorded: State samples in the file.
         warnings: Warnings for the operator.
         error: Name of the error's class, after a failure.
+        flags: Failed checks of the safety module that ended it.
         motion: How much the recording moves; None without a recording.
         walk: How well a walking robot followed the requested velocity, by its own sensors; None without a
         walk or a recording.
@@ -57,6 +58,7 @@ class EpisodeReport:
     states_recorded: int = 0
     warnings: tuple[str, ...] = ()
     error: str = ""
+    flags: tuple[str, ...] = ()
     motion: Excitation | None = None
     walk: VelocityError | None = None
     balance: BalanceResult | None = None
@@ -76,6 +78,7 @@ class EpisodeReport:
             "states_recorded": self.states_recorded,
             "warnings": list(self.warnings),
             "error": self.error,
+            "flags": list(self.flags),
         }
 
     def lines(self) -> list[str]:

@@ -150,7 +150,7 @@ def run_episodes(
     if robot.notice:
         view.note(robot.notice)
     elif holds_last_command:
-        view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot))
+        view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot, stopped_by=robot.stopped_by))
     # The supervisor connects to the robot itself, so that a wrong port is reported before a process starts.
     # Then it only keeps the port open, until the control process is dead.
     with (

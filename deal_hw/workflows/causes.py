@@ -1,0 +1,70 @@
+"""Why states come late or corrupt, by the wire and by this computer's load, as advice for messages.
+
+A robot that is emulated has no cable, and a slow real one may have nothing wrong with it but a busy computer.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from typing_extensions import Self
+
+LATE = frozenset(
+    {"state_stale", "action_late", "command_stale", "clock_jump", "device_watchdog", "device_disarmed"}
+)
+"""Flags of the safety module (see `deal_hw.control.safety`) that a busy computer can cause."""
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """How busy this computer is.
+
+    Attributes:
+        running: Mean number of threads that ran or waited for a processor in the last minute.
+        processors: Processors that this process may use.
+    """
+
+    running: float
+    processors: int
+
+    @classmethod
+    def now(cls) -> Self:
+        """Return the present load."""
+        return cls(os.getloadavg()[0], len(os.sched_getaffinity(0)))
+
+    @property
+    def high(self) -> bool:
+        """Whether threads had to wait for a processor."""
+        return self.running > self.processors
+
+    def __str__(self) -> str:
+        return f"load {self.running:.1f} on {self.processors} processor{'s' * (self.processors != 1)}"
+
+
+def late_advice(local: bool, load: Load) -> str:
+    """Return the likely cause of late states or commands, and what to do.
+
+    Args:
+        local: The robot is a program on this computer; see :func:`deal_hw.drivers.on_this_computer`.
+        load: This computer's load.
+    """
+    if local:
+        return (
+            f"{load}; the robot is a program on this computer (an emulator), so no cable is at fault: it "
+            "or the control loop was late; end other programs and run again"
+        )
+    if load.high:
+        return f"{load}: this computer is busy; end other programs and run again, then check the cable"
+    return f"{load}, which is no cause; check cable, connectors and wireless"
+
+
+def corrupt_advice(local: bool, load: Load) -> str:
+    """Return the likely cause of corrupt or lost states, and what to do; arguments as :func:`late_advice`."""
+    if local:
+        return (
+            "the robot is a program on this computer (an emulator), so no cable is at fault: it spoils "
+            "frames on purpose (`emulate --profile realistic`, `--corrupt`, `--drop`), or it was late "
+            f"({load})"
+        )
+    return "check cable, connectors and grounding"

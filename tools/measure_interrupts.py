@@ -1,0 +1,173 @@
+#!/usr/bin/env python3
+"""How long `train` and `calibrate` live after a signal, and what they leave behind.
+
+python tools/measure_interrupts.py runs/demo/dataset --runs 20 --out interrupts.json
+
+Each run starts a verb in a process of its own and sends it SIGINT or SIGTERM, in turn, after a drawn time.
+Noted are the seconds until the process has ended, its exit code, processes that outlive it, and files that
+are not whole. The load stands beside each row: on a busy computer a verb hears late. The exit code is 1 if a
+run took longer than five seconds, was killed, or left something behind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import safe_open
+
+from deal_hw.data.files import write_json
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+MOST_S = 5.0
+"""A signal must have ended the verb after this time [s]."""
+PATIENCE_S = 60.0
+"""Then it is killed [s]."""
+MARK = "DEAL_HW_MEASURED_RUN"
+"""Environment variable by which the processes of a run are found."""
+INTERRUPTED = 130
+
+
+def command(verb: str, dataset: Path, out: Path) -> list[str]:
+    """Return the command line of a verb that runs for minutes."""
+    arguments = {
+        "train": ["train", "cartpole", "--udr", "--steps", "1000000", "--out", str(out)],
+        "train-go2": ["train", "go2", "--udr", "--steps", "10000000", "--out", str(out)],
+        "calibrate": ["calibrate", str(dataset), "--out", str(out)],
+        "calibrate-deal": ["calibrate", str(dataset), "--method", "deal", "--out", str(out)],
+    }
+    return [sys.executable, "-m", "deal_hw", *arguments[verb]]
+
+
+VERBS = ("train", "train-go2", "calibrate", "calibrate-deal")
+
+
+def left_over(mark: str) -> list[int]:
+    """Return the ids of processes with a mark in their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+def broken(folder: Path) -> Iterator[str]:
+    """Yield the files of a folder that are not whole, with what is wrong."""
+    for path in sorted(folder.rglob("*")):
+        if ".draft" in path.name:
+            yield f"{path.name}: a draft"
+            continue
+        try:
+            if path.suffix == ".json":
+                json.loads(path.read_text(encoding="utf-8"))
+            elif path.suffix == ".npz":
+                with np.load(path, allow_pickle=False) as arrays:
+                    list(arrays.values())
+            elif path.suffix == ".safetensors":
+                with safe_open(path, framework="np") as tensors:
+                    [tensors.get_tensor(name) for name in tensors.keys()]
+            elif path.suffix == ".onnx":
+                OnnxPolicy(path)
+        except Exception as error:
+            yield f"{path.name}: {type(error).__name__}: {error}"
+
+
+def measure(verb: str, dataset: Path, number: signal.Signals, after_s: float) -> dict[str, Any]:
+    """Start a verb, send it a signal, and return what became of it."""
+    mark = uuid.uuid4().hex
+    with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            command(verb, dataset, Path(out)),
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, MARK: mark},
+            # A shell lets programs in the background ignore SIGINT, and this one may be such a program.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        time.sleep(after_s)
+        load, early = os.getloadavg()[0], process.poll()
+        process.send_signal(number)
+        sent = time.monotonic()
+        try:
+            code = process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        took_s = time.monotonic() - sent
+        said.seek(0)
+        words = said.read().decode(errors="replace").strip().splitlines()
+        return {
+            "verb": verb,
+            "signal": number.name,
+            "after_s": round(after_s, 2),
+            "took_s": round(took_s, 2),
+            "exit_code": code,
+            "ended_before": early is not None,
+            "processes_left": len(left_over(mark)),
+            "broken_files": list(broken(Path(out))),
+            "files": sorted(path.name for path in Path(out).rglob("*") if path.is_file()),
+            "last_words": words[-1][-200:] if words else "",
+            "load": round(load, 1),
+        }
+
+
+def sound(row: Mapping[str, Any]) -> bool:
+    """Return whether a run ended in time and as it should."""
+    ended = row["ended_before"] or (row["took_s"] <= MOST_S and row["exit_code"] == INTERRUPTED)
+    return ended and not row["processes_left"] and not row["broken_files"]
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return one line for each verb and signal."""
+    lines = ["verb            signal   runs  sound  longest [s]  load"]
+    for verb in dict.fromkeys(row["verb"] for row in rows):
+        for name in dict.fromkeys(row["signal"] for row in rows):
+            own = [row for row in rows if (row["verb"], row["signal"]) == (verb, name)]
+            if own:
+                longest, loads = max(row["took_s"] for row in own), [row["load"] for row in own]
+                lines.append(
+                    f"{verb:<15} {name:<8} {len(own):4d}  {sum(map(sound, own)):5d}  {longest:11.1f}  "
+                    f"{min(loads):.0f} to {max(loads):.0f}"
+                )
+    return "\n".join(lines)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path, help="of a cart-pole, such as the demo's")
+    parser.add_argument("--runs", type=int, default=20, help="signals in all, the verbs in turn")
+    parser.add_argument("--verbs", nargs="+", choices=VERBS, default=VERBS)
+    parser.add_argument("--longest", type=float, default=40.0, help="latest signal [s]")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="JSON file of the rows")
+    given = parser.parse_args(words)
+    rng, rows = np.random.default_rng(given.seed), []
+    for run in range(given.runs):
+        verb = given.verbs[run % len(given.verbs)]
+        number = (signal.SIGINT, signal.SIGTERM)[run // len(given.verbs) % 2]
+        rows.append(measure(verb, given.dataset, number, float(rng.uniform(0.5, given.longest))))
+        print(json.dumps({name: value for name, value in rows[-1].items() if name != "files"}), flush=True)
+        if given.out is not None:
+            write_json(given.out, rows)
+    print(table(rows))
+    return int(not all(map(sound, rows)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
