@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from safetensors import safe_open
 
-from deal_hw.data.files import write_json
+from deal_hw.bench.rows import write_rows
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 
 MOST_S = 5.0
@@ -164,7 +164,7 @@ def main(words: Sequence[str] | None = None) -> int:
         rows.append(measure(verb, given.dataset, number, float(rng.uniform(0.5, given.longest))))
         print(json.dumps({name: value for name, value in rows[-1].items() if name != "files"}), flush=True)
         if given.out is not None:
-            write_json(given.out, rows)
+            write_rows(given.out, rows, program="tools/measure_interrupts.py")
     print(table(rows))
     return int(not all(map(sound, rows)))
 

@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from types import FrameType, MappingProxyType
 from typing import Any, TextIO, cast
 
 from deal_hw.documentation import page
@@ -374,11 +374,28 @@ def _terminated_like_ctrl_c() -> Iterator[None]:
     ):
         yield
         return
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    came = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal came
+        came = True
+        raise KeyboardInterrupt
+
+    before: dict[signal.Signals, Any] = {signal.SIGTERM: signal.SIG_DFL}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        before[signal.SIGINT] = signal.default_int_handler
+    for number in before:
+        signal.signal(number, interrupt)
     try:
         yield
+    except ImportError:
+        # A library's compiled module, while it loads, makes an error of its own of the interrupt.
+        if came:
+            raise KeyboardInterrupt from None
+        raise
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _to_nowhere(stream: TextIO) -> None:

@@ -18,8 +18,6 @@ from deal_hw.training import PolicyTrainer, TrainingFiles, TrainingProgress, Tra
 
 _SEED = 3
 _SAME = 1e-5
-_STEPS_TO_STOP = 8
-"""In the middle of the first updates of SAC (three optimisers) and of PPO (20 steps an update)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,34 +175,6 @@ class TrainerSuite:
         case.train(config, progress=resumed.append, files=TrainingFiles(checkpoint=file, resume=True))
         assert stopped.steps < resumed[0].steps and resumed[-1].steps == config.steps
         assert resumed[0].mean_return == stopped.mean_return
-
-    def test_a_request_to_stop_is_heard_within_an_update(self, case: TrainerCase, tmp_path: Path) -> None:
-        """On a slow computer an update takes minutes: no further optimiser step, whole files."""
-        from torch.optim.optimizer import register_optimizer_step_pre_hook
-
-        file = tmp_path / "checkpoint.safetensors"
-        steps = 0
-
-        def count(*_: object) -> None:
-            nonlocal steps
-            steps += 1
-
-        # Called before the hooks of one optimiser.
-        counting = register_optimizer_step_pre_hook(count)
-        try:
-            files = TrainingFiles(checkpoint=file, stop=lambda: steps >= _STEPS_TO_STOP)
-            policy = case.train(case.config, files=files)
-        finally:
-            counting.remove()
-        assert steps == _STEPS_TO_STOP
-        assert policy.act(np.zeros(len(policy.spec.observation), dtype=np.float32)).shape
-        resumed: list[int] = []
-        case.train(
-            case.config,
-            progress=lambda status: resumed.append(status.steps),
-            files=TrainingFiles(checkpoint=file, resume=True, stop=lambda: bool(resumed)),
-        )
-        assert resumed
 
     def test_a_fine_tune_starts_from_the_networks_of_a_checkpoint(
         self, case: TrainerCase, second: KeptTraining, tmp_path: Path

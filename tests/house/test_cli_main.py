@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -299,6 +300,22 @@ def test_a_signal_ends_a_verb_by_its_own_way_out(
     assert cli.main(["probe"]) == cli.EXIT_INTERRUPTED
     assert left and capsys.readouterr().err == "deal-hw: interrupted\n"
     assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_an_interrupt_that_a_loading_library_swallows_is_one_all_the_same(
+    add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Numpy's compiled module makes "initialization failed" of it; without a signal that stays an error."""
+
+    def load(settings: Settings) -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        raise ImportError("initialization failed")
+
+    add_verb(load)
+    assert cli.main(["probe"]) == cli.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "deal-hw: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_an_interrupt_after_the_end_changes_nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import pickle
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 from rsl_rl.algorithms import PPO
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import CheckpointError, ConfigurationError, TrainingDivergedError, UnknownNameError
@@ -78,6 +80,27 @@ def toy_case(trainer: Any, members: int, config: Any, short_config: Any) -> Trai
     )
 
 
+def sac_case() -> TrainerCase:
+    """Return SAC and the toy."""
+    return toy_case(
+        SacTrainer(),
+        16,
+        SacConfig(steps=8_000, hidden=(32, 32), warmup=500),
+        SacConfig(steps=800, hidden=(32, 32), warmup=500),
+    )
+
+
+def ppo_case() -> TrainerCase:
+    """Return PPO and the toy."""
+    settings: dict[str, Any] = {
+        "hidden": (32, 32),
+        "rollout": 16,
+        "learning_rate": 3e-3,
+        "reward_scale": 0.1,
+    }
+    return toy_case(PpoTrainer(), 64, PpoConfig(steps=60_000, **settings), PpoConfig(steps=1_024, **settings))
+
+
 class TestSac(TrainerSuite):
     """SAC keeps the contract of trainers."""
 
@@ -85,12 +108,7 @@ class TestSac(TrainerSuite):
     @classmethod
     def case(cls) -> TrainerCase:
         """Return SAC and the toy."""
-        return toy_case(
-            SacTrainer(),
-            16,
-            SacConfig(steps=8_000, hidden=(32, 32), warmup=500),
-            SacConfig(steps=800, hidden=(32, 32), warmup=500),
-        )
+        return sac_case()
 
 
 class TestPpo(TrainerSuite):
@@ -100,15 +118,36 @@ class TestPpo(TrainerSuite):
     @classmethod
     def case(cls) -> TrainerCase:
         """Return PPO and the toy."""
-        settings: dict[str, Any] = {
-            "hidden": (32, 32),
-            "rollout": 16,
-            "learning_rate": 3e-3,
-            "reward_scale": 0.1,
-        }
-        return toy_case(
-            PpoTrainer(), 64, PpoConfig(steps=60_000, **settings), PpoConfig(steps=1_024, **settings)
-        )
+        return ppo_case()
+
+
+@pytest.mark.parametrize("make", [sac_case, ppo_case])
+def test_a_request_to_stop_is_heard_within_an_update(make: Callable[[], TrainerCase], tmp_path: Path) -> None:
+    """On a slow computer an update takes minutes: no further optimiser step, whole files.
+
+    Eight steps are in the middle of the first updates of SAC (three optimisers) and of PPO (20 an update).
+    """
+    case, file, steps = make(), tmp_path / "checkpoint.safetensors", 0
+
+    def count(*_: object) -> None:
+        nonlocal steps
+        steps += 1
+
+    # Called before the hooks of one optimiser.
+    counting = register_optimizer_step_pre_hook(count)
+    try:
+        policy = case.train(case.config, files=TrainingFiles(checkpoint=file, stop=lambda: steps >= 8))
+    finally:
+        counting.remove()
+    assert steps == 8
+    assert policy.act(np.zeros(len(policy.spec.observation), dtype=np.float32)).shape
+    resumed: list[int] = []
+    case.train(
+        case.config,
+        progress=lambda status: resumed.append(status.steps),
+        files=TrainingFiles(checkpoint=file, resume=True, stop=lambda: bool(resumed)),
+    )
+    assert resumed
 
 
 SHORT = SacConfig(steps=800, hidden=(32, 32), warmup=500)
