@@ -221,10 +221,12 @@ def test_page_shows_a_column_map_that_reads() -> None:
         "elbow_joint",
         "wrist",
         "jaw",
+        "cart",
+        "wheel",
         "finger",
         "knee",
     ]
-    assert columns.joints[5].position == "m3.fb" and columns.velocity == "none"
+    assert columns.joints[7].position == "m3.fb" and columns.velocity == "none"
 
 
 def test_so101_converter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

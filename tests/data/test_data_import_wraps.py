@@ -11,13 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deal_hw.data.checks.command_kind import command_kind
 from deal_hw.data.importing.columns import JointKinds, parse_column_map
 from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.load import load_tables, tables_of
 from deal_hw.data.importing.memory_source import read_memory
 from deal_hw.data.importing.table import Table
 from deal_hw.data.importing.wraps import unwrap
-from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.data.recording.telemetry_checks import Severity
+from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 TURN = 2 * np.pi
@@ -170,16 +172,19 @@ def test_commands_within_one_are_asked_about() -> None:
     arrays = cartpole(0.3 * np.sin(t), t, power)
     unsaid: list[Mapping[str, object]] = [{}, {"target_unit": "rad"}, {"unit": "m"}]
     for entries in unsaid:
-        with pytest.raises(DatasetError, match=r"from: \[-1, 1\], to: \[-2.62, 2.62\].*or `target_unit: N`"):
-            read(arrays, cart=entries, pole={})
+        table, _ = read(arrays, cart=entries, pole={})
+        found = command_kind(table, servo=False)
+        assert found.severity is Severity.FAIL
+        assert "{from: [-1, 1], to: [-2.62, 2.62]}" in found.message and "`target_unit: N`" in found.message
     scale = {"from": [-1, 1], "to": [-2.62, 2.62]}
     by_power, _ = read(arrays, cart={"target_normalised": scale, "sign": -1}, pole={})
     np.testing.assert_allclose(by_power.target[:, 0], -2.62 * power, atol=1e-12)
+    assert "unsaid" not in by_power.source
     by_force, _ = read(arrays, cart={"target_unit": "N", "offset": 0.3}, pole={})
     np.testing.assert_array_equal(by_force.target[:, 0], power)
     # Larger commands, or none, leave no doubt.
-    assert read(cartpole(power, t, 2 * power), cart={}, pole={})[0].target.max() > 1
-    assert not read(cartpole(power, t, 0 * power), cart={}, pole={})[0].target.any()
+    for scale_by in (2.0, 0.0):
+        assert "unsaid" not in read(cartpole(power, t, scale_by * power), cart={}, pole={})[0].source
 
 
 def test_a_motors_target_is_an_effort() -> None:

@@ -44,7 +44,7 @@ STILL: Final = {"rad": 0.02, "m": 0.002}
 
 
 def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> CheckResult:
-    """Check that commands are what the actuators of the model take.
+    """Check that commands are what the actuators of the model take, and that their unit is known.
 
     Args:
         table: The recording, with valid clock and values.
@@ -64,6 +64,8 @@ def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None)
     test = _is_effort if servo else _is_position
     found = [table.actuated[c] for c, i in joints if test(position[:, i], command[:, c], period)]
     if not joints or len(found) < MOST * len(joints):
+        if not servo and "unsaid" in table.source:
+            return CheckResult("actuation", Severity.FAIL, table.source["unsaid"])
         return beyond or CheckResult("actuation", Severity.OK, "the commands fit the model's actuators")
     return CheckResult("actuation", Severity.FAIL, _accusation(found, servo=servo))
 

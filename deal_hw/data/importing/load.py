@@ -125,18 +125,18 @@ def tables_of(
         if say is not None:
             _tell(say, channels, used, joints, columns is None and number == 0, said)
         table = build_table(channels, used, joints)
-        _ask(channels.path, table, used)
+        if unsaid := _unsaid(table, used):
+            table.source["unsaid"] = unsaid
         if say is not None:
             _tell_turns(say, table)
         tables.append(table)
     return tables
 
 
-def _ask(path: Path, table: Table, columns: ColumnMap) -> None:
-    """Refuse a motor's commands that may be newtons as well as a share of full power.
+def _unsaid(table: Table, columns: ColumnMap) -> str:
+    """Return the question about a motor's commands that may be newtons as well as a share of full power.
 
-    Raises:
-        DatasetError: All commands of motors lie within -1..1, and the map does not say what 1 is.
+    It is open where all commands of motors lie within -1..1, and the map does not say what 1 is; else "".
     """
     motors = {joint.name: joint for joint in columns.joints if joint.motor is not None}
     reach = {
@@ -145,19 +145,20 @@ def _ask(path: Path, table: Table, columns: ColumnMap) -> None:
         if name in motors and np.isfinite(values).any()
     }
     if not reach or max(reach.values()) > 1.0:
-        return
+        return ""
     for name, furthest in reach.items():
         joint = motors[name]
         full = joint.motor
         if furthest > 0 and full is not None and joint.unit_unsaid and abs(full - 1.0) > SAME_EFFORT:
             unit = joint.effort_unit
             scale = f"{{from: [-1, 1], to: [-{full:.4g}, {full:.4g}]}}"
-            raise DatasetError(
-                f"{path}: the commands of {name} lie within -1..1, and its motor in the model gives "
-                f"{full:.4g} {unit} at its highest command: 1 may be full power or 1 {unit}. Write into the "
-                f"column map, for {name}, `target_normalised: {scale}` if it is full power, or "
+            return (
+                f"the commands of {name} lie within -1..1, and its motor in the model gives {full:.4g} "
+                f"{unit} at its highest command: 1 may be full power or 1 {unit}. Write into the column map "
+                f"(--columns), for {name}, `target_normalised: {scale}` if it is full power, or "
                 f"`target_unit: {unit}`"
             )
+    return ""
 
 
 def _tell_turns(say: Say, table: Table) -> None:
