@@ -46,7 +46,7 @@ def test_the_ideal_profile_has_no_latency() -> None:
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_the_latency_is_the_mean_delay_from_a_command_to_a_state_that_shows_it(profile: str) -> None:
-    """300 commands and 300 frames, by the device's own ticks; a mean of either jitter is known to 0.07 ticks."""
+    """300 commands and 300 frames, by the device's own ticks: either mean is known to 0.07 ticks."""
     truth = nominal_truth(profile, actuation_ticks=3, sensing_ticks=4)
     exact = dataclasses.replace(PROFILES[profile], sensor=PROFILES["ideal"].sensor)
     sensor, ages = Sensor(exact, truth.sensing_ticks, 200, np.random.default_rng(5)), []
