@@ -2,6 +2,7 @@
 """Parameter errors of the cart-pole behind each of its wires: the demo's demonstration and calibration.
 
 python tools/measure_wire_calibration.py --transports serial can odrive dynamixel --seeds 1,2,3 --out r.json
+python tools/measure_wire_calibration.py --virtual --profile realistic --seeds 1000-1009 --out r.json
 python tools/measure_wire_calibration.py --table r.json
 
 Each row is an emulator with hidden physics in a process of its own. 4 s of motion `rich` are fitted by
@@ -10,6 +11,11 @@ balancing pole is chaotic, so each demonstration shows different parameters. So 
 (--repeats), and the interval beside each error shows what its recording determines. Parameters that a wire's
 device does not have are left out: an ODrive's set-point is moved by the host. The wire `firmware` is serial,
 with the firmware of the ATmega328P in simavr at its end.
+
+With --virtual everything runs in virtual time: the machine's load changes nothing, and a seed gives one row.
+Rows that --out holds already are not run again. The second table has, for each wire and value, how many 90 %
+intervals hold the truth. The true latency is the device's own mean delay. ODrive and Dynamixel do not report
+when a command arrived, so there the calibrated latency also contains the wire's, up to 1 ms.
 """
 
 from __future__ import annotations
@@ -18,20 +24,46 @@ import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deal_hw.bench.rows import write_rows
+from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.bench import parse_seeds
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.errors import DealHwError, InsufficientDataError
+from deal_hw.drivers.cartpole.can_emulator import can_device
+from deal_hw.drivers.cartpole.can_link import CanLink
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
+from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.cartpole.odrive_emulator import odrive_device
+from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
+from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
+from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot
+from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.errors import DealHwError, InsufficientDataError, UnknownNameError
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align, fill_gaps
+from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.settings import CARTPOLE_RANGE_RATIO
+from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate
+from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.settings import LinkOptions
+from deal_hw.workflows.shipped import required_policy
 
 FIRMWARE = "firmware"
+VIRTUAL = ("serial", "can", "odrive", "dynamixel")
+"""Wires in virtual time."""
 TRIES = 3
 """A recording is made again where a pause of this computer made the safety filter end it too early."""
 NOT_THERE = {"odrive": ("servo.speed_limit",)}
@@ -75,29 +107,115 @@ def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[s
     found = calibrate(
         Calibrate(dataset=run / "dataset", out=run, seed=seed, quiet=True, report=False, advise=False)
     ).result
+    return _errors(found, truth["parameters"], truth["latency_s"], transport)
+
+
+def measure_virtual(transport: str, profile: str, seed: int) -> dict[str, Any]:
+    """Run one row in virtual time; the calibration is that of the command line's defaults."""
+    truth = draw_truth(profile, seed, range_ratio=CARTPOLE_RANGE_RATIO)
+    row: dict[str, Any] = {"transport": transport, "profile": profile, "seed": seed, "virtual": True}
+    virtual = _virtual(transport, truth)
+    try:
+        plan = RunPlan(
+            robot="cartpole", motion="rich", seconds=4.0, seed=seed, policy=str(required_policy("cartpole"))
+        )
+        runs = [demonstrate(virtual, replace(plan, motion=motion))[0] for motion in ("rich", "chirp")]
+        fitted, held_out = (fill_gaps(align(run.trajectory, DESCRIPTION)) for run in runs)
+        found = calibrate_episodes(
+            load_model(DESCRIPTION),
+            k9_space(),
+            [fitted],
+            [held_out],
+            method="default",
+            budget=Budget(),
+            rng=np.random.default_rng(seed),
+            threads=1,
+        )
+    except DealHwError as error:
+        return row | {"error": f"{type(error).__name__}: {error}"}
+    return row | _errors(found, truth.parameters, truth.latency_s, transport) | {"error": ""}
+
+
+def _virtual(transport: str, truth: CartpoleTruth) -> VirtualCartpole:
+    """Return an emulated cart-pole behind a wire in virtual time."""
+    match transport:
+        case "serial":
+            return VirtualCartpole(truth)
+        case "can":
+            return VirtualCartpole(truth, can_device(truth), partial(CartpoleRobot, link=CanLink))
+        case "odrive":
+            parts = OdriveSettings(enable_watchdog=ENABLE_WATCHDOG, watchdog_timeout=WATCHDOG_TIMEOUT)
+            return VirtualCartpole(truth, odrive_device(truth, parts), partial(OdriveRobot, settings=parts))
+        case "dynamixel":
+            servos = DynamixelSettings()
+            return VirtualCartpole(
+                truth, DynamixelDevice(truth, servos), partial(DynamixelCartpole, settings=servos)
+            )
+    raise UnknownNameError("wire in virtual time", transport, VIRTUAL)
+
+
+def _errors(
+    found: CalibrationResult, truth: Mapping[str, float], latency_s: float, transport: str
+) -> dict[str, Any]:
+    """Return the part of a row that compares a result with the truth."""
     parameters = {
         p.name: {
-            "truth": truth["parameters"][p.name],
+            "truth": truth[p.name],
             "estimate": float(found.estimate[k]),
             "low": float(found.interval[k, 0]),
             "high": float(found.interval[k, 1]),
         }
         for k, p in enumerate(found.space)
-        if p.name not in NOT_THERE.get(transport, ())
+        # Play that the calibration added has no counterpart in the truth.
+        if p.name in truth and p.name not in NOT_THERE.get(transport, ())
     }
     off = [abs(v["estimate"] / v["truth"] - 1) for v in parameters.values()]
     half = [np.log(v["high"] / v["low"]) / 2 for v in parameters.values()]
-    held = [v["low"] <= v["truth"] <= v["high"] for v in parameters.values()]
+    held = [_holds(v) for v in parameters.values()]
+    low, high = found.latency_interval_s
     return {
         "error_percent": 100 * float(np.mean(off)),
         "median_percent": 100 * float(np.median(off)),
         "interval_percent": 100 * float(np.median(half)),
         "coverage90": float(np.mean(held)),
         "chi2": found.chi2,
-        "latency_error_ms": 1e3 * (found.latency_s - truth["latency_s"]),
+        "latency_error_ms": 1e3 * (found.latency_s - latency_s),
         "alarms": [str(alarm) for alarm in found.alarms],
         "parameters": parameters,
+        "latency": {
+            "truth": 1e3 * latency_s,
+            "estimate": 1e3 * found.latency_s,
+            "low": 1e3 * low,
+            "high": 1e3 * high,
+        },
+        "added": [name for name in found.space.names if name not in truth],
+        "seconds": found.seconds,
     }
+
+
+def _holds(value: Mapping[str, float]) -> bool:
+    return value["low"] <= value["truth"] <= value["high"]
+
+
+def coverage_table(rows: list[dict[str, Any]]) -> str:
+    """Return, as Markdown, how many 90 % intervals of each value hold the truth, and their median width."""
+    whole = [row for row in rows if not row["error"] and "latency" in row]
+    names = list(dict.fromkeys(name for row in whole for name in row["parameters"]))
+    lines = [
+        "| wire | runs | latency [ms] | " + " | ".join(f"{name} [%]" for name in names) + " |",
+        "|" + "---|" * (3 + len(names)),
+    ]
+    for transport in dict.fromkeys(row["transport"] for row in whole):
+        mine = [row for row in whole if row["transport"] == transport]
+        delays = [row["latency"] for row in mine]
+        width = np.median([v["high"] - v["low"] for v in delays]) / 2
+        cells = [f"{sum(map(_holds, delays))} (+-{width:.2f})"]
+        for name in names:
+            found = [row["parameters"][name] for row in mine if name in row["parameters"]]
+            half = 50 * np.median([np.log(v["high"] / v["low"]) for v in found]) if found else 0.0
+            cells.append(f"{sum(map(_holds, found))} (+-{half:.1f})" if found else "")
+        lines.append(f"| {transport} | {len(mine)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -130,28 +248,36 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> int:
     """Measure the rows and print them as a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--transports", nargs="+", default=["serial", "firmware", "can", "odrive", "dynamixel"]
-    )
+    parser.add_argument("--transports", nargs="+", default=None, help="all by default")
+    parser.add_argument("--virtual", action="store_true", help="in virtual time; not the wire `firmware`")
     parser.add_argument("--profile", default="sensor")
     parser.add_argument("--seeds", type=parse_seeds, default=(1, 2, 3), help="such as 1,2,3 or 0-9")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--table", type=Path, default=None, help="print the table of a result")
     given = parser.parse_args()
+    if given.transports is None:
+        given.transports = list(VIRTUAL if given.virtual else (*VIRTUAL, FIRMWARE))
     if given.table is not None:
-        print(table(json.loads(given.table.read_text(encoding="utf-8"))["rows"]))
+        kept = json.loads(given.table.read_text(encoding="utf-8"))["rows"]
+        print(table(kept), coverage_table(kept), sep="\n\n")
         return 0
     rows: list[dict[str, Any]] = []
+    if given.virtual and given.out is not None and given.out.exists():
+        rows = json.loads(given.out.read_text(encoding="utf-8"))["rows"]
+    done = {(row["transport"], row["profile"], row["seed"]) for row in rows if not row["error"]}
     # Wires take turns, so that other work on the machine affects all of them.
     for seed in tuple(given.seeds) * given.repeats:
         for transport in given.transports:
-            rows.append(measure(transport, given.profile, seed))
+            if (transport, given.profile, seed) in done:
+                continue
+            run = measure_virtual if given.virtual else measure
+            rows.append(run(transport, given.profile, seed))
             short = rows[-1]["error"] or f"{rows[-1]['error_percent']:.2f} %"
             print(f"{transport} seed {seed}: {short}", file=sys.stderr, flush=True)
             if given.out is not None:
                 write_rows(given.out, rows, program="tools/measure_wire_calibration.py")
-    print(table(rows))
+    print(table(rows), coverage_table(rows), sep="\n\n")
     return 0
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -54,6 +54,8 @@ class WindowData:
         prior_mean: Prior of the start states: a measurement, an estimate or a weak guess, (W, 2 C).
         prior_std: Its standard deviation, (W, 2 C).
         prior_counts: Entries of the prior that count as measurements, (2 C,).
+        late: Directions in which random delays of commands move whitened predictions, scaled, (W, H M, P);
+            None for constant delays.
     """
 
     episode: int
@@ -65,11 +67,43 @@ class WindowData:
     prior_mean: FloatArray
     prior_std: FloatArray
     prior_counts: Mask
+    late: FloatArray | None = None
+
+    def whitened(self, error: FloatArray) -> FloatArray:
+        """Return prediction errors or their changes, (..., W, H, M), in units of their standard deviation.
+
+        Those of samples that were not measured are 0.
+        """
+        alone = error / self.std
+        if self.late is None:
+            return np.asarray(alone)
+        flat = alone.reshape(*alone.shape[:-2], -1)
+        # The symmetric root keeps each residual at its sample.
+        shared = np.einsum("wrp,...wr->...wp", self.late, flat)
+        return np.asarray((flat - np.einsum("wrp,...wp->...wr", self.late, shared)).reshape(alone.shape))
 
     @property
     def reported(self) -> Mask:
         """Which samples were measured, (W, H, M); the others filled a gap."""
         return np.asarray(np.isfinite(self.std))
+
+
+@dataclass(frozen=True, slots=True)
+class CommandDelays:
+    """Random delays of commands around the latency; see :mod:`deal_hw.calib.fit.command_delays`.
+
+    Attributes:
+        std_s: Their standard deviation [s], where residuals have the size of the sensors' noise.
+        theta: Parameters at which their effect is computed, (K,).
+        latency_s: The latency there [s].
+        shift: Device periods by which the episodes' commands were moved already, by the period at which each
+            begins now; its effect is computed around these. One mapping per episode.
+    """
+
+    std_s: float
+    theta: FloatArray
+    latency_s: float
+    shift: tuple[Mapping[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +162,7 @@ class Problem:
             it from the recordings.
         settings: Assumptions about recordings.
         policy: The policy that produced all commands; None for an unknown one, or no policy.
+        command_delays: Random delays of commands that fits allow for; None for a constant delay.
         channels: Indices of the measured channels into (position, velocity), (M,).
         noise_std: Noise of (position, velocity) over all speeds, (2 C,); valid for measured entries only.
         noise: Noise at rest, and jitter of the sample times.
@@ -143,6 +178,7 @@ class Problem:
     known_std: FloatArray | None = None
     settings: DataSettings = SETTINGS
     policy: PopulationPolicy | None = None
+    command_delays: CommandDelays | None = None
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
@@ -234,7 +270,8 @@ class Problem:
 
     def on(self, episodes: Sequence[SampledEpisode], known_std: FloatArray | None) -> Problem:
         """Return the problem of other recordings; noise is estimated again, simulators are shared."""
-        other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
+        # Delays belong to single commands, which a part of a recording counts from another beginning.
+        other = dataclasses.replace(self, episodes=episodes, known_std=known_std, command_delays=None)
         other._batches = self._batches
         return other
 
@@ -244,10 +281,25 @@ class Problem:
         other.noise = NoiseModel(self.noise.position_std * scale, self.noise.timing_std_s)
         return other
 
+    def with_command_delays(
+        self, delays: CommandDelays | None, episodes: Sequence[SampledEpisode] | None = None
+    ) -> Problem:
+        """Return the problem with random delays of commands, whose fits allow for them.
+
+        ``episodes`` are the same recordings with moved commands.
+        """
+        other = copy.copy(self)
+        other.command_delays = delays
+        other.episodes = self.episodes if episodes is None else episodes
+        return other
+
     def with_more(self, parameters: Sequence[Parameter]) -> Problem:
         """Return the problem with more parameters after its own; recordings and noise are shared."""
         other = copy.copy(self)
         space = other.space = ParameterSpace((*self.space.parameters, *parameters))
+        if self.command_delays is not None:
+            theta = np.append(self.command_delays.theta, [p.nominal for p in parameters])
+            other.command_delays = dataclasses.replace(self.command_delays, theta=theta)
         other._batches = BatchPool(self.robot, space, self.threads, counted=self._batches.counted)
         return other
 
@@ -446,4 +498,6 @@ def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
     """Return the windows under a mask (W,), or at these rows."""
     names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
     windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
-    return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})
+    late = None if data.late is None else data.late[chosen]
+    values = {name: getattr(data, name)[chosen] for name in names}
+    return dataclasses.replace(data, windows=windows, late=late, **values)

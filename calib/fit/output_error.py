@@ -146,6 +146,8 @@ def fit_output_error(
     Raises:
         InsufficientDataError: No recording holds a window.
     """
+    # Its own weights are those of a model error, whatever that is.
+    problem = problem.with_command_delays(None)
     space = problem.space
     fixed = not recipe.latency or problem.fixed_latency_s is not None
     if problem.fixed_latency_s is None:

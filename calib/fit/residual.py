@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
+from deal_hw.calib.fit.command_delays import with_command_delays
 from deal_hw.types import FloatArray
 
 
@@ -145,7 +146,9 @@ class Shooting:
         self.fixed_latency = problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency
         self.given = given or problem.noise_free
         self.prior_share = prior_share
-        self.data: Sequence[WindowData] = problem.windows(length) if data is None else data
+        self.data: Sequence[WindowData] = (
+            with_command_delays(problem, problem.windows(length)) if data is None else data
+        )
         self.length = length
         # The last point whose predictions are known, and these: (W, H, M) an episode.
         self._known: tuple[Point | None, list[FloatArray]] = (None, [])
@@ -261,14 +264,14 @@ class Shooting:
                 x[K + 1 + c, :, c] += steps[K + 1 + c]
                 v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
             predicted = self._predict(values, data, x, v).observed
-            r = (base[e] - data.measured) / data.std
+            r = data.whitened(base[e] - data.measured)
             difference = predicted - base[e]
             if central:
                 here_x, here_v = point.position[e], point.velocity[e]
                 other = self._predict(2 * point.value - values, data, 2 * here_x - x, 2 * here_v - v).observed
                 two = ~one_sided
                 difference[two] = (predicted - other)[two] / 2
-            jac = np.moveaxis(difference / data.std, 0, -1) / steps
+            jac = np.moveaxis(data.whitened(difference), 0, -1) / steps
             if np.isfinite(r).all():
                 # A column that diverges beside a finite base gives no direction.
                 jac = np.nan_to_num(jac, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
@@ -379,7 +382,7 @@ class Shooting:
     def _window_costs(self, e: int, predicted: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""
         data = self.data[e]
-        cost = np.sum(((predicted - data.measured) / data.std) ** 2, axis=(2, 3))
+        cost = np.sum(data.whitened(predicted - data.measured) ** 2, axis=(2, 3))
         if not self.given:
             start = np.concatenate([x, v], axis=2) - data.prior_mean
             cost = cost + np.sum(self.start_information[e] * start**2, axis=2)
@@ -388,7 +391,7 @@ class Shooting:
     def residuals(self, point: Point) -> list[FloatArray]:
         """Return the whitened residuals at a point, (W, H, M) an episode."""
         predicted = self._observed(point)
-        return [(y - data.measured) / data.std for y, data in zip(predicted, self.data, strict=True)]
+        return [data.whitened(y - data.measured) for y, data in zip(predicted, self.data, strict=True)]
 
     def _observed(self, point: Point) -> list[FloatArray]:
         """Return the predictions at a point, (W, H, M) an episode; those of the last point are kept."""

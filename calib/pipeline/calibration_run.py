@@ -69,6 +69,8 @@ class CalibrationRun:
         settings: Which checks to run.
         local: The local fit, if there is one.
         play: The fit with play in the gears, if there is one.
+        late: The fit with random delays of commands, if there is one; then the problem has them.
+        late: The fit with random delays of commands, if there is one; then the problem has them.
         progress: Receives progress reports.
         first_steps: Physics steps of the problem before this calibration.
         checks: Physics steps of each check so far, by its name.

@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -48,11 +48,13 @@ from deal_hw.calib.pipeline.calibration_run import (
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
-from deal_hw.calib.validation.diagnosis import find_play, fit_play
+from deal_hw.calib.validation.diagnosis import Diagnosis, find_play, fit_play
+from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import averaged, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
+    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -62,9 +64,6 @@ from deal_hw.calibration import (
     listed,
 )
 from deal_hw.types import FloatArray
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,6 +171,10 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             run.say(BEFORE_SEARCH, DIVERGED)
         # Another minimum can leave a residual as small as noise, but with a pattern.
         white = local is not None and conclusive(problem, local, MISMATCH.white_samples)
+        if local is not None and not white and (late := fit_delays(problem, local, MISMATCH.evidence)):
+            problem, local = late.problem, late.fit
+            run = dataclasses.replace(run, problem=problem, late=late)
+            white = conclusive(problem, local, MISMATCH.white_samples)
         if local is not None and not white and conclusive(problem, local):
             local = lower_minimum(run, local, RESTARTS) or local
             white = conclusive(problem, local)
@@ -342,12 +345,17 @@ def conclude_fit(
     ``searched`` is the search's result; None where the fit needed no search. ``choice`` is that of
     cross-validation, if it ran.
     """
-    problem, scan, whole = run.problem, None, None
-    searched = searched or without_search(problem, run.budget, refined)
+    late, scan, whole = run.late, None, None
+    searched = searched or without_search(run.problem, run.budget, refined)
     if choice is not None and choice.chosen == "search":
         length, states = refined.shooting.length, refined.shooting.states(refined.point)
-        refined = at_parameters(problem, searched.estimate, searched.latency_s, length, states)
-    elif problem.fixed_latency_s is None:
+        refined = at_parameters(run.problem, searched.estimate, searched.latency_s, length, states)
+    elif late is None and unexplained(refined, MISMATCH.white_samples):
+        late = fit_delays(run.problem, refined, MISMATCH.evidence)
+        refined = refined if late is None else late.fit
+    problem = run.problem if late is None else late.problem
+    # The mean of random delays is no whole number of ticks.
+    if problem.fixed_latency_s is None and late is None and not (choice and choice.chosen == "search"):
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -358,8 +366,14 @@ def conclude_fit(
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:
         known = averaged(problem, whole, known)
+    if late is not None and unexplained(refined):
+        known = late.widened(known)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play)
+    if late is not None:
+        cause = delay_cause(late, refined.latency_s)
+        known = known.with_alarms(cause.alarm)
+        checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
     facts: dict[str, Any] = {
         "restarts": restarts,
         "window_s": refined.shooting.length * problem.episodes[0].period_s,
@@ -384,6 +398,20 @@ def conclude_fit(
         known=known,
         facts=facts,
     )
+
+
+def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
+    """Return random delays of commands as a cause of the residual, which the fit has allowed for."""
+    found = late.found
+    alarm = Alarm(
+        f"Each command acts after its own delay: {1e3 * latency_s:.3g} ms on average, with a standard "
+        f"deviation of {1e3 * found.std_s:.2g} ms.",
+        "The latency is their mean. Each command's own delay was an unknown of the fit, so the intervals "
+        "include them.",
+        "To measure more exactly: end other programs on the computer that sends, send at an even pace, or "
+        "time-stamp commands where they are received.",
+    )
+    return Diagnosis("delay", found.share, found.deviance, (), alarm)
 
 
 def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:

@@ -3,20 +3,34 @@
 Random delays predict no sample, but they predict where the residual is large: each pushes in proportion to
 the change of its command. Any other model error looks like a random force of constant size, white or slow.
 All are Gaussian processes beside white noise. Random delays are found where the residual is likelier with
-them than with these forces alone.
+them than with these forces alone. Then the fit is repeated with a delay of its own for each command; see
+:mod:`deal_hw.calib.fit.command_delays`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation.signatures import SignatureResponse
+from deal_hw.calib.data.problem import CommandDelays, Problem
+from deal_hw.calib.fit.command_delays import (
+    command_spacing_s,
+    delay_columns,
+    free_rows,
+    likely_std,
+    moved_commands,
+)
+from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
+from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
+from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.residual import Shooting, WindowRows
+from deal_hw.calib.validation.signatures import SignatureResponse, answers
+from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 
@@ -30,13 +44,20 @@ class RandomDelaySettings:
         rows: Residuals of each window, from its start.
         slow_s: Correlation time of the slow force [s].
         ratio: Least and largest ratio of the mean variances of a process and the noise [-].
+        spaced: Largest standard deviation of delays, in times between commands, with which these arrive in
+            order [-].
+        rounds: Most fits of one window length, each around the delays of the one before.
+        iterations: Most iterations of each.
     """
 
     fewest: int = 4
-    windows: int = 30
-    rows: int = 240
+    windows: int = 20
+    rows: int = 320
     slow_s: float = 0.1
     ratio: tuple[float, float] = (1e-5, 1e5)
+    spaced: float = 0.3
+    rounds: int = 3
+    iterations: int = 6
 
 
 SETTINGS = RandomDelaySettings()
@@ -59,25 +80,160 @@ class RandomDelay:
     std_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class DelayFit:
+    """A fit that has a delay of its own for each command.
+
+    Attributes:
+        problem: The problem with these delays.
+        fit: Its fit.
+        found: How well random delays explained the residual of the fit before.
+        before: That fit, with one constant delay.
+    """
+
+    problem: Problem
+    fit: Refined
+    found: RandomDelay
+    before: Refined
+
+    def widened(self, known: Uncertainty) -> Uncertainty:
+        """Return an uncertainty that is at least that of the fit with one constant delay.
+
+        Delays also take up a part of what else a model lacks. So they make intervals narrower only where
+        they leave nothing but noise.
+        """
+        before = with_rows(self.before)
+        wide = uncertainty_at(before.shooting.problem, before)
+        std = np.zeros(len(known.space))
+        std[: len(wide.space)] = np.sqrt(np.diag(wide.covariance))
+        first, last = before.shooting.problem.latency_range_s
+        low, high = (
+            (a + b) / 2 + side * max(b - a, wide.latency_interval_s[1] - wide.latency_interval_s[0]) / 2
+            for side in (-1, 1)
+            for a, b in [known.latency_interval_s]
+        )
+        interval_s = max(low, first), min(high, last)
+        return replace(known.widened_to(std), latency_interval_s=interval_s)
+
+
+def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | None:
+    """Return the fit with random delays of commands; None where its residual does not show any.
+
+    Args:
+        problem: The problem, with a constant delay.
+        refined: Its fit.
+        least: Least gain in deviance that shows them [-].
+    """
+    if problem.command_delays is not None or problem.noise_free or problem.robot.base is not None:
+        return None
+    if problem.known_std is not None:
+        # A chosen residual scale is no noise beside which delays could be seen.
+        return None
+    still: tuple[dict[int, int], ...] = tuple({} for _ in problem.episodes)
+    delayed = problem.with_command_delays(CommandDelays(0.0, refined.theta, refined.latency_s, still))
+    seen = _seen(delayed, refined)
+    if seen is None:
+        return None
+    rows, columns = seen
+    found = random_delay(rows, answers(problem, refined), problem.episodes[0].period_s, columns)
+    if found is None or not found.gain > least:
+        return None
+    std_s, gain = _likely(delayed, refined, rows, columns)
+    # Commands that wait for those before them have no delay of their own.
+    if not gain > least or std_s > SETTINGS.spaced * command_spacing_s(problem):
+        return None
+    delayed = _with(delayed, refined, std_s)
+    best: Refined | None = None
+    fit = refined
+    for seconds in REFINEMENT.stages_s:
+        states = None if best is None else best.shooting.states(best.point)
+        for _ in range(SETTINGS.rounds):
+            try:
+                fit = refine(
+                    delayed, fit.theta, fit.latency_s, (seconds,), SETTINGS.iterations, states=states
+                )
+            except InsufficientDataError:
+                break
+            if (seen := _seen(delayed, fit)) is None:
+                break
+            free = [free_rows(r, c) for r, c in zip(*seen, strict=True)]
+            moved, shift, changed = moved_commands(delayed, fit.shooting.data, free, std_s)
+            if not changed:
+                break
+            delayed = _with(delayed, fit, std_s, shift, moved)
+            states = fit.shooting.states(fit.point)
+        if best is not None and fit.chi2 > REFINEMENT.worse * max(best.chi2, 1.0):
+            break
+        best = fit
+    if best is None or best.shooting.problem.command_delays is None:
+        return None
+    found = replace(found, std_s=std_s * max(best.chi2, 1.0) ** 0.5)
+    return DelayFit(best.shooting.problem, best, found, refined)
+
+
+def _with(
+    problem: Problem,
+    fit: Refined,
+    std_s: float,
+    shift: Sequence[Mapping[int, int]] | None = None,
+    episodes: Sequence[SampledEpisode] | None = None,
+) -> Problem:
+    """Return the problem with random delays whose effects are computed at a fit."""
+    known = problem.command_delays
+    shift = known.shift if shift is None and known else shift or ()
+    return problem.with_command_delays(CommandDelays(std_s, fit.theta, fit.latency_s, tuple(shift)), episodes)
+
+
+def _seen(problem: Problem, fit: Refined) -> tuple[list[WindowRows], list[FloatArray]] | None:
+    """Return linearised residuals of a fit, whitened for the sensors' noise alone, and delays' columns."""
+    plain = problem.with_command_delays(None)
+    shooting = Shooting(plain, fit.shooting.length)
+    columns = [delay_columns(problem, fit.theta, fit.latency_s, data) for data in shooting.data]
+    known = [c for c in columns if c is not None]
+    if len(known) < len(columns):
+        return None
+    return list(shooting.normal(fit.point, keep=True).rows), known
+
+
+def _likely(
+    problem: Problem, fit: Refined, rows: Sequence[WindowRows], columns: Sequence[FloatArray]
+) -> tuple[float, float]:
+    """Return the likeliest standard deviation of the delays [s] at a fit, and its gain in deviance."""
+    free = [free_rows(r, c) for r, c in zip(rows, columns, strict=True)]
+    width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
+    return likely_std(
+        [f.residual for f in free],
+        [f.columns for f in free],
+        [f.parameter for f in free],
+        12.0 / width**2 + fit.normal.prior,
+    )
+
+
 def random_delay(
-    rows: Sequence[WindowRows], answers: Sequence[SignatureResponse], period_s: float
+    rows: Sequence[WindowRows],
+    answers: Sequence[SignatureResponse],
+    period_s: float,
+    columns: Sequence[FloatArray] | None = None,
 ) -> RandomDelay | None:
     """Compare random delays and forces with forces alone; None where there is nothing to compare.
 
-    Residuals and the windows' responses to commands are given per episode.
+    Residuals and the windows' responses to commands are given per episode, and the columns of
+    :func:`delay_columns`, if they are known. Without them each sample's change of a set-point has a delay.
     """
     every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
     chosen = every[:: max(-(-len(every) // SETTINGS.windows), 1)]
     if len(chosen) < SETTINGS.fewest or not any(np.any(a.change) for a in answers):
         return None
-    windows = [_Window.of(rows[e], answers[e], w) for e, w in chosen]
+    late = [None] * len(rows) if columns is None else columns
+    windows = [_Window.of(rows[e], answers[e], late[e], w) for e, w in chosen]
     change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])
     rms = np.sqrt(np.mean(change**2, axis=0))
     residual = np.stack([window.residual for window in windows])
+    followed = np.stack([window.parameter for window in windows])
     delay, scale = _process(windows, "delay", rms, period_s)
     forces = [_process(windows, name, rms, period_s)[0] for name in ("white", "slow")]
-    noise, delays, without = (_fitted(residual, these)[0] for these in ([], [delay], forces))
-    both, ratios, level = _fitted(residual, [*forces, delay])
+    noise, delays, without = (_fitted(residual, followed, these)[0] for these in ([], [delay], forces))
+    both, ratios, level = _fitted(residual, followed, [*forces, delay])
     return RandomDelay(
         deviance=noise - delays,
         gain=without - both,
@@ -92,25 +248,33 @@ class _Window:
 
     Attributes:
         residual: In the remaining directions, (D,).
+        parameter: Their derivatives by parameters and latency, (D, K + 1).
         basis: These directions, (H M, D).
         response: Whitened response to a set-point, (A, H, M).
         change: Changes of the set-points, (H, A).
+        late: Changes by the delay of each command, if known, (P, H M) [1/s].
     """
 
     residual: FloatArray
+    parameter: FloatArray
     basis: FloatArray
     response: FloatArray
     change: FloatArray
+    late: FloatArray | None
 
     @classmethod
-    def of(cls, rows: WindowRows, answer: SignatureResponse, w: int) -> _Window:
+    def of(cls, rows: WindowRows, answer: SignatureResponse, late: FloatArray | None, w: int) -> _Window:
         R, S, M = rows.residual.shape[1], rows.start.shape[2], answer.response.shape[3]
         H = min(answer.response.shape[2], max(SETTINGS.rows // M, 4))
         # The start state's prior comes last.
         kept = np.concatenate([np.arange(H * M), np.arange(R - S, R)])
         basis = np.linalg.qr(rows.start[w][kept], mode="complete")[0][:, S:] if S else np.eye(len(kept))
         residual = basis.T @ rows.residual[w][kept]
-        return cls(residual, basis[: H * M], answer.response[:, w, :H], answer.change[w, :H])
+        known = None if late is None else late[w, : H * M].T
+        parameter = basis.T @ rows.parameter[w][kept]
+        return cls(
+            residual, parameter, basis[: H * M], answer.response[:, w, :H], answer.change[w, :H], known
+        )
 
 
 def _process(
@@ -124,6 +288,10 @@ def _process(
     covariance = []
     for window in windows:
         A, H, M = window.response.shape
+        if name == "delay" and window.late is not None:
+            columns = window.late @ window.basis
+            covariance.append(columns.T @ columns)
+            continue
         later = np.zeros((A, H, H, M))
         for k in range(H):
             later[:, k, k:] = window.response[:, : H - k]
@@ -142,26 +310,39 @@ def _process(
     return every / scale, scale
 
 
-def _fitted(residual: FloatArray, covariances: Sequence[FloatArray]) -> tuple[float, FloatArray, float]:
+def _fitted(
+    residual: FloatArray, followed: FloatArray, covariances: Sequence[FloatArray]
+) -> tuple[float, FloatArray, float]:
     """Return the deviance of residuals, (W, D), from the most likely processes beside white noise.
 
-    Their mean variances over that of the noise, and the noise's variance, follow.
+    Their mean variances over that of the noise, and the noise's variance, follow. Parameters have followed
+    the processes, so the likelihood is the restricted one (Patterson and Thompson 1971); ``followed`` holds
+    the derivatives by them, (W, D, P).
     """
-    count, (W, D) = residual.size, residual.shape
+    W, D = residual.shape
     unit = np.broadcast_to(np.eye(D), (W, D, D))
+    power = np.einsum("wdp,wdp->p", followed, followed)
+    # Where the windows show nothing of a parameter, it follows nothing.
+    seen = power > 0
+    followed, weak = followed[..., seen] / np.sqrt(power[seen]), 1e-9 * np.eye(int(seen.sum()))
+    count = residual.size - int(seen.sum())
 
     def likelihood(log_ratios: FloatArray) -> tuple[float, FloatArray, float]:
         """Return deviance, its gradient, and the noise's variance."""
         parts = [ratio * c for ratio, c in zip(np.exp(log_ratios), covariances, strict=True)]
-        total = sum(parts, unit)
-        inverse = np.linalg.inv(total)
-        whitened = np.einsum("wij,wj->wi", inverse, residual)
+        inverse = np.linalg.inv(sum(parts, unit))
+        across = inverse @ followed
+        information = np.einsum("wdp,wdq->pq", followed, across) + weak
+        shift = np.linalg.solve(information, np.einsum("wdp,wd->p", across, residual))
+        whitened = np.einsum("wij,wj->wi", inverse, residual - followed @ shift)
         level = max(float(np.sum(residual * whitened)) / count, 1e-300)
-        deviance = count * np.log(level) + float(np.sum(np.linalg.slogdet(total)[1]))
-        slope = [
-            np.sum(inverse * part) - np.einsum("wi,wij,wj->", whitened, part, whitened) / level
-            for part in parts
-        ]
+        deviance = count * np.log(level) - float(np.sum(np.linalg.slogdet(inverse)[1]))
+        deviance += float(np.linalg.slogdet(information)[1])
+        slope = []
+        for part in parts:
+            moved = np.einsum("wdp,wde,weq->pq", across, part, across, optimize=True)
+            trace = np.sum(inverse * part) - np.trace(np.linalg.solve(information, moved))
+            slope.append(trace - np.einsum("wi,wij,wj->", whitened, part, whitened, optimize=True) / level)
         return float(deviance), np.array(slope), level
 
     def cost(log_ratios: FloatArray) -> tuple[float, FloatArray]:

@@ -51,8 +51,7 @@ def oracle_balances(truth: CartpoleTruth) -> bool:
     """Return whether the balancer with the true parameters holds the pole for 6 s from either side."""
     profile = find_profile(truth.profile)
     # It plans for the mean of the jitter, because single values are unknown in advance.
-    jitter = (profile.actuation_jitter_ticks + profile.sensing_jitter_ticks) / 2
-    latency_ticks = truth.actuation_ticks + truth.sensing_ticks + round(jitter)
+    latency_ticks = truth.actuation_ticks + truth.sensing_ticks + round(profile.mean_jitter_ticks)
     controller = design_lqr(truth.parameters, latency_ticks, profile.sensor)
     return all(balances(truth, controller, angle) for angle in (START_ANGLE_RAD, -START_ANGLE_RAD))
 

@@ -17,7 +17,7 @@ class CartpoleProfile:
     Attributes:
         name: The profile's name, as on the command line.
         sensor: Noise, quantisation and velocity estimate.
-        latency_ticks: Lowest and highest total latency, actuation plus sensing [device ticks].
+        latency_ticks: Lowest and highest total latency, actuation plus sensing, before jitter [device ticks].
         actuation_jitter_ticks: A command acts up to this much later, uniformly [device ticks].
         sensing_jitter_ticks: A frame reports a state up to this much older, uniformly [device ticks].
         stribeck_ratio: Friction at standstill over friction in motion, less 1.
@@ -35,6 +35,11 @@ class CartpoleProfile:
     stribeck_speed_m_s: float = 0.02
     backlash_m: float = 0.0
     drop_probability: float = 0.0
+
+    @property
+    def mean_jitter_ticks(self) -> float:
+        """Mean of both jitters together [device ticks]: each is uniform from 0."""
+        return (self.actuation_jitter_ticks + self.sensing_jitter_ticks) / 2
 
 
 PROFILES: Final = {

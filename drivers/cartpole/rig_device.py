@@ -12,7 +12,6 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import EmulatedDevice
 from deal_hw.drivers.cartpole.link import Link
 from deal_hw.drivers.cartpole.mechanics import Mechanics
-from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.types import Status
 
@@ -119,10 +118,8 @@ class RigChip:
 
 
 def delay_ticks(truth: CartpoleTruth) -> int:
-    """Return a truth's whole latency, which a chip has between a command and its action [ticks]."""
-    profile = find_profile(truth.profile)
-    jitter = (profile.actuation_jitter_ticks + profile.sensing_jitter_ticks) // 2
-    return truth.actuation_ticks + truth.sensing_ticks + jitter
+    """Return a truth's mean latency in whole ticks, which a chip has between a command and its action."""
+    return int(1e3 * truth.latency_s + 1e-6)
 
 
 class RigDevice(EmulatedDevice):

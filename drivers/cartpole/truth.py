@@ -25,8 +25,8 @@ class CartpoleTruth:
         profile: Name of the profile.
         seed: Seed of the draw, of noise and of the start angles.
         parameters: Every parameter by name, known ones included [SI units of ``parameter_space()``].
-        actuation_ticks: A command acts that many device ticks after it was received.
-        sensing_ticks: A frame reports the state of that many device ticks ago.
+        actuation_ticks: A command acts that many device ticks after it was received, before jitter.
+        sensing_ticks: A frame reports the state of that many device ticks ago, before jitter.
         refused: Draws before this one that the oracle policy could not balance.
     """
 
@@ -39,8 +39,13 @@ class CartpoleTruth:
 
     @property
     def latency_s(self) -> float:
-        """Total latency, actuation plus sensing, without jitter [s]."""
-        return (self.actuation_ticks + self.sensing_ticks) * 1e-3
+        """Mean total latency: actuation plus sensing, and the mean of the profile's jitter [s].
+
+        Jitter only delays. So the mean, which a calibration finds, is later than the constant part.
+        """
+        return (
+            self.actuation_ticks + self.sensing_ticks + find_profile(self.profile).mean_jitter_ticks
+        ) * 1e-3
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""

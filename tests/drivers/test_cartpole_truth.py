@@ -1,5 +1,6 @@
 """Hidden truths: reproducible, in range, balanced by the oracle; and the balancer itself."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,8 +8,10 @@ import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.lqr import design_lqr, linearise
+from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.oracle import balances, draw_truth, oracle_balances
 from deal_hw.drivers.cartpole.profiles import PROFILES
+from deal_hw.drivers.cartpole.sensor import Sample, Sensor
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
@@ -39,6 +42,21 @@ def test_the_ideal_profile_has_no_latency() -> None:
     """Ideal means equations only."""
     truth = candidate_truth("ideal", np.random.default_rng(1), seed=1, range_ratio=5.0, refused=0)
     assert truth.latency_s == 0.0
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_the_latency_is_the_mean_delay_from_a_command_to_a_state_that_shows_it(profile: str) -> None:
+    """300 commands and 300 frames, by the device's own ticks: either mean is known to 0.07 ticks."""
+    truth = nominal_truth(profile, actuation_ticks=3, sensing_ticks=4)
+    exact = dataclasses.replace(PROFILES[profile], sensor=PROFILES["ideal"].sensor)
+    sensor, ages = Sensor(exact, truth.sensing_ticks, 200, np.random.default_rng(5)), []
+    for tick in range(1500):
+        sensor.observe(Sample(tick * 1e-3, 0.0, 0.0, 0.0, 0.0))
+        if tick % 5 == 4 and tick > 50:
+            ages.append(tick - sensor.read().cart_um / 1e3)
+    mechanics = Mechanics(truth)
+    late = [mechanics.command_delay() for _ in range(300)]
+    assert 1e3 * truth.latency_s == pytest.approx(np.mean(late) + np.mean(ages), abs=0.3)
 
 
 def test_the_truth_survives_json() -> None:

@@ -82,22 +82,30 @@ def cut_windows(episode: SampledEpisode, length: int, first: int = 0, latest_s: 
     return Windows(start=np.array(starts, dtype=np.int64), length=length, stride=stride)
 
 
-def setpoints(batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray) -> FloatArray:
+def setpoints(
+    batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray, target: FloatArray | None = None
+) -> FloatArray:
     """Return each member's set-point over the whole episode, (N, S, A).
 
     Args:
         batch: The members; their speed limits, command delays and plays apply.
         episode: The episode.
         latency_s: Total latency of each member, (N,) [s].
+        target: Targets of each member, (N, S, A); the episode's by default.
     """
     if batch.robot.description.actuation == "motor":
         # Efforts are not slewed; before the first one the motors are off.
-        efforts = np.repeat(episode.target[None], batch.count, axis=0)
+        efforts = np.repeat(episode.target[None], batch.count, axis=0) if target is None else target
         return delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
-    # Members with the same limit have the same set-point; most spaces have one limit for all.
-    factors, member = np.unique(batch.servo_factor("servo_speed_limit"), axis=0, return_inverse=True)
+    factors = batch.servo_factor("servo_speed_limit")
+    if target is None:
+        # Members with the same limit have the same set-point; most spaces have one limit for all.
+        factors, member = np.unique(factors, axis=0, return_inverse=True)
+        target = episode.target
+    else:
+        member = np.arange(batch.count)
     rate = factors[:, None] * episode.speed_limit[None] * episode.step_s
-    path = slew(np.repeat(episode.start_setpoint[None], len(factors), axis=0), episode.target, rate)
+    path = slew(np.repeat(episode.start_setpoint[None], len(factors), axis=0), target, rate)
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
     path = delay(path[member.ravel()], batch.lag_s(latency_s) / episode.step_s, start)
     return path if batch.play is None else play(start, path, batch.play)

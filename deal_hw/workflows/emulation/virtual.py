@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deal_hw.clock import VirtualClock
+from deal_hw.clock import Clock, VirtualClock
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_level import ATTEMPTS, ExcitationLevelSearch, shortfalls
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
@@ -21,11 +21,13 @@ from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
+from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice, TrueTrajectory
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.robot import Robot
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.transport import Transport
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
@@ -39,7 +41,7 @@ class VirtualEpisode:
     Attributes:
         trajectory: The recording, as read back from its file.
         first_tick: Device tick of the recording's first sample.
-        true: True states since the robot was made.
+        true: True states since the robot was made; none where its device does not keep them.
         report: How the run went.
     """
 
@@ -60,12 +62,20 @@ class VirtualCartpole:
 
     Args:
         truth: Its hidden parameters, profile and seed.
+        device: The emulated device; by default one with a serial port that keeps its true states.
+        robot: Makes the driver for its wire.
     """
 
-    def __init__(self, truth: CartpoleTruth) -> None:
+    def __init__(
+        self,
+        truth: CartpoleTruth,
+        device: EmulatedDevice | None = None,
+        robot: Callable[[Transport, Clock], Robot] = CartpoleRobot,
+    ) -> None:
         self.truth = truth
         self.clock = VirtualClock(_START_NS)
-        self.device = CartpoleDevice(truth, keep_truth=True)
+        self.device = device or CartpoleDevice(truth, keep_truth=True)
+        self._robot = robot
         self._transport = VirtualTransport(self.device, self.clock)
 
     @property
@@ -88,7 +98,7 @@ class VirtualCartpole:
             path: File to write; a temporary one by default.
             metadata: For the recording.
         """
-        robot = CartpoleRobot(self._transport, self.clock)
+        robot = self._robot(self._transport, self.clock)
         ticks: list[int] = []
         with tempfile.TemporaryDirectory() as folder:
             file = path or Path(folder) / "episode.mcap"

@@ -1,0 +1,182 @@
+"""Random delays of commands as unknowns of a fit: whitening, their likeliest size, moved commands."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from deal_hw.bench.tasks import Case, make_case
+from deal_hw.calib.data.problem import CommandDelays, Problem, WindowData
+from deal_hw.calib.fit.command_delays import (
+    FreeRows,
+    _numbers,
+    command_begins,
+    delay_columns,
+    free_rows,
+    likely_std,
+    moved_commands,
+    with_command_delays,
+)
+from deal_hw.calib.fit.intervals import MISMATCH, uncertainty_at, with_rows
+from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.validation.random_delay import fit_delays
+from deal_hw.drivers.cartpole.profiles import PROFILES
+from deal_hw.parameters import Parameter
+from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.types import FloatArray
+
+DELAY_S = 1.1e-3
+
+
+def test_whitened_errors_have_unit_covariance(noisy: Case, noisy_problem: Problem) -> None:
+    """W (1 + s^2 D D^T) W^T is the unit matrix, with W as the windows apply it."""
+    theta, latency_s = noisy.theta, noisy.latency_s
+    problem = noisy_problem.with_command_delays(CommandDelays(DELAY_S, theta, latency_s, ({},)))
+    (data,) = noisy_problem.windows(40)
+    (late,) = with_command_delays(problem, [data])
+    columns = delay_columns(problem, theta, latency_s, data)
+    assert columns is not None and np.abs(columns * DELAY_S).max() > 0.5
+    H, M = data.measured.shape[1:]
+    unit = np.eye(H * M).reshape(H * M, 1, H, M) * np.ones((1, len(data.windows), 1, 1))
+    white = late.whitened(unit * data.std).reshape(H * M, -1, H * M)
+    for w in range(len(data.windows)):
+        covariance = np.eye(H * M) + DELAY_S**2 * columns[w] @ columns[w].T
+        W = white[:, w].T
+        np.testing.assert_allclose(W @ covariance @ W.T, np.eye(H * M), atol=1e-9)
+    np.testing.assert_array_equal(late.measured, data.measured)
+
+
+def _delayed(std_s: float, seed: int) -> tuple[WindowRows, FloatArray]:
+    """Return residuals of 12 windows with 20 commands each, which a fit has followed, and the columns."""
+    rng = np.random.default_rng(seed)
+    columns = np.cumsum(np.repeat(rng.standard_normal((12, 20, 1)), 6, axis=1) * 100.0, axis=1)
+    columns = np.where(np.arange(120)[:, None] // 6 >= np.arange(20), columns, 0.0)
+    followed = columns @ rng.standard_normal((12, 20, 8)) / 1e3
+    residual = rng.standard_normal((12, 120)) + (columns @ rng.normal(0.0, std_s, (12, 20, 1)))[..., 0]
+    fit = np.linalg.lstsq(followed.reshape(-1, 8), residual.ravel(), rcond=None)[0]
+    last = ((0, 0), (0, 1))
+    start = np.concatenate([np.ones((12, 120, 1)), np.full((12, 1, 1), 1e-3)], axis=1)
+    rows = np.pad(residual - followed @ fit, last), np.pad(followed, (*last, (0, 0)))
+    return WindowRows(*rows, start), columns
+
+
+@pytest.mark.parametrize("std_s", [0.3e-3, DELAY_S])
+def test_the_delays_size_is_found_although_a_fit_followed_them(std_s: float) -> None:
+    """Within 10 % on average over ten draws of 240 delays each; the gain decides beyond doubt."""
+    found = []
+    for seed in range(10):
+        free = free_rows(*_delayed(std_s, seed))
+        size, gain = likely_std([free.residual], [free.columns], [free.parameter], np.full(8, 1e-6))
+        assert gain > 20
+        found.append(size)
+    assert np.mean(found) == pytest.approx(std_s, rel=0.1)
+
+
+def test_noise_alone_has_no_delays() -> None:
+    """The likeliest size is the least, and nothing is gained."""
+    free = free_rows(*_delayed(0.0, 0))
+    _, gain = likely_std([free.residual], [free.columns], [free.parameter], np.full(8, 1e-6))
+    assert gain < 4
+
+
+def _largest(columns: FloatArray, problem: Problem, data: WindowData) -> int:
+    """Return the command of the second window that moves it most."""
+    size = np.where(_numbers(problem, data, columns.shape[2])[1] >= 0, np.abs(columns[1]).max(axis=0), 0.0)
+    return int(_numbers(problem, data, columns.shape[2])[1, np.argmax(size)])
+
+
+def _late(episode: SampledEpisode, command: int, periods: int) -> SampledEpisode:
+    """Return the episode with one command that acts later."""
+    begin, target = command_begins(episode)[command], episode.target.copy()
+    target[begin : begin + periods] = episode.target[begin - 1]
+    return dataclasses.replace(episode, target=target)
+
+
+def test_a_column_is_what_a_late_command_does(noisy: Case, noisy_problem: Problem) -> None:
+    """The command that moves the second window most, moved by hand by one period."""
+    problem, latency = noisy_problem, np.array([noisy.latency_s])
+    (data,) = problem.windows(40)
+    columns = delay_columns(problem, noisy.theta, noisy.latency_s, data)
+    assert columns is not None
+    k = _largest(columns, problem, data)
+    (episode,) = problem.episodes
+    other = problem.with_command_delays(None, [_late(episode, k, 1)])
+    on_time, late = (p.predict(noisy.theta[None], latency, data).observed[0, 1] for p in (problem, other))
+    by_hand = ((late - on_time) / data.std[1]).ravel() / episode.step_s
+    assert np.abs(by_hand * DELAY_S).max() > 0.2
+    np.testing.assert_allclose(columns[1, :, k % columns.shape[2]], by_hand, atol=1e-6)
+
+
+def test_commands_move_to_their_likeliest_delay(noisy: Case, noisy_problem: Problem) -> None:
+    """One command acts 4 ms late, without noise: in three steps it is moved by 4 periods.
+
+    Delays stay unknowns around the mean.
+    """
+    plain, latency = noisy_problem, np.array([noisy.latency_s])
+    (data,), (episode,) = plain.windows(40), plain.episodes
+
+    def predicted(problem: Problem) -> FloatArray:
+        return np.asarray(problem.predict(noisy.theta[None], latency, data).observed[0])
+
+    def columns_of(problem: Problem) -> FloatArray:
+        found = delay_columns(problem, noisy.theta, noisy.latency_s, data)
+        assert found is not None
+        return found
+
+    late = _largest(columns_of(plain), plain, data)
+    measured = predicted(plain.with_command_delays(None, [_late(episode, late, 4)]))
+    known = CommandDelays(5e-3, noisy.theta, noisy.latency_s, ({},))
+    problem = plain.with_command_delays(known)
+    for _ in range(3):
+        residual = ((predicted(problem) - measured) / data.std).reshape(len(data.windows), -1)
+        # Nothing but the delays is unknown.
+        rows = FreeRows(residual, columns_of(problem), np.zeros((*residual.shape, 0)))
+        episodes, shift, changed = moved_commands(problem, [data], [rows], 5e-3)
+        problem = problem.with_command_delays(dataclasses.replace(known, shift=shift), episodes)
+    assert not changed
+    begin = int(command_begins(episode)[late])
+    assert {period: by for period, by in shift[0].items() if by} == {begin + 4: 4}
+    # The measurements take the straight part of the move, so that a delay of 0 is still the likeliest.
+    (around,) = with_command_delays(problem, [data])
+    columns = columns_of(problem)
+    alone = _numbers(problem, data, columns.shape[2]) == late
+    by = 0.004 * np.einsum("wdp,wp->wd", columns, alone).reshape(data.measured.shape)
+    np.testing.assert_allclose(around.measured, data.measured + by * data.std, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def jittering() -> Case:
+    """A demonstration over a link on which each command acts 0 to 3 ms later; nothing else is unknown."""
+    profile = dataclasses.replace(
+        PROFILES["sensor"], name="jittering", latency_ticks=(5, 25), actuation_jitter_ticks=3
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PROFILES, "jittering", profile)
+        return make_case("cartpole", "jittering", 0, 5.0)
+
+
+def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
+    """Latency, its interval, parameters and the noise; one constant delay leaves a chi2 above 2."""
+    problem = Problem(jittering.robot, jittering.space, [jittering.fit], threads=1)
+    constant = refine(problem, jittering.theta, jittering.latency_s)
+    assert constant.chi2 > 2
+    late = fit_delays(problem, constant, MISMATCH.evidence)
+    assert late is not None and late.fit.chi2 < 1.1
+    assert late.found.std_s == pytest.approx(1.12e-3, rel=0.5)
+    known = uncertainty_at(late.problem, with_rows(late.fit))
+    low, high = known.latency_interval_s
+    assert low <= jittering.latency_s <= high and high - low < 3e-3
+    inside = (known.interval[:, 0] <= jittering.theta) & (jittering.theta <= known.interval[:, 1])
+    assert inside.mean() >= 0.85
+    # Where more than noise is left, intervals are no narrower than with one constant delay.
+    wide, before = late.widened(known), uncertainty_at(problem, with_rows(constant))
+    assert np.all(np.diag(wide.covariance) >= np.diag(before.covariance) * (1 - 1e-9))
+    assert np.ptp(wide.latency_interval_s) >= 0.99 * np.ptp(before.latency_interval_s)
+    # Commands that a part of a recording counts from another beginning have no known delays.
+    assert late.problem.on([jittering.fit], None).command_delays is None
+    more = Parameter.around("cart.more", "dof_damping", ("cart",), "N·s/m", 0.1)
+    more_delays = late.problem.with_more([more]).command_delays
+    assert more_delays is not None and more_delays.theta.shape == (len(jittering.space) + 1,)
