@@ -162,7 +162,8 @@ class Problem:
             it from the recordings.
         settings: Assumptions about recordings.
         policy: The policy that produced all commands; None for an unknown one, or no policy.
-        command_delays: Random delays of commands that fits allow for; None for a constant delay.
+        command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
+            to single commands of these recordings: a problem of others begins without.
         channels: Indices of the measured channels into (position, velocity), (M,).
         noise_std: Noise of (position, velocity) over all speeds, (2 C,); valid for measured entries only.
         noise: Noise at rest, and jitter of the sample times.
@@ -178,7 +179,7 @@ class Problem:
     known_std: FloatArray | None = None
     settings: DataSettings = SETTINGS
     policy: PopulationPolicy | None = None
-    command_delays: CommandDelays | None = None
+    command_delays: CommandDelays | None = field(init=False, default=None)
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
@@ -270,8 +271,7 @@ class Problem:
 
     def on(self, episodes: Sequence[SampledEpisode], known_std: FloatArray | None) -> Problem:
         """Return the problem of other recordings; noise is estimated again, simulators are shared."""
-        # Delays belong to single commands, which a part of a recording counts from another beginning.
-        other = dataclasses.replace(self, episodes=episodes, known_std=known_std, command_delays=None)
+        other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
         other._batches = self._batches
         return other
 

@@ -177,6 +177,7 @@ def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     assert np.ptp(wide.latency_interval_s) >= 0.99 * np.ptp(before.latency_interval_s)
     # Commands that a part of a recording counts from another beginning have no known delays.
     assert late.problem.on([jittering.fit], None).command_delays is None
+    assert dataclasses.replace(late.problem, episodes=[jittering.fit]).command_delays is None
     more = Parameter.around("cart.more", "dof_damping", ("cart",), "N·s/m", 0.1)
     more_delays = late.problem.with_more([more]).command_delays
     assert more_delays is not None and more_delays.theta.shape == (len(jittering.space) + 1,)
