@@ -7,9 +7,9 @@ FOLDER holds your own checkouts: ODriveResources (odriverobotics), DynamixelSDK 
 (huggingface, v0.4.4: later versions need Python 3.12) and unitree_sdk2_python (unitreerobotics). What is not
 there is left out. Programs run unchanged, but for the port or bus that they open by name
 (tools/clients/sitecustomize.py), in a terminal where this tool presses the keys. Each has its own emulator. A
-program that fails is tried three times, because its time limits are short for a busy machine; the table shows
-the tries. Programs with packages of their own get an environment below --environments. The exit code is 1 if
-one fails.
+program that fails is run again, up to three times in all, because its time limits are short for a busy
+machine; table and transcript show at which try it passed, what was wrong before, and the load at each try.
+Programs with packages of their own get an environment below --environments. The exit code is 1 if one fails.
 
 Unitree's SDK needs cyclonedds 0.10.2: name a Python that has it with --unitree-python. On `lo` it needs
 multicast, which a network of its own allows:
@@ -73,15 +73,31 @@ class Run:
 
     Attributes:
         client: The program.
-        tries: How often it was run.
-        output: What it printed.
-        faults: What was wrong; empty: it passed.
+        output: What it printed in the last try.
+        faults: What was wrong in the last try; empty: it passed.
+        failed: What was wrong in each try before.
+        load: The machine's load before each try.
     """
 
     client: Client
-    tries: int
     output: str
     faults: tuple[str, ...]
+    failed: tuple[tuple[str, ...], ...] = ()
+    load: tuple[float, ...] = ()
+
+    @property
+    def tries(self) -> int:
+        """How often it was run."""
+        return len(self.load)
+
+    @property
+    def verdict(self) -> str:
+        """The result in words, with what was wrong in the tries before it."""
+        before = "; ".join(
+            f"try {number}: {'; '.join(faults)}" for number, faults in enumerate(self.failed, start=1)
+        )
+        text = f"FAIL: {'; '.join(self.faults)}" if self.faults else f"pass at try {self.tries}"
+        return f"{text} ({before})" if before else text
 
 
 def run_in_terminal(
@@ -151,9 +167,11 @@ def prepare(client: Client, port: str, folder: Path) -> None:
 
 
 def check(client: Client, folder: Path, python: Path) -> Run:
-    """Run a program until it passes, twice at most."""
-    run = Run(client=client, tries=0, output="", faults=("not run",))
-    while run.faults and run.tries < _TRIES:
+    """Run a program until it passes, three times at most."""
+    failed: list[tuple[str, ...]] = []
+    load: list[float] = []
+    while True:
+        load.append(os.getloadavg()[0])
         try:
             output, code = _once(client, folder, python)
         except TransportError as error:
@@ -163,8 +181,11 @@ def check(client: Client, folder: Path, python: Path) -> Run:
         ]
         faults += [f"{text!r} in its output" for text in client.must_not if text in output]
         faults += [] if code in client.exit_codes else [f"exit code {code}"]
-        run = Run(client=client, tries=run.tries + 1, output=output, faults=tuple(faults))
-    return run
+        if not faults or len(load) == _TRIES:
+            return Run(
+                client=client, output=output, faults=tuple(faults), failed=tuple(failed), load=tuple(load)
+            )
+        failed.append(tuple(faults))
 
 
 def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
@@ -210,11 +231,11 @@ def transcript(runs: Sequence[Run]) -> str:
         if len(lines) > _HEAD + _TAIL:
             left = len(lines) - _HEAD - _TAIL
             lines = [*lines[:_HEAD], f"... {left} lines ...", *lines[-_TAIL:]]
-        verdict = "pass" if not run.faults else "FAIL: " + "; ".join(run.faults)
+        load = ", ".join(f"{value:.1f}" for value in run.load)
         text = "\n".join("    " + re.sub(r"/\S*/", "", line)[:110] for line in lines)
         arguments = " ".join(run.client.command[1:]).replace("{port}", "PORT")
         out.append(
-            f"## {run.client.name} {arguments}".rstrip() + f"\n\n{verdict}, try {run.tries}\n\n{text}\n"
+            f"## {run.client.name} {arguments}".rstrip() + f"\n\n{run.verdict}, load {load}\n\n{text}\n"
         )
     return "\n".join(out)
 
@@ -234,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = options.folder.resolve()
     chosen = [c for c in CLIENTS if not options.only or c.name in options.only]
     runs = []
-    print("| program | result | tries |\n|---|---|---|", flush=True)
+    print("| program | result | load |\n|---|---|---|", flush=True)
     for client in chosen:
         if not (folder / client.source).exists():
             print(f"| {client.name} | skipped: no {client.source} | |", flush=True)
@@ -249,11 +270,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 else python_of(client, options.environments.resolve(), shlex.split(options.pip_args))
             )
         except subprocess.CalledProcessError as error:
-            runs.append(Run(client=client, tries=0, output=str(error.stderr), faults=("not installed",)))
+            runs.append(Run(client=client, output=str(error.stderr), faults=("not installed",)))
         else:
             runs.append(check(client, folder, python))
-        verdict = "; ".join(runs[-1].faults) or "pass"
-        print(f"| {client.name} | {verdict} | {runs[-1].tries} |", flush=True)
+        load = ", ".join(f"{value:.1f}" for value in runs[-1].load)
+        print(f"| {client.name} | {runs[-1].verdict} | {load} |", flush=True)
     if options.transcript is not None:
         options.transcript.write_text(transcript(runs))
     return int(any(run.faults for run in runs))

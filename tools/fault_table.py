@@ -285,9 +285,9 @@ def summary(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]]) -> str:
-    """Return the tables of several wires as one page."""
+    """Return the tables of several wires as one page; files of the same wire share a column."""
     results = [{**result, "rows": [summary(row) for row in result["rows"]]} for result in results]
-    wires = [result["rows"][0]["wire"] for result in results]
+    wires = list(dict.fromkeys(row["wire"] for result in results for row in result["rows"]))
     names = dict.fromkeys(row["fault"] for result in results for row in result["rows"])
     loads = [load for result in results for row in result["rows"] for load in row["load"]]
     first = results[0]["calls"][-1]["machine"]
@@ -308,7 +308,8 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         "|---|---|" + "---:|" * len(wires) + "---|---|---|",
     ]
     for name in names:
-        rows = [next((r for r in result["rows"] if r["fault"] == name), None) for result in results]
+        found = {row["wire"]: row for result in results for row in result["rows"] if row["fault"] == name}
+        rows = [found.get(wire) for wire in wires]
         known = [row for row in rows if row is not None]
         each = [r for row in known for r in row["repetitions"]]
         codes = ", ".join(str(code) for code in sorted({r["exit_code"] for r in each}))

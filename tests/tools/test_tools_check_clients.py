@@ -91,7 +91,7 @@ def test_a_program_that_never_ends_is_stopped(tmp_path: Path) -> None:
     assert exit_code < 0
 
 
-def test_a_program_is_run_twice_and_what_was_wrong_is_said(
+def test_a_program_is_run_again_and_what_was_wrong_is_kept(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A missing text, a forbidden one and the exit code each have their words; a second try may pass."""
@@ -102,9 +102,15 @@ def test_a_program_is_run_twice_and_what_was_wrong_is_said(
     monkeypatch.setattr(check_clients, "_once", lambda *_: next(answers))
     run = check(client, tmp_path, Path(sys.executable))
     assert (run.tries, run.faults) == (2, ())
+    assert run.failed == (("no 'Done' in its output", "'Traceback' in its output", "exit code 1"),)
+    assert run.verdict == (
+        "pass at try 2 (try 1: no 'Done' in its output; 'Traceback' in its output; exit code 1)"
+    )
     monkeypatch.setattr(check_clients, "_once", lambda *_: ("Traceback pos: 1", 1))
     run = check(client, tmp_path, Path(sys.executable))
     assert run.faults == ("no 'Done' in its output", "'Traceback' in its output", "exit code 1")
+    assert run.tries == 3
+    assert run.verdict.startswith("FAIL: no 'Done' in its output; ")
 
 
 def test_an_empty_folder_skips_every_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,8 +123,10 @@ def test_an_empty_folder_skips_every_program(tmp_path: Path, capsys: pytest.Capt
 def test_a_transcript_is_short_and_has_no_paths() -> None:
     """The beginning and the end of the output, without folders of this machine."""
     lines = [f"line {k}" for k in range(100)]
-    run = Run(client=PLAIN, tries=1, output="\n".join(["at /some/folder/x.py", *lines]), faults=())
+    out = "\n".join(["at /some/folder/x.py", *lines])
+    run = Run(client=PLAIN, failed=(("exit code 1",),), output=out, faults=(), load=(2.04, 7.56))
     text = transcript([run])
+    assert "pass at try 2 (try 1: exit code 1), load 2.0, 7.6" in text
     assert "at x.py" in text
     assert "... 79 lines ..." in text
     assert "line 99" in text
