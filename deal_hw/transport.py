@@ -215,3 +215,8 @@ class TopicTransport(Transport):
 
         A transport that cannot know them (Zenoh) returns nothing; for certainty, listen to the topic as well.
         """
+
+    @property
+    def stream(self) -> int | None:
+        """Number of the stream of our messages, by which a bridge identifies us; None if there is none."""
+        return None

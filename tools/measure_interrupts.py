@@ -170,4 +170,6 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    # A reader such as `head` that has read enough ends it, as it ends other programs. No verb runs then.
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     sys.exit(main())

@@ -419,28 +419,32 @@ class _Stop:
         self._asked = True
         return self.requested
 
-    def note(self) -> None:
-        """Note a signal.
+    def note(self) -> bool:
+        """Note a signal, and return whether the trainer will stop by it.
 
-        Raises:
-            KeyboardInterrupt: The trainer has not begun: there is nothing to keep, and the libraries that are
-                being loaded would take many seconds on a busy computer.
+        One that has not begun will not: there is nothing to keep, and the libraries that are being loaded
+        would take many seconds on a busy computer.
         """
-        if not self._asked:
-            raise KeyboardInterrupt
-        self.requested = True
+        self.requested = self._asked
+        return self.requested
 
 
 @contextlib.contextmanager
 def _stopped_by_signal() -> Iterator[_Stop]:
-    """Yield what notes the first SIGINT or SIGTERM; a second one acts as usual."""
+    """Yield what notes the first SIGINT or SIGTERM; a second one, or one before the training, acts as usual."""
     stop = _Stop()
     try:
         before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
         def note(number: int, frame: Any) -> None:
-            signal.signal(number, before[signal.Signals(number)])
-            stop.note()
+            usual = before[signal.Signals(number)]
+            signal.signal(number, usual)
+            if stop.note():
+                return
+            if callable(usual):
+                # The command line must know of it: a library that is being loaded may swallow the exception.
+                usual(number, frame)
+            raise KeyboardInterrupt
 
         for number in before:
             signal.signal(number, note)

@@ -47,6 +47,8 @@ _ASK_S: Final = 0.5
 """Time between repeated requests: a first one may be lost during the network's discovery [s]."""
 _PATIENCE_S: Final = 3.0
 """A switcher that is silent for this long does not exist, as in older firmware [s]."""
+_UNREACHED_S: Final = 1.5
+"""After three requests a bridge has said whether they reach it: it does so five times a second [s]."""
 _ACT_S: Final = 5.0
 """Longest wait for an answer, as in the vendor's SDK [s]."""
 
@@ -137,12 +139,18 @@ class MotionSwitcher:
     Args:
         services: The robot's services.
         clock: For waiting.
+        why_unreached: Returns why requests since a time [ns] cannot reach the robot; "" if nothing is known.
     """
 
-    def __init__(self, services: ServiceClient, clock: Clock) -> None:
+    def __init__(
+        self,
+        services: ServiceClient,
+        clock: Clock,
+        why_unreached: Callable[[int], str] = lambda since_ns: "",
+    ) -> None:
         self.released = ""
         self.old = False
-        self._services, self._clock = services, clock
+        self._services, self._clock, self._why_unreached = services, clock, why_unreached
         self._old_active = True
         self._answered = False
 
@@ -157,11 +165,13 @@ class MotionSwitcher:
         if self.old:
             return OLD_SERVICE if self._old_active else ""
         patience_s = min(timeout_s, _PATIENCE_S)
-        deadline_ns = self._clock.now_ns() + round(patience_s * 1e9)
+        begin_ns = self._clock.now_ns()
+        deadline_ns = begin_ns + round(patience_s * 1e9)
         while (left_ns := deadline_ns - self._clock.now_ns()) > 0:
             try:
                 answer = self._services.ask(SWITCHER, CHECK_MODE, {}, min(_ASK_S, left_ns * 1e-9))
             except TransportTimeoutError:
+                self._check_reached(begin_ns)
                 continue
             except RefusedError as error:
                 if error.code != BUSY:
@@ -177,6 +187,13 @@ class MotionSwitcher:
             )
         self.old = True
         return OLD_SERVICE
+
+    def _check_reached(self, begin_ns: int) -> None:
+        """Check that nothing is known to keep requests from the robot, once that can be known."""
+        if self._clock.now_ns() - begin_ns >= round(_UNREACHED_S * 1e9) and (
+            why := self._why_unreached(begin_ns)
+        ):
+            raise TransportTimeoutError(f"go2: {why}")
 
     def lie_down(self, timeout_s: float) -> None:
         """Ask the active mode to lay the robot down; a refusal or a missing answer is ignored."""

@@ -20,7 +20,7 @@ from deal_hw.drivers.go2.messages.body import body_state, is_damped
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.remote import decode_remote, parse_combination
-from deal_hw.drivers.go2.messages.rpc import STATUS_TEXTS, read_note
+from deal_hw.drivers.go2.messages.rpc import HEARD_TEXTS, STATUS_TEXTS, read_note
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.go2.takeover import Takeover
@@ -131,11 +131,14 @@ class Go2Robot(Robot):
             self._motion,
             None if self.description.floating_base is None else np.array(self.description.rest_position),
             services=self._has_services,
+            why_unreached=self._why_unreached,
         )
         self._frame: LowStateFrame | None = None
         self._armed = self._homed = self._in_charge = False
         self._passive_ns: int | None = None
         self._armed_ns, self._bridged = 0, False
+        # Streams that the bridge has heard, and when it said so [ns].
+        self._bridge_heard, self._bridge_heard_ns = "", 0
         self._fault = self._operator_stop = ""
 
     def connect(self) -> None:
@@ -352,6 +355,8 @@ class Go2Robot(Robot):
         if status is None:
             return
         self._bridged = True
+        if (heard := read_note(message.payload, HEARD_TEXTS)) is not None:
+            self._bridge_heard, self._bridge_heard_ns = heard["heard"], message.stamp_ns
         controlled = status["control"] == "controlled"
         ours = bool(self._sender.in_force or self._armed_ns)
         if controlled and self._in_charge and not ours:
@@ -362,6 +367,20 @@ class Go2Robot(Robot):
         later = message.stamp_ns - self._armed_ns > BRIDGE_DELAY_NS
         if self._armed and later and not controlled and not self._fault:
             self._fault = f"go2: the bridge took the robot from this run: {status['reason']}"
+
+    def _why_unreached(self, since_ns: int) -> str:
+        """Return why requests since a time [ns] do not pass the bridge; "" if nothing is known.
+
+        Zenoh drops a reader's messages and tells neither side. The bridge says whom it hears.
+        """
+        stream = self._transport.stream
+        if stream is None or self._bridge_heard_ns <= since_ns or f"{stream:016x}" in self._bridge_heard:
+            return ""
+        return (
+            "states arrive through the bridge, but it hears none of this run's messages: the certificate "
+            "may only read (an observer's). Give a controller's by --certificate and --key, and its name to "
+            "the bridge by --controllers (`deal-hw keys show DIR` lists names)"
+        )
 
     def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:
         self._frame = frame

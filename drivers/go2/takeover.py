@@ -39,6 +39,7 @@ class Takeover:
         motion: Returns positions and velocities of the joints in the newest state, (J,) each.
         rest: The pose of a lying robot, (J,) [rad]; None for one whose base is held, which cannot fall.
         services: Whether it has services, and with them a controller of its own to release.
+        why_unreached: As of :class:`~deal_hw.drivers.go2.motion_switcher.MotionSwitcher`.
     """
 
     def __init__(
@@ -51,11 +52,12 @@ class Takeover:
         rest: FloatArray | None,
         *,
         services: bool = True,
+        why_unreached: Callable[[int], str] = lambda since_ns: "",
     ) -> None:
         self._transport, self._clock, self._pump = transport, clock, pump
         self._motion, self._rest = motion, rest
         self._services = ServiceClient(send, pump, clock)
-        self._switcher = MotionSwitcher(self._services, clock)
+        self._switcher = MotionSwitcher(self._services, clock, why_unreached)
         self._has_services = services
         self._foreign, self._foreign_ns = 0, -1
 

@@ -110,6 +110,17 @@ def test_an_observer_reads_and_cannot_command(rig: BridgeRig, controller: Bridge
         assert not observer.in_charge
 
 
+def test_a_run_with_an_observers_certificate_is_refused(rig: BridgeRig) -> None:
+    """It waited for a minute for services that never heard it, and blamed sport mode."""
+    clock = MonotonicClock()
+    told = rig.commands()
+    with Go2Robot(ZenohTransport(rig.port, clock, rig.options("observer")), clock) as robot:
+        with pytest.raises(TransportTimeoutError, match=r"the certificate may only read.*--controllers"):
+            robot.home(30.0)
+        robot.passive()
+    assert rig.commands() == told
+
+
 def test_a_second_controller_and_replays_are_refused(rig: BridgeRig, controller: BridgeClient) -> None:
     """Both are counted, and the first one's commands go on: nothing else moved the robot."""
     told = rig.commands()

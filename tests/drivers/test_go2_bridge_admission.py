@@ -110,6 +110,16 @@ def test_an_idle_bridge_sends_nothing(bench: Bench) -> None:
     assert bench.judge.control is Control.IDLE
 
 
+def test_it_says_which_streams_reach_it(bench: Bench) -> None:
+    """The last eight, refused ones too; a stream that is missing there may not write."""
+    bench.walk(1)
+    for stream in range(2, 9):
+        assert bench.send(DAMPING, stream, age_ms=500.0) is None
+    bench.send(HOLD, 1)
+    bench.send(DAMPING, 9)
+    assert bench.judge.status()["heard"].split() == [f"{stream:016x}" for stream in (3, 4, 5, 6, 7, 8, 1, 9)]
+
+
 def test_a_hand_over_begins_with_damping(bench: Bench) -> None:
     """A stiff command from nowhere is refused; after damping the same passes unchanged."""
     assert bench.send(HOLD) is None

@@ -11,7 +11,7 @@ from fakes.go2 import STANDING, STIFF, FakeBench
 from deal_hw.control.passive import make_passive
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
-from deal_hw.drivers.go2.messages.rpc import Response, encode_response
+from deal_hw.drivers.go2.messages.rpc import Response, encode_note, encode_response
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.errors import (
     ProtocolError,
@@ -151,6 +151,32 @@ def test_a_robot_without_any_service_is_a_timeout_with_advice() -> None:
     wire.robot.connect()
     with pytest.raises(TransportTimeoutError, match=r"3104.*bridge"):
         wire.robot.home(10.0)
+
+
+@pytest.mark.parametrize(
+    ("heard", "words"),
+    [
+        ("00000000000000bb", "the certificate may only read"),
+        # Where the bridge hears us, or is too old to say whom it hears, the services are what is missing.
+        ("00000000000000bb 00000000000000aa", "neither motion_switcher nor robot_state answers"),
+        (None, "neither motion_switcher nor robot_state answers"),
+    ],
+)
+def test_a_bridge_that_does_not_hear_us_is_told_from_a_robot_without_services(
+    heard: str | None, words: str
+) -> None:
+    """With a certificate that may only read, Zenoh drops requests and tells nobody."""
+    wire = FakeBench()
+    wire.device.deaf, wire.topics.our_stream = set(topics.SERVICES), 0xAA
+    wire.robot.connect()
+    told = {"control": "idle", "reason": "nobody", **({} if heard is None else {"heard": heard})}
+    for i in range(100):
+        wire.topics.say(topics.BRIDGE, encode_note(told), 0.2 * i)
+    began_ns = wire.clock.now_ns()
+    with pytest.raises(TransportTimeoutError, match=words):
+        wire.robot.home(30.0)
+    assert (wire.clock.now_ns() - began_ns < 2_000_000_000) == ("read" in words)
+    assert wire.device.heard == []
 
 
 def test_a_short_silence_of_the_switcher_is_no_older_firmware() -> None:

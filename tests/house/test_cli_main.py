@@ -329,6 +329,18 @@ def test_an_interrupt_after_the_end_changes_nothing() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.parametrize("arguments", [["--version"], ["probe"]])
+def test_the_end_of_the_process_looks_for_no_garbage(arguments: list[str]) -> None:
+    """A training that was interrupted spent 5 to 10 s on it, on a busy computer."""
+    code = (
+        "import atexit, gc, sys; from deal_hw.cli import main as cli;"
+        f"sys.argv = ['deal-hw', *{arguments!r}];"
+        "atexit.register(lambda: print(gc.get_freeze_count() > 1000)); sys.exit(cli.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[-1] == "True"
+
+
 def test_broken_pipe_of_a_robot_is_told(
     add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:

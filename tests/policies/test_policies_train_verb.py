@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import deal_hw.cli.main as cli
 import deal_hw.cli.train as train_module
 from deal_hw.cli.train import Train, train
 from deal_hw.drivers import driver_description
@@ -110,6 +112,25 @@ def test_a_signal_before_the_first_step_ends_at_once(
         train(Train(udr=True, out=tmp_path, quiet=True))
     assert not after and not list(tmp_path.iterdir())
     assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_a_loading_library_swallows_ends_it_all_the_same(
+    number: signal.Signals,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """It ended with a traceback, "ImportError: initialization failed"."""
+
+    def load(*_: object, **__: object) -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(number)
+        raise ImportError("initialization failed")
+
+    monkeypatch.setattr("deal_hw.workflows.train.train_policy", load)
+    assert cli.main(["train", "cartpole", "--udr", "--quiet", "--out", str(tmp_path)]) == cli.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "deal-hw: interrupted\n"
 
 
 def test_a_go2_is_trained_stopped_and_resumed(

@@ -189,6 +189,7 @@ class FakeTopics(VirtualTopics):
 
     Attributes:
         others: Writers that discovery knows, by topic.
+        our_stream: Number by which a bridge knows the driver; None without a bridge.
         tamper: Returns the bytes that arrive, from topic and bytes of a message of the device.
 
     Args:
@@ -199,6 +200,7 @@ class FakeTopics(VirtualTopics):
     def __init__(self, device: TopicCore, clock: VirtualClock) -> None:
         super().__init__(device, clock)
         self.others: dict[str, tuple[str, ...]] = {}
+        self.our_stream: int | None = None
         self.tamper: Callable[[str, bytes], Iterable[bytes]] = lambda topic, payload: (payload,)
         self._later: list[tuple[int, int, str, bytes]] = []
         self._number = itertools.count()
@@ -206,6 +208,11 @@ class FakeTopics(VirtualTopics):
     def writers(self, topic: str) -> tuple[str, ...]:
         """Return :attr:`others`."""
         return self.others.get(topic, ())
+
+    @property
+    def stream(self) -> int | None:
+        """Return :attr:`our_stream`."""
+        return self.our_stream
 
     def say(self, topic: str, payload: bytes, after_s: float = 0.0) -> None:
         """Let another participant send a message, now or later; the device hears it, too."""

@@ -32,6 +32,8 @@ from deal_hw.transport import Message
 
 _STREAMS: Final = 64
 """Number of streams whose newest sequences are remembered; messages of older streams are too old anyway."""
+_TOLD: Final = 8
+"""Number of streams that the status names, those heard last."""
 _REQUESTS: Final = {topics.request(name): name for name in topics.SERVICES}
 
 
@@ -89,6 +91,7 @@ class Admission:
         self._stiff = False
         self._last_ns = 0
         self._newest: OrderedDict[tuple[int, str], int] = OrderedDict()
+        self._heard: OrderedDict[int, None] = OrderedDict()
 
     def command(self, message: Message, now_ns: int, frame: LowStateFrame | None) -> LowCommand | None:
         """Return the command in a message if it may go to the robot, else None.
@@ -173,6 +176,7 @@ class Admission:
             "admitted": self.admitted,
             "refused": dict(self.refused),
             "last_refusal": self.last_refusal,
+            "heard": " ".join(f"{stream:016x}" for stream in self._heard),
         }
 
     def _become(self, control: Control, reason: str) -> None:
@@ -192,6 +196,11 @@ class Admission:
             echo = read_echo(message.attachment)
         except FrameError as error:
             raise RefusedMessageError("unstamped", str(error)) from error
+        # Before any other check: a sender must know whether its messages get here at all.
+        self._heard[echo.stream] = None
+        self._heard.move_to_end(echo.stream)
+        if len(self._heard) > _TOLD:
+            self._heard.popitem(last=False)
         if echo.heard.session != self._session:
             raise RefusedMessageError(
                 "session",

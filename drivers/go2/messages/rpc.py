@@ -101,6 +101,8 @@ def decode_request(payload: bytes) -> Request:
 CLAIM_TEXTS: Final = {"id": 200, "who": 200, "state": 200}
 STATUS_TEXTS: Final = {"control": 40, "reason": 400}
 """Texts of a claim and of the bridge's status (who controls the robot, and why) -> most characters."""
+HEARD_TEXTS: Final = {"heard": 200}
+"""Further text of the status, which older bridges lack: the streams that reached it."""
 
 
 def encode_note(values: Mapping[str, Any]) -> bytes:
