@@ -130,19 +130,21 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
         # A chosen residual scale is no noise beside which delays could be seen.
         return None
     still: tuple[dict[int, int], ...] = tuple({} for _ in problem.episodes)
-    delayed = problem.with_command_delays(CommandDelays(0.0, refined.theta, refined.latency_s, still))
-    seen = _seen(delayed, refined)
+    none_yet = CommandDelays(0.0, refined.theta, refined.latency_s, still)
+    # A fit that explained too little ends on a part of the recordings: its windows are those of the part.
+    part = refined.shooting.problem
+    seen = _seen(part.with_command_delays(none_yet), refined)
     if seen is None:
         return None
     rows, columns = seen
-    found = random_delay(rows, answers(problem, refined), problem.episodes[0].period_s, columns)
+    found = random_delay(rows, answers(part, refined), part.episodes[0].period_s, columns)
     if found is None or not found.gain > least:
         return None
-    std_s, gain = _likely(delayed, refined, rows, columns)
+    std_s, gain = _likely(part, refined, rows, columns)
     # Commands that wait for those before them have no delay of their own.
     if not gain > least or std_s > SETTINGS.spaced * command_spacing_s(problem):
         return None
-    delayed = _with(delayed, refined, std_s)
+    delayed = problem.with_command_delays(replace(none_yet, std_s=std_s))
     best: Refined | None = None
     fit = refined
     for seconds in REFINEMENT.stages_s:
