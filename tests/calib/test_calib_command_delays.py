@@ -20,7 +20,7 @@ from deal_hw.calib.fit.command_delays import (
     with_command_delays,
 )
 from deal_hw.calib.fit.intervals import MISMATCH, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.fit.refinement import part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation.random_delay import fit_delays
 from deal_hw.drivers.cartpole.profiles import PROFILES
@@ -188,3 +188,15 @@ def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     more = Parameter.around("cart.more", "dof_damping", ("cart",), "N·s/m", 0.1)
     more_delays = late.problem.with_more([more]).command_delays
     assert more_delays is not None and more_delays.theta.shape == (len(jittering.space) + 1,)
+
+
+def test_a_fit_that_ended_on_a_part_of_the_recordings_shows_delays(jittering: Case) -> None:
+    """A local fit above chi2 4 does not go on to all recordings; the fit with delays has all of them."""
+    problem = Problem(jittering.robot, jittering.space, [jittering.fit], threads=1)
+    part = part_of(problem, 2.5)
+    assert part is not problem
+    late = fit_delays(problem, refine(part, jittering.theta, jittering.latency_s, (0.2,)), MISMATCH.evidence)
+    assert late is not None and late.fit.chi2 < 1.1
+    assert late.found.std_s == pytest.approx(1.12e-3, rel=0.5)
+    used, whole = (sum(e.usable.sum() for e in p.episodes) for p in (late.problem, problem))
+    assert used == whole

@@ -138,6 +138,18 @@ def test_degrees(make_table: MakeTable) -> None:
     assert found.severity is Severity.FAIL and "degrees" in found.message
 
 
+def test_degrees_are_one_cause_in_one_short_paragraph(make_table: MakeTable) -> None:
+    """Positions in degrees lie far from their commands and outside the limits: no second cause."""
+    sound = make_table()
+    found = examine(make_table(position=np.rad2deg(sound.position)), LIMITS)
+    assert [v.name for v in found if v.severity is Severity.FAIL] == ["units"]
+    with pytest.raises(DatasetError) as refused:
+        require(found, "rec.csv")
+    text = str(refused.value)
+    assert text.count("degrees") == 1 and "hip, knee, foot: the measurement's range is about 57.3" in text
+    assert "another zero" not in text and "normalised to" not in text and len(text) < 300
+
+
 def test_degrees_of_a_joint_without_limits(make_table: MakeTable) -> None:
     """A servo's joint that turns 23 rad may be in degrees: a warning. A free one, or a wheel, may turn so."""
     sound = make_table()

@@ -78,13 +78,15 @@ def examine(
     middle = [rate, _gaps(clock), jumps, _frozen(table), speed_verdict(table), _commands(table, efforts)]
     if not table.command_s.size or not table.actuated:
         return (*first, *middle)
+    units = _units(table, limits)
+    # Positions in a wrong unit also lie far from commands and outside the limits: no other cause.
+    comparable = units.severity is not Severity.FAIL
     return (
         *first,
         *middle,
         _copy(table),
-        _units(table, limits),
-        _levels(table),
-        _inside_limits(table, limits),
+        units,
+        *([_levels(table), _inside_limits(table, limits)] if comparable else []),
         *match(table),
         _slip(kept or table),
         _clipped_commands(table, limits),
@@ -326,7 +328,8 @@ _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
 
 def _units(table: Table, limits: FloatArray | None) -> CheckResult:
     """Compare the spans of command and measurement, and both with the model's limits."""
-    held, found = table.target_at(table.time_s), []
+    held, found = table.target_at(table.time_s), list[str]()
+    alike_factor: dict[tuple[str, float], list[str]] = {}
     for column, index in enumerate(table.actuated_index):
         target, measured, name = held[:, column], table.position[:, index], table.joint_names[index]
         spans = _span(target), _span(measured)
@@ -334,20 +337,28 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
         if min(spans) <= 0 or alike < 0.3:
             continue
         ratio = spans[0] / spans[1]
-        for factor, words in _FACTORS.items():
-            if abs(ratio / factor - 1) < SCALE_TOLERANCE:
-                found.append(f"{name}: the command's range is {ratio:.3g} times the measurement's ({words})")
-            elif abs(ratio * factor - 1) < SCALE_TOLERANCE:
-                found.append(
-                    f"{name}: the measurement's range is {1 / ratio:.3g} times the command's ({words})"
-                )
-        if not any(line.startswith(f"{name}:") for line in found) and alike > 0.8 and not 0.2 < ratio < 5:
+        factors = [
+            (f"the {larger}'s range is about {factor:.3g} times the {smaller}'s", factor)
+            for factor in _FACTORS
+            for larger, smaller, share in (
+                ("command", "measurement", ratio / factor),
+                ("measurement", "command", 1 / (ratio * factor)),
+            )
+            if abs(share - 1) < SCALE_TOLERANCE
+        ]
+        for words_and_factor in factors[:1]:
+            alike_factor.setdefault(words_and_factor, []).append(name)
+        if not factors and alike > 0.8 and not 0.2 < ratio < 5:
             found.append(
                 f"{name}: command and measurement move alike but their ranges differ "
                 f"{max(ratio, 1 / ratio):.3g} "
                 f"times ({_normal_range(target if ratio > 1 else measured)})"
             )
-    found += _beyond_limits(table, limits)
+    explained = [name for names in alike_factor.values() for name in names]
+    found = [
+        f"{', '.join(names)}: {words} ({_FACTORS[factor]})" for (words, factor), names in alike_factor.items()
+    ] + found
+    found += _beyond_limits(table, limits, explained)
     if found:
         text = f"{'; '.join(found)}. Give the unit in the column map (unit, target_unit, normalised)"
         return _verdict("units", Severity.FAIL, text)
@@ -381,9 +392,12 @@ def _levels(table: Table) -> CheckResult:
     )
 
 
-def _beyond_limits(table: Table, limits: FloatArray | None) -> list[str]:
+def _beyond_limits(table: Table, limits: FloatArray | None, explained: Sequence[str] = ()) -> list[str]:
+    """Return what positions beyond the limits say of joints whose unit is not ``explained`` yet."""
     found = []
     for index, name in enumerate(table.joint_names):
+        if name in explained:
+            continue
         values = table.position[:, index]
         low, high = (-np.inf, np.inf) if limits is None else limits[index]
         reach = float(np.nanmax(np.abs(values)))
