@@ -38,6 +38,8 @@ API_NAMES = {
         "deploy",
         "replay",
         "RunReport",
+        "stop",
+        "StopReport",
         "LinkOptions",
         "LegOptions",
         "SimulationOptions",

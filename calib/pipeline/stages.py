@@ -200,7 +200,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             "search_estimate": dict(zip(searched.space.names, map(float, searched.estimate), strict=True)),
             "search_latency_s": searched.latency_s,
             **found.facts,
-            "physics_steps": {"fits": run.fit_steps, **run.checks},
+            "physics_steps": {"fits": run.fit_steps + attempts.earlier_steps, **run.checks},
         }
         return dataclasses.replace(
             searched,

@@ -279,7 +279,9 @@ def record(robot: PlainRobot, number: int, seconds: float) -> str:
     if robot.fault == "jitter":
         late = rng.uniform(0.0, 2.0 * robot.delay_s / step_s, rows)
         arrives = np.maximum.accumulate(substeps * np.arange(rows) + late.astype(np.int64))
-    names = [joint.name for joint in KINDS[robot.kind].joints]
+    # A fault may give the robot more joints than its model has.
+    nominal = mujoco.MjModel.from_xml_string(robot.model)
+    names = [nominal.joint(j).name for j in range(nominal.njnt)]
     joint = model.actuator_trnid[:, 0]
     moved = [model.joint(int(i)).name for i in joint]
     dof, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]

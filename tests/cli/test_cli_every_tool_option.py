@@ -268,12 +268,16 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     files = {"distribution.json": Path("distribution.json")}
     for demo in demos:
         monkeypatch.setattr(demo, "EmulatorProcess", note("emulator", emulated))
-        monkeypatch.setattr(demo, "first_episode", note("first_episode", ends=True))
+        monkeypatch.setattr(demo, "show_episode", note("show_episode", ends=True))
+        monkeypatch.setattr(demo, "recorded", lambda record, *_: record(0))
+        monkeypatch.setattr(demo, "deployed", lambda run, count, _: run(count))
+        monkeypatch.setattr(demo, "numbers", lambda run: (0,))
         monkeypatch.setattr(
             demo, "calibrate", note("calibrate", types.SimpleNamespace(files=files, result=None))
         )
         for name in ("collect", "train", "deploy"):
-            monkeypatch.setattr(demo, name, note(name, types.SimpleNamespace(episodes=())))
+            run = types.SimpleNamespace(episodes=(), paths=(Path("e.mcap"),))
+            monkeypatch.setattr(demo, name, note(name, run))
     monkeypatch.setattr(demos[1], "on_floor", lambda distribution: distribution)
     monkeypatch.setattr(demos[1], "trust", lambda result: types.SimpleNamespace(colour="green"))
     _calibrate(monkeypatch, did)

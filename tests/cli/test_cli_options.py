@@ -25,6 +25,7 @@ NO_USE: tuple[float, ...] = (math.nan, math.inf, -math.inf, 1e300)
 DOUBTFUL: tuple[float, ...] = (-1, 0, 1e-300, 2**63)
 """Refused, or of use: zero is a seed, and a share."""
 FINE_AT_ZERO = {
+    "node",
     "seed",
     "episodes",
     "holdout",

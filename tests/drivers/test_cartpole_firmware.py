@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import random
 import re
 import shutil
@@ -227,8 +228,9 @@ def test_an_image_needs_no_environment(target: str, chip: str, tmp_path: Path) -
         pytest.skip("no make")
     said = subprocess.run(
         # As on a machine that never ran `make setup`.
-        ["make", "-n", "-W", "pyproject.toml", f"VENV={tmp_path / 'venv'}", target],
+        ["make", "--no-print-directory", "-n", "-W", "pyproject.toml", f"VENV={tmp_path / 'venv'}", target],
         cwd=ROOT,
+        env={name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))},
         capture_output=True,
         text=True,
         check=True,

@@ -151,8 +151,11 @@ def test_what_cannot_work_is_refused() -> None:
         StopSettings("cartpole", port="x", state_check="length")
 
 
-def test_without_a_run_and_a_port_nothing_is_done(capsys: pytest.CaptureFixture[str]) -> None:
-    """The exit code is 1, for nobody confirmed anything."""
+def test_without_a_run_and_a_port_nothing_is_done(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The exit code is 1, for nobody confirmed anything. Runs of other tests beside it must go on."""
+    monkeypatch.setattr("deal_hw.workflows.stop.find_runs", list)
     assert main(["stop", "go2_on_stand"]) == 1
     assert "no run of go2_on_stand of this user on this computer" in capsys.readouterr().err
 
