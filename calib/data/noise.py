@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
@@ -86,6 +87,9 @@ class DataSettings:
 
 
 SETTINGS = DataSettings()
+REST = 24
+"""Steps of one value above which a joint is at rest [-]. In fewer, a slow motion passes a count of its encoder:
+that is rounding, which counts as noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +159,7 @@ def _differences(
     if not tried:
         return [(np.empty(0), np.empty(0, dtype=np.int64))] * parts[0].shape[1]
     every = np.concatenate([np.diff(x, n=order, axis=0) for x, _ in tried])
-    moving = [sliding_window_view(np.diff(x, axis=0) != 0, order, axis=0).any(axis=-1) for x, _ in tried]
+    moving = [sliding_window_view(_moves(x), order, axis=0).any(axis=-1) for x, _ in tried]
     whole = [
         np.ones(len(x) - order, dtype=bool) if m is None else sliding_window_view(m, order + 1).all(axis=1)
         for x, m in tried
@@ -163,6 +167,11 @@ def _differences(
     shows = np.concatenate(moving) & np.concatenate(whole)[:, None]
     rows = [np.flatnonzero(column) for column in shows.T]
     return [(every[row, j], row) for j, row in enumerate(rows)]
+
+
+def _moves(values: FloatArray) -> Mask:
+    """Return which steps from a sample to the next are no part of a rest, (T - 1, J)."""
+    return np.asarray(maximum_filter1d(np.diff(values, axis=0) != 0, REST + 1, axis=0))
 
 
 def _spread(difference: FloatArray, order: int) -> float:

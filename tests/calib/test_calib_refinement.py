@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.checks import check_excitation
-from deal_hw.calib.data.noise import noise_model, white_noise_std
+from deal_hw.calib.data.noise import DataSettings, noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.fit.null_space import NullSpace, null_directions, null_space
@@ -301,8 +301,8 @@ def test_a_joint_at_rest_has_no_vote() -> None:
     found = white_noise_std([moved])[0]
     assert white_noise_std([held, moved])[0] == found
     assert white_noise_std([_encoder(10.0, rest_s=60.0)])[0] == pytest.approx(found, rel=0.1)
-    # Alone it shows nothing, and nothing counts but the rounding on the wire.
-    assert white_noise_std([held])[0] < 1e-6
+    # Alone it shows nothing: it has the noise of a coarse encoder.
+    assert white_noise_std([held])[0] == DataSettings.held_std
 
 
 def test_timing_jitter_is_told_from_noise() -> None:
