@@ -86,7 +86,7 @@ class Case:
 
 
 class SpoiledError(Exception):
-    """A repetition without result: on a busy machine the run ended by itself before the fault."""
+    """A repetition without result: on a busy machine the run ended, or came not so far, before the fault."""
 
 
 class Rig(ABC):
@@ -264,12 +264,15 @@ class Rig(ABC):
         """Draw a phase and a moment of it, and return then.
 
         Raises:
-            SpoiledError: The run ended before.
+            SpoiledError: The run ended before, or the moment never came: nothing was caused.
         """
         self.phase = str(self.rng.choice([phase for phase in self.case.phases if phase in self.phases]))
         event, begin_s, length_s = self.phase_at(self.phase)
         offset_s = begin_s + length_s * float(self.rng.uniform())
-        begun_ns = self.until(lambda: self.event_ns(event))
+        try:
+            begun_ns = self.until(lambda: self.event_ns(event))
+        except TimeoutError as error:
+            raise SpoiledError(f"the run did not reach its phase {self.phase!r}: {error}") from error
         if begun_ns:
             due_ns = begun_ns + round(offset_s * 1e9)
             time.sleep(max(due_ns - time.monotonic_ns(), 0) * 1e-9)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes.logind import FakeLogind
 
 from deal_hw.control.loop import Outcome
 from deal_hw.control.planned_end import ENDING_EVENT
@@ -28,6 +29,7 @@ from deal_hw.types import Status
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.sleep_lock import ASLEEP
 from deal_hw.workflows.running.supervised import InterruptedRunError, run_episodes
 
 pytestmark = pytest.mark.slow
@@ -220,4 +222,20 @@ def test_a_session_that_ends_leaves_the_robot_damped(
     (episode,) = raised.value.report.episodes
     assert episode.passive_confirmed
     assert episode.reason in [reason(number) for number in numbers]
+    assert len(Dataset.open(tmp_path / "dataset").read(0).trajectory.sent_s) > 40
+
+
+def test_a_run_ends_damped_before_this_computer_sleeps(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only a delay is granted; the sleep is announced while the robot stands: damped, then the lock goes."""
+    with FakeLogind(tmp_path, refuse=("block",)) as logind:
+        monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", logind.address)
+        report = rig.run(tmp_path / "dataset", at_beat=80, act=logind.prepare_for_sleep)
+        assert logind.released("delay")
+    told = rig.finish()
+    assert kinds(told) == [DAMPING, STIFF, DAMPING]
+    (episode,) = report.episodes
+    assert (episode.outcome, episode.reason) == (Outcome.STOPPED, ASLEEP)
+    assert episode.passive_confirmed
     assert len(Dataset.open(tmp_path / "dataset").read(0).trajectory.sent_s) > 40

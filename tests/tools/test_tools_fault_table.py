@@ -1,10 +1,15 @@
-"""Pages of fault tables: one column for each wire."""
+"""Fault tables: what counts as a repetition, and one column for each wire."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+from fault_rig import RUNNING, Case, SpoiledError
 from fault_table import page
+from measure_go2_faults import Go2Rig
 
 
 def result(wire: str, fault: str, passive_ms: float) -> dict[str, Any]:
@@ -37,3 +42,17 @@ def test_files_of_one_wire_share_its_column() -> None:
     assert lines[2].startswith("| a | passive | 3 / 3; 1/1 | 4 / 4; 1/1 | 130 |")
     assert lines[3].startswith("| b | passive | 5 / 5; 1/1 |  | 130 |")
     assert text.endswith("Not as expected: none.\n")
+
+
+def test_a_run_that_never_reaches_its_phase_is_no_repetition(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a starved machine it did not stand within 40 s: no fault was caused, and none may be judged."""
+    rig = Go2Rig(Case(name="x", phases=(RUNNING,)), "zenoh", tmp_path, np.random.default_rng(0))
+
+    def until(*_: Any) -> None:
+        raise TimeoutError("waited 40 s without result")
+
+    monkeypatch.setattr(rig, "until", until)
+    with pytest.raises(SpoiledError, match="did not reach its phase 'running': waited 40 s"):
+        rig.await_moment()
