@@ -127,7 +127,10 @@ def measure(verb: str, dataset: Path, number: signal.Signals, after_s: float) ->
 
 def sound(row: Mapping[str, Any]) -> bool:
     """Return whether a run ended in time and as it should."""
-    ended = row["ended_before"] or (row["took_s"] <= MOST_S and row["exit_code"] == INTERRUPTED)
+    # Python ends itself by SIGINT after any interrupt that came while it ran text, as dataclasses do; and a
+    # signal ends it before the verb has taken signals. A shell sees 130 or 143.
+    codes = (INTERRUPTED, -signal.Signals[row["signal"]])
+    ended = row["ended_before"] or (row["took_s"] <= MOST_S and row["exit_code"] in codes)
     return ended and not row["processes_left"] and not row["broken_files"]
 
 

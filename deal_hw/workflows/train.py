@@ -431,7 +431,7 @@ class _Stop:
 
 @contextlib.contextmanager
 def _stopped_by_signal() -> Iterator[_Stop]:
-    """Yield what notes the first SIGINT or SIGTERM; a second one, or one before the training, acts as usual."""
+    """Yield what notes the first SIGINT or SIGTERM in a training; others act as usual."""
     stop = _Stop()
     try:
         before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

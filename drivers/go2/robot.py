@@ -129,6 +129,7 @@ class Go2Robot(Robot):
             self._sender.publish,
             self._pump,
             self._motion,
+            lambda: self._stream.device_ns,
             None if self.description.floating_base is None else np.array(self.description.rest_position),
             services=self._has_services,
             why_unreached=self._why_unreached,

@@ -20,7 +20,8 @@ LISTEN_S: Final = 0.5
 RELEASE_PAUSE_S: Final = 1.0
 """Wait between releasing a mode and checking again, as in the vendor's example [s]."""
 LIE_DOWN_S: Final = 4.0
-"""Longest wait for a robot that was told to lie down to come to rest [s]."""
+"""Longest wait for a robot that was told to lie down to come to rest, by its own clock [s]: a simulator on a
+busy computer is slower than real time."""
 STILL_S: Final = 0.5
 _STILL_RAD_S: Final = 0.3
 _LYING_RAD: Final = 0.5
@@ -37,6 +38,7 @@ class Takeover:
         pump: Receives one message, waiting at most this long [s], and passes it to its reader; raises
             TransportTimeoutError if none arrives.
         motion: Returns positions and velocities of the joints in the newest state, (J,) each.
+        robot_ns: Returns the time of the newest state, by the robot's own clock [ns].
         rest: The pose of a lying robot, (J,) [rad]; None for one whose base is held, which cannot fall.
         services: Whether it has services, and with them a controller of its own to release.
         why_unreached: As of :class:`~deal_hw.drivers.go2.motion_switcher.MotionSwitcher`.
@@ -49,13 +51,14 @@ class Takeover:
         send: Callable[[str, bytes], object],
         pump: Callable[[float], None],
         motion: Callable[[], tuple[FloatArray, FloatArray]],
+        robot_ns: Callable[[], int],
         rest: FloatArray | None,
         *,
         services: bool = True,
         why_unreached: Callable[[int], str] = lambda since_ns: "",
     ) -> None:
         self._transport, self._clock, self._pump = transport, clock, pump
-        self._motion, self._rest = motion, rest
+        self._motion, self._robot_ns, self._rest = motion, robot_ns, rest
         self._services = ServiceClient(send, pump, clock)
         self._switcher = MotionSwitcher(self._services, clock, why_unreached)
         self._has_services = services
@@ -157,14 +160,14 @@ class Takeover:
 
     def _await_stillness(self, deadline_ns: int) -> None:
         """Wait until the robot lies and its joints have stopped, up to a limit."""
-        until_ns = min(self._clock.now_ns() + round(LIE_DOWN_S * 1e9), deadline_ns)
-        still_since_ns = self._clock.now_ns()
-        while (now_ns := self._clock.now_ns()) < until_ns:
+        still_since_ns = self._robot_ns()
+        until_ns = still_since_ns + round(LIE_DOWN_S * 1e9)
+        while self._robot_ns() < until_ns and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
             with contextlib.suppress(TransportTimeoutError):
-                self._pump((until_ns - now_ns) * 1e-9)
+                self._pump(left_ns * 1e-9)
             if np.abs(self._motion()[1]).max() > _STILL_RAD_S:
-                still_since_ns = self._clock.now_ns()
-            elif self._clock.now_ns() - still_since_ns >= round(STILL_S * 1e9) and self._lies():
+                still_since_ns = self._robot_ns()
+            elif self._robot_ns() - still_since_ns >= round(STILL_S * 1e9) and self._lies():
                 return
 
     def _await_silence(self, deadline_ns: int) -> None:

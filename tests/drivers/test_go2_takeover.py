@@ -6,12 +6,12 @@ import json
 
 import numpy as np
 import pytest
-from fakes.go2 import STANDING, STIFF, FakeBench
+from fakes.go2 import RESTING, STANDING, STIFF, FakeBench
 
 from deal_hw.control.passive import make_passive
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
-from deal_hw.drivers.go2.messages.rpc import Response, encode_note, encode_response
+from deal_hw.drivers.go2.messages.rpc import Request, Response, encode_note, encode_response
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.errors import (
     ProtocolError,
@@ -57,6 +57,31 @@ def test_a_robot_that_stays_standing_is_not_released() -> None:
     assert ("motion_switcher", 1003) not in apis(wire) and wire.device.mode == "normal"
     assert make_passive(wire.robot, wire.clock)
     assert wire.device.heard == []
+
+
+def test_a_robot_that_is_slower_than_real_time_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An emulator on a busy computer: it lies down within 3 s of its own time, 6 s of ours."""
+    wire = FakeBench(pose=STANDING)
+    device, serve, asked_ms = wire.device, wire.device.serve, [-1]
+    # A state every 2 ms of ours is one every millisecond of its own.
+    device.tick_step = 1
+
+    def slowly(service: str, request: Request) -> tuple[int, str]:
+        if (service, request.api) != ("sport", 1005):
+            return serve(service, request)
+        asked_ms[0] = device.tick_ms
+        return 0, ""
+
+    def move(topic: str, payload: bytes) -> tuple[bytes]:
+        if 0 <= asked_ms[0] < device.tick_ms - 3000:
+            device.pose = RESTING.copy()
+        return (payload,)
+
+    monkeypatch.setattr(device, "serve", slowly)
+    wire.topics.tamper = move
+    wire.robot.connect()
+    wire.robot.home(20.0)
+    assert wire.device.mode == ""
 
 
 def test_a_robot_on_a_stand_is_released_as_it_is() -> None:

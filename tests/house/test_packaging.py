@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import sys
-import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -238,8 +237,9 @@ def test_the_wheel_calibrates_a_robot_in_a_clean_environment(wheel: Path, tmp_pa
     made = [sys.executable, "-m", "venv", "--without-pip", str(where)]
     subprocess.run(made, check=True, capture_output=True, timeout=120)
     (site,) = where.glob("lib/python*/site-packages")
-    # A path in a .pth file is searched; .pth files there are not read, so the editable install is hidden.
-    (site / "packages.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    # Paths in a .pth file are searched; .pth files there are not read, so the editable install is hidden.
+    packages = [path for path in sys.path if Path(path).name == "site-packages"]
+    (site / "packages.pth").write_text("\n".join(packages), encoding="utf-8")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "COV"))}
     run = functools.partial(
         subprocess.run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
