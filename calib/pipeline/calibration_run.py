@@ -23,7 +23,6 @@ from deal_hw.types import FloatArray
 if TYPE_CHECKING:
     from deal_hw.calib.fit.output_error import OutputErrorFit
 
-PLAY = "play in the gears"
 SHARED_ERRORS = "errors that commands and measurements share"
 AFTER_FIT = "after the fit"
 """Names of checks."""
@@ -74,6 +73,7 @@ class CalibrationRun:
         progress: Receives progress reports.
         first_steps: Physics steps of the problem before this calibration.
         checks: Physics steps of each check so far, by its name.
+        left_out: Why checks were left out, by their names.
     """
 
     problem: Problem
@@ -87,25 +87,42 @@ class CalibrationRun:
     progress: ProgressCallback | None = None
     first_steps: int = 0
     checks: dict[str, int] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    _begun: list[int] = field(default_factory=list)
 
     @contextlib.contextmanager
     def check(self, name: str) -> Iterator[None]:
         """Count what runs inside as a check."""
         before = self.problem.steps
+        self._begun.append(before)
         try:
             yield
         finally:
+            self._begun.pop()
             self.checks[name] = self.checks.get(name, 0) + self.problem.steps - before
 
     @property
+    def check_steps(self) -> int:
+        """Physics steps of the checks so far, with the one that is running."""
+        running = self.problem.steps - self._begun[0] if self._begun else 0
+        return sum(self.checks.values()) + running
+
+    @property
     def fit_steps(self) -> int:
-        """Physics steps of the fits so far."""
-        return self.problem.steps - self.first_steps - sum(self.checks.values())
+        """Physics steps of the fits so far, also of searches that an earlier process has finished."""
+        return self.problem.steps - self.first_steps + self.attempts.earlier_steps - self.check_steps
 
     @property
     def check_steps_left(self) -> int:
         """Physics steps that checks may take: together no more than the fits."""
-        return self.fit_steps - sum(self.checks.values())
+        return self.fit_steps - self.check_steps
+
+    def allows(self, name: str, steps: float) -> bool:
+        """Return whether a check that takes at most so many steps fits in; one that does not is noted."""
+        if self.settings.thorough or steps <= self.check_steps_left:
+            return True
+        self.left_out[name] = "left out, since the checks would take longer than the fits"
+        return False
 
     def say(self, stage: str, message: str = "", done: int = 0, total: int = 1, **candidate: Any) -> None:
         """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""

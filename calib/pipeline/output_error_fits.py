@@ -42,6 +42,7 @@ from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import (
+    HALVES,
     SplitHalf,
     Validation,
     agreement,
@@ -57,6 +58,7 @@ from deal_hw.calib.validation.cross_validation import (
     on_folds,
     time_masks,
 )
+from deal_hw.calib.validation.diagnosis import Diagnosis, diagnose
 from deal_hw.calibration import Z90, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -170,30 +172,33 @@ class OutputErrorFits(Fits):
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
         known = uncertainty_at(problem, fit, own_scale=True)
+        chi2, left = fit.chi2, None
+        if settings.mismatch_s:
+            # With fitted start states the residual shows model error, not smoothing error.
+            left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
+            chi2 = left.normal.cost / max(left.normal.count, 1)
+        local = None if run.local is None else with_rows(run.local)
+        causes: tuple[Diagnosis, ...] | None = None
+        judged = run.problem, local
         with run.check(AFTER_FIT):
-            split = self._split_half(problem, fit, recipe, known)
+            if local is not None and left is not None:
+                # A local fit that diverged has seen only a part of the recordings.
+                lost = local.chi2 >= REFINEMENT.local_hopeless
+                judged = (problem, with_rows(left)) if lost else (run.problem, local)
+                if judged[1] is not None and unexplained(judged[1]):
+                    causes = diagnose(judged[0], judged[1], run.play, run.allows)
+            split = self._split_half(run, problem, fit, recipe, known)
         known = widened_by_split_half(known, split)
         if settings.hold_first:
             known = _including(known, first.theta)
         for kinds, std in settings.common_std:
             known = _scaled_together(known, kinds, std)
         facts: dict[str, Any] = {}
-        if run.local is not None:
-            # With fitted start states the residual shows model error, not smoothing error.
-            local = with_rows(run.local)
+        if local is not None:
             with run.check(AFTER_FIT):
                 known, facts["physics_step"] = with_step(run.problem, local, known)
-        chi2, left = fit.chi2, None
-        if settings.mismatch_s:
-            left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
-            chi2 = left.normal.cost / max(left.normal.count, 1)
-        if run.local is not None and left is not None:
-            # A local fit that diverged has seen only a part of the recordings.
-            lost = run.local.chi2 >= REFINEMENT.local_hopeless
-            judged = (problem, with_rows(left)) if lost else (run.problem, local)
-            if unexplained(judged[1]):
-                with run.check(AFTER_FIT):
-                    known, facts["diagnosis"] = with_causes(*judged, known, run.play)
+        if causes is not None and judged[1] is not None:
+            known, facts["diagnosis"] = with_causes(judged[0], judged[1], known, causes)
         found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {
@@ -305,10 +310,16 @@ class OutputErrorFits(Fits):
         return found
 
     def _split_half(
-        self, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
+        self, run: CalibrationRun, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
     ) -> SplitHalf:
         """Fit two halves of the motions from the estimate on all data, and compare."""
         before, most = problem.steps, self.settings.half_iterations
+        # Central derivatives by each value and the latency, and a line of damped steps.
+        members = 2 * (len(problem.space) + 1) + 10
+        substeps = problem.episodes[0].step_s / problem.robot.step_s
+        cost = float(most * members * fit.plain.device_periods * substeps)
+        if not run.allows(HALVES, cost):
+            return SplitHalf(note=f"left out: it would take {cost:.1g} physics steps")
         parts = map(problem.part, fold_masks(problem, 2))
         try:
             halves = [

@@ -40,7 +40,6 @@ from deal_hw.calib.fit.refinement import (
 )
 from deal_hw.calib.pipeline.calibration_run import (
     AFTER_FIT,
-    PLAY,
     SHARED_ERRORS,
     CalibrationRun,
     FitOutcome,
@@ -48,7 +47,7 @@ from deal_hw.calib.pipeline.calibration_run import (
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
-from deal_hw.calib.validation.diagnosis import Diagnosis, find_play, fit_play
+from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import averaged, scan_latency
@@ -202,6 +201,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             **found.facts,
             "physics_steps": {"fits": run.fit_steps + attempts.earlier_steps, **run.checks},
         }
+        if run.left_out:
+            provenance["checks_left_out"] = dict(run.left_out)
         return dataclasses.replace(
             searched,
             method=self.name,
@@ -369,7 +370,7 @@ def conclude_fit(
     if late is not None and unexplained(refined):
         known = late.widened(known)
     with run.check(AFTER_FIT):
-        known, checked = judge(problem, refined, known, run.settings, run.play)
+        known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause.alarm)
@@ -470,7 +471,8 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         if checked.tried == checked.of:
             return found
         left = f"{checked.of - checked.tried} of {checked.of} corrections were not tried"
-        return found.but(checks_left_out={SHARED_ERRORS: f"{left}: they would take longer than the fits"})
+        run.left_out[SHARED_ERRORS] = f"{left}: they would take longer than the fits"
+        return found
     run.say(BEFORE_SEARCH, str(suspect.alarm))
     unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
-from deal_hw.calib.report.verdict import make_story, trust
+from deal_hw.calib.report.verdict import grouped, make_story, trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
@@ -38,7 +38,10 @@ _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "setti
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table of parameters; positions are percent of the search range."""
+    """One line of the table of parameters; positions are percent of the search range.
+
+    ``biased`` is the named cause of the residual that the value compensates for, or "".
+    """
 
     parameter: Parameter
     estimate: float
@@ -48,6 +51,7 @@ class Row:
     has_value: bool
     outside: bool
     at_bound: str
+    biased: str
     bar_left: float
     bar_width: float
     nominal_at: float
@@ -96,6 +100,7 @@ def render(inputs: ReportInputs) -> str:
         drawing=None if inputs.drawing is None else charts.robot(inputs.drawing),
         rows=rows,
         trust=trust(result),
+        alarm_groups=grouped(result.alarms),
         counts=[
             (word, result.verdicts.count(word))
             for word in ("identifiable", "weak", "not identifiable")
@@ -175,6 +180,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
                 has_value=has_value,
                 outside=has_value and not low <= result.estimate[k] <= high,
                 at_bound=bound,
+                biased=result.biased.get(p.name, ""),
                 bar_left=float(at[0][k]),
                 bar_width=max(float(at[1][k] - at[0][k]), 0.4),
                 nominal_at=float(at[2][k]),

@@ -6,12 +6,12 @@ The error on held-out motion decides first.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from deal_hw import calibration
-from deal_hw.calibration import EXPLAINED_CHI2, CalibrationResult
+from deal_hw.calibration import EXPLAINED_CHI2, Alarm, CalibrationResult
 
 Colour = Literal["green", "amber", "red"]
 
@@ -119,6 +119,14 @@ def trust(result: CalibrationResult) -> Trust:
             "amber", f"{gain} {noise}", "No recording shows whether the model holds on other motion.", record
         )
     return Trust("green", f"{gain} {noise}", "The remaining error is the sensor's noise.", "Use it.")
+
+
+def grouped(alarms: Sequence[Alarm]) -> list[list[Alarm]]:
+    """Return alarms with the same remedy as one group, in the order of their first ones, without doubles."""
+    groups: dict[str, list[Alarm]] = {}
+    for alarm in dict.fromkeys(alarms):
+        groups.setdefault(alarm.do, []).append(alarm)
+    return list(groups.values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,7 +27,8 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.diagnosis import Diagnosis, diagnose
+from deal_hw.calib.validation.diagnosis import Allows, Diagnosis, all_allowed, diagnose
+from deal_hw.calib.validation.residual_place import unexplained_alarm
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Z90, Alarm, listed
@@ -43,7 +44,6 @@ class CheckSettings:
         at_end: Distance to an end of the latency range, as a share of it, that counts as at the end [-].
         causes: Most causes of a residual that become alarms; all are in the provenance.
         half_iterations: Most iterations of each half's fit.
-        most_half_steps: Most physics steps of the split-half check.
         fewest_windows: Fewest windows that are halved.
         false_alarms: Probability that the split-half check flags any parameter of a right model [-]: among
             many parameters, intervals of some halves always miss each other.
@@ -52,12 +52,14 @@ class CheckSettings:
     at_end: float = 0.01
     causes: int = 2
     half_iterations: int = 6
-    most_half_steps: float = 3e8
     fewest_windows: int = 4
     false_alarms: float = 0.05
 
 
 SETTINGS = CheckSettings()
+
+HALVES = "two halves of the data"
+"""Name of the split-half check."""
 
 LATENCY = "latency"
 """Name of the latency among the values that a cause moves."""
@@ -123,10 +125,19 @@ def judge(
     known: Uncertainty,
     settings: Validation,
     fitted: WiderFit | None = None,
+    allows: Allows = all_allowed,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
 
-    ``refined`` has linearised residuals, and ``known`` is its uncertainty. ``fitted`` is a fit with play.
+    The physics step and the causes of the residual come first, because they say what to do.
+
+    Args:
+        problem: The problem.
+        refined: Its fit, with linearised residuals.
+        known: The fit's uncertainty.
+        settings: Which checks to run.
+        fitted: A fit with play.
+        allows: Which of the long ones may run.
     """
     facts: dict[str, Any] = {
         "inflation": known.inflation,
@@ -142,12 +153,14 @@ def judge(
         }
     if settings.physics_step:
         known, facts["physics_step"] = with_step(problem, refined, known)
+    asked = settings.diagnosis and unexplained(refined)
+    causes = diagnose(problem, refined, fitted, allows) if asked else ()
     if settings.split_half:
-        split = check_split_half(problem, refined, known)
+        split = check_split_half(problem, refined, known, allows)
         known = widened_by_split_half(known, split)
         facts["split_half"] = split.to_json()
-    if settings.diagnosis and unexplained(refined):
-        known, facts["diagnosis"] = with_causes(problem, refined, known, fitted)
+    if asked:
+        known, facts["diagnosis"] = with_causes(problem, refined, known, causes)
     return known, facts
 
 
@@ -162,11 +175,15 @@ def with_step(problem: Problem, refined: Refined, known: Uncertainty) -> tuple[U
 
 
 def with_causes(
-    problem: Problem, refined: Refined, known: Uncertainty, fitted: WiderFit | None = None
+    problem: Problem, refined: Refined, known: Uncertainty, found: Sequence[Diagnosis]
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
-    """Put alarms for causes of the residual first; return all causes as plain JSON values, too."""
-    found = diagnose(problem, refined, fitted)
-    alarms = (f.alarm for f in found[: SETTINGS.causes])
+    """Put alarms for causes of the residual first; return all causes as plain JSON values, too.
+
+    Where there is none, the alarm says so, and where the residual lies.
+    """
+    alarms = [f.alarm for f in found[: SETTINGS.causes]]
+    if not found and refined.chi2 > MISMATCH.chi2:
+        alarms = [unexplained_alarm(problem, refined)]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
 
 
@@ -277,7 +294,9 @@ class SplitHalf:
         )
 
 
-def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> SplitHalf:
+def check_split_half(
+    problem: Problem, refined: Refined, known: Uncertainty, allows: Allows = all_allowed
+) -> SplitHalf:
     """Refine two halves of the windows alone and compare with ``refined``; the latency stays.
 
     Parameters that ``known`` calls unidentified are not compared.
@@ -287,7 +306,7 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
     if windows < SETTINGS.fewest_windows:
         return SplitHalf(note=f"{windows} windows are too few to halve: record longer")
     cost = _steps(problem, shooting)
-    if cost > SETTINGS.most_half_steps:
+    if not allows(HALVES, cost):
         return SplitHalf(note=f"left out: it would take {cost:.1g} physics steps")
     before = problem.steps
     block = 1

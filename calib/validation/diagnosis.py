@@ -10,7 +10,7 @@ the residual is large: beside random forces of constant size, it must make the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -30,6 +30,7 @@ from deal_hw.calib.validation.wider_models import (
     WiderFit,
     fit_wider,
     gain_of,
+    wider_cost,
     zero_parameters,
 )
 from deal_hw.calibration import Alarm, listed, percent
@@ -48,6 +49,9 @@ class DiagnosisSettings:
         most: Most named causes.
         alike: Least explained share of a named body's mass, relative to the best one's [-].
         decisive: Share explained by play from which other causes are searched only after its repair [-].
+        poor: Chi2 that a cause may leave without explaining the share ``decisive`` [-]. Effects are computed
+            around the fit. Where most of a residual of three times the noise stays unexplained, the fit is
+            not the robot, and what remains can look like any cause.
         most_play: Widest play, as a share of the commands' span [-].
         least_play: Least play of a named joint, as a share of the widest one [-].
         sure: Least value of a named parameter that is 0 in the model, in its standard deviations [-].
@@ -57,6 +61,7 @@ class DiagnosisSettings:
         burst_share: hold at least this share of the squared residual [-],
         burst_kurtosis: and have at least this kurtosis (noise: 3).
         burst_size: Least squared residual of a burst over the median [-].
+        burst_left: Chi2 that bursts may leave: twice the noise [-].
     """
 
     folds: int = 4
@@ -65,6 +70,7 @@ class DiagnosisSettings:
     most: int = 3
     alike: float = 0.8
     decisive: float = 0.5
+    poor: float = 9.0
     most_play: float = 0.5
     least_play: float = 0.2
     sure: float = 5.0
@@ -74,9 +80,23 @@ class DiagnosisSettings:
     burst_share: float = 0.4
     burst_kurtosis: float = 8.0
     burst_size: float = 40.0
+    burst_left: float = 4.0
 
 
 SETTINGS = DiagnosisSettings()
+
+Allows = Callable[[str, float], bool]
+"""Whether a check, by name, may run that takes at most so many physics steps."""
+
+PLAY = "play in the gears"
+ZEROS = "what is 0 in the model"
+"""Names of checks."""
+
+
+def all_allowed(name: str, steps: float) -> bool:
+    """Allow every check."""
+    del name, steps
+    return True
 
 
 ZERO_CAUSES: Mapping[str, Cause] = {
@@ -250,19 +270,41 @@ class Evidence:
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
-def diagnose(problem: Problem, refined: Refined, fitted: WiderFit | None = None) -> tuple[Diagnosis, ...]:
+def diagnose(
+    problem: Problem,
+    refined: Refined,
+    fitted: WiderFit | None = None,
+    allows: Allows = all_allowed,
+) -> tuple[Diagnosis, ...]:
     """Return the causes of a fit's residual, best supported first; the fit has linearised residuals.
 
-    ``fitted`` is a fit with play, if there is one of this problem.
+    Args:
+        problem: The problem.
+        refined: Its fit.
+        fitted: A fit with play, if there is one of this problem.
+        allows: Which fits of wider models may be made.
     """
-    found_play = find_play(problem, refined, fitted)
-    wider = [found_play.diagnosis] if found_play is not None else []
+    wider: list[Diagnosis] = []
+    if may_have_play(problem) and allows(
+        PLAY, wider_cost(problem, fitted is None or fitted.of is not problem)
+    ):
+        found_play = find_play(problem, refined, fitted)
+        wider += [] if found_play is None else [found_play.diagnosis]
     if not any(one.share >= SETTINGS.decisive for one in wider):
-        wider += find_zero(problem, refined)
+        more = [] if problem.noise_free else zero_parameters(problem)
+        if more and allows(ZEROS, wider_cost(problem, True)):
+            wider += find_zero(problem, refined, more)
     decisive = [one for one in wider if one.share >= SETTINGS.decisive]
     if decisive:
         return tuple(decisive)
-    return tuple(sorted((*name_causes(evidence(problem, refined)), *wider), key=lambda f: -f.deviance))
+    wider = [one for one in wider if supported(one.share, refined.chi2)]
+    found = name_causes(evidence(problem, refined), refined.chi2)
+    return tuple(sorted((*found, *wider), key=lambda f: -f.deviance))
+
+
+def supported(share: float, chi2: float) -> bool:
+    """Return whether a cause that explains a share of a residual is more than an accident of a poor fit."""
+    return share >= SETTINGS.decisive or chi2 * (1 - share) <= SETTINGS.poor
 
 
 def evidence(problem: Problem, refined: Refined) -> Evidence:
@@ -287,11 +329,17 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
     )
 
 
+def may_have_play(problem: Problem) -> bool:
+    """Return whether a model with play in the gears can be fitted: to servos on a fixed base."""
+    known = any(p.kind == "servo_play" for p in problem.space.parameters)
+    fixed = problem.robot.base is None and not problem.noise_free
+    return problem.robot.description.actuation == "position" and fixed and not known
+
+
 def fit_play(problem: Problem) -> WiderFit | None:
     """Fit a model with play in every gear to a part of the recordings; None where it cannot be fitted."""
     description, names = problem.robot.description, problem.robot.actuator_names
-    known = any(p.kind == "servo_play" for p in problem.space.parameters)
-    if description.actuation != "position" or problem.robot.base is not None or problem.noise_free or known:
+    if not may_have_play(problem):
         return None
     span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
     coordinate_units = problem.robot.coordinate_units[problem.robot.joints]
@@ -341,13 +389,12 @@ def find_play(problem: Problem, refined: Refined, fitted: WiderFit | None = None
     return Play(cause, problem.with_more(named), theta, fit.latency_s, wide.prediction.chi2)
 
 
-def find_zero(problem: Problem, refined: Refined) -> list[Diagnosis]:
-    """Compare predictions with the parameters that are 0 in the model, and were not searched, and without.
+def find_zero(problem: Problem, refined: Refined, more: Sequence[Parameter]) -> list[Diagnosis]:
+    """Compare predictions with parameters that are 0 in the model, and were not searched, and without.
 
     They come as one cause, that of the parameter which explains most.
     """
-    more = zero_parameters(problem)
-    wide = fit_wider(problem, more) if more and not problem.noise_free else None
+    wide = fit_wider(problem, more)
     gained = None if wide is None else gain_of(wide, refined)
     if wide is None or gained is None:
         return []
@@ -372,8 +419,11 @@ def find_zero(problem: Problem, refined: Refined) -> list[Diagnosis]:
     return [Diagnosis(cause, gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))]
 
 
-def name_causes(known: Evidence) -> list[Diagnosis]:
-    """Return the causes that evidence supports, best first; each is tested together with those before it."""
+def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
+    """Return the causes that evidence supports, best first; each is tested together with those before it.
+
+    ``chi2`` is the fit's. Causes with signatures are :func:`supported` together, or none is named.
+    """
     found: list[Diagnosis] = []
     taken: list[Signature] = []
     groups = _groups(known.found)
@@ -389,11 +439,14 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
         found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
-    varying = _varying_delay(known, taken)
-    if varying is not None:
+    if found and not supported(1 - float(np.prod([1 - one.share for one in found])), chi2):
+        found, taken = [], []
+    left = chi2 * float(np.prod([1 - one.share for one in found]))
+    varying, bursts = _varying_delay(known, taken), _bursts(known, known.residual(taken))
+    if varying is not None and supported(varying.share, left):
         found.append(varying)
-    bursts = _bursts(known, known.residual(taken))
-    if bursts is not None:
+    # Bursts predict nothing, and are chosen for their size. So only what they leave can support them.
+    if bursts is not None and left * (1 - bursts.share) <= SETTINGS.burst_left:
         found.append(bursts)
     return sorted(found, key=lambda f: -f.deviance)
 

@@ -110,6 +110,19 @@ def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
     return WiderFit(problem, more, fit, prediction)
 
 
+def wider_cost(problem: Problem, fits: bool) -> float:
+    """Return about how many physics steps a wider model takes, with its fit or from one.
+
+    Each fit takes about half of its most iterations. The model as it is gets one, too.
+    """
+    total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
+    periods = min(REFINEMENT.local_s, total_s / 2) / problem.robot.step_s
+    # Derivatives by each value and start state, and a line of damped steps.
+    members = 2 + len(problem.space) + 2 * problem.coordinates + 10
+    predictions = total_s / problem.robot.step_s
+    return 6.0 * members * periods * (2 if fits else 1) + 2.0 * predictions
+
+
 def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
     """Return what a wider fit gains over the model as it is; None where that is too little.
 

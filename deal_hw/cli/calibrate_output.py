@@ -178,15 +178,14 @@ def other_alarms(alarms: Sequence[Alarm], width: int, room: int) -> list[str]:
 
     Alarms with the same remedy are one entry. What finds no room is counted, and stands in the report.
     """
-    groups: dict[str, list[str]] = {}
-    for alarm in alarms:
-        groups.setdefault(alarm.do, []).append(alarm.seen)
+    from deal_hw.calib.report.verdict import grouped
+
     lines: list[str] = []
     hidden = 0
-    for seen in groups.values():
-        entry = wrapped(f"alarm: {' '.join(dict.fromkeys(seen))}", width, "")
+    for group in grouped(alarms):
+        entry = wrapped(f"alarm: {' '.join(dict.fromkeys(alarm.seen for alarm in group))}", width, "")
         if hidden or len(lines) + len(entry) + 1 > room:
-            hidden += len(seen)
+            hidden += len(group)
         else:
             lines = entry + lines
     if hidden:

@@ -23,6 +23,7 @@ from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
 from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
 from deal_hw.calib.validation.random_delay import random_delay
+from deal_hw.calib.validation.residual_place import densest_stretch
 from deal_hw.calib.validation.signatures import (
     Cause,
     Signature,
@@ -228,6 +229,47 @@ def test_contact_comes_in_bursts() -> None:
     found = {f.cause: f for f in _named(wrong)}
     assert "contact" in found
     assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].alarm.do
+    # Far above the noise they are a part of what the model lacks.
+    assert not [f for f in name_causes(_evidence(wrong), 1000.0) if f.cause == "contact"]
+
+
+def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:
+    """A load beside four times its square that no cause explains: named near the noise, not far above it."""
+    load = _moved_by(np.full((WINDOWS, SAMPLES), 0.3))
+    strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
+    known = _evidence(load + 2 * np.std(load) / np.std(strange) * strange)
+    assert [f.cause for f in name_causes(known, 5.0)] == ["load"]
+    assert name_causes(known, 100.0) == []
+    # What explains most of it stands, however large it is.
+    assert [f.cause for f in name_causes(_evidence(load), 100.0)] == ["load"]
+
+
+def test_a_residual_without_a_cause_is_placed(small_problem: Callable[..., Problem]) -> None:
+    """A sensor is wrong in a part of the travel: the alarm names these positions, and no cause."""
+    rng = np.random.default_rng(0)
+    position = rng.uniform(-3.0, 3.0, 20_000)
+    power = rng.normal(size=20_000) ** 2 * np.where((position > 0.9) & (position < 1.2), 60.0, 1.0)
+    found = densest_stretch(power, position)
+    # Bins of 6/16: the stretch reaches from 0.75 to 1.5 at most.
+    assert found is not None and 0.7 < found.low < 0.9 and 1.1 < found.high < 1.51
+    assert found.share == pytest.approx(0.05 * 60 / (0.05 * 60 + 0.95), abs=0.05)
+    assert densest_stretch(rng.normal(size=20_000) ** 2, position) is None
+    assert densest_stretch(np.ones(5), np.ones(5)) is None
+
+    problem = small_problem()
+    fit = with_rows(refine(problem, problem.space.nominal, 0.0, (0.2,), iterations=2))
+    (data,), (residual,) = fit.shooting.data, fit.normal.residual
+    cart = problem.measured(data.episode)[data.windows.samples()][..., 0]
+    blind = cart > np.quantile(cart, 0.95)
+    wrong = np.zeros_like(residual)
+    wrong[..., 0] = np.where(blind, 50.0, 1.0)
+    fit = dataclasses.replace(fit, chi2=100.0, normal=dataclasses.replace(fit.normal, residual=(wrong,)))
+    known, causes = with_causes(problem, fit, uncertainty_at(problem, fit), ())
+    assert causes == []
+    seen = known.alarms[0].seen
+    assert "None of the known causes" in seen and "10.0 times" in seen
+    assert "where cart is between" in seen and f"and {cart.max():.2f} m" in seen
+    assert "100 % of its square is in cart" in seen
 
 
 def _with_gaps(known: Evidence, share: float) -> Evidence:
@@ -497,7 +539,7 @@ def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Pa
     fit = with_rows(refine(problem, problem.space.nominal, robot.delay_s, (0.2,), iterations=8))
     assert "pivot.armature" not in problem.space.names and unexplained(fit)
     assert [p.name for p in zero_parameters(problem)] == ["pivot.armature"]
-    (found,) = diagnosis.find_zero(problem, fit)
+    (found,) = diagnosis.find_zero(problem, fit, zero_parameters(problem))
     value = float(re.findall(r"pivot.armature = (\S+) kg", found.alarm.seen)[0])
     assert value == pytest.approx(0.01, rel=0.1)
     assert found.cause == "inertia" and found.joints == ("pivot",) and found.share > 0.5

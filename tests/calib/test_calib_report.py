@@ -208,6 +208,30 @@ def test_the_story_comes_first_then_the_verdict_then_alarms() -> None:
         at = text.index(words, at + 1)
 
 
+def test_alarms_with_one_remedy_are_one_entry() -> None:
+    """Three alarms, two of them with the same remedy and meaning: two entries, each remedy once."""
+    alarms = (
+        Alarm("a jitters", "worn out", "buy one"),
+        Alarm("b sticks", "rust", "oil it"),
+        Alarm("c jitters", "worn out", "buy one"),
+    )
+    text = Tags(render(inputs(result(space(), alarms=alarms)))).text()
+    assert "3 alarms" in text
+    at = [text.index(words) for words in ("a jitters", "c jitters", "buy one", "b sticks", "oil it")]
+    assert at == sorted(at)
+    assert text.count("buy one") == 1 and text.count("worn out") == 1
+
+
+def test_values_that_a_named_cause_moves_are_marked() -> None:
+    """In the row of the parameter and beside the latency, with the cause; nowhere else."""
+    plain, biased = (
+        Tags(render(inputs(result(space(), biased=causes)))).text()
+        for causes in ({}, {"p1": "damping", "latency": "delay"})
+    )
+    assert "biased by" not in plain
+    assert biased.count("biased by damping") == 1 and biased.count("biased by delay") == 1
+
+
 def test_every_panel_names_recording_unit_and_lines() -> None:
     """Titles are files; axes have units and ticks; a legend names what is drawn before the first panel."""
     found = inputs(result(space()))

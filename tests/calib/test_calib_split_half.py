@@ -11,8 +11,13 @@ from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.checks import (
+    HALVES,
     SplitHalf,
     Validation,
     agreement,
@@ -21,7 +26,7 @@ from deal_hw.calib.validation.checks import (
     judge,
     widened_by_split_half,
 )
-from deal_hw.calibration import BEFORE_SEARCH, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Budget, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 from deal_hw.types import FloatArray
 
@@ -152,3 +157,60 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
             [space.unnormalize(np.full(len(space), u))[k] for u in (0.05, 0.95)]
         )
         assert known.interval[k, 0] <= theta[k] <= known.interval[k, 1]
+
+
+def test_checks_take_no_more_steps_than_the_fits(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """What fits in runs and is counted; what does not is named, unless all checks are asked for."""
+    rng = np.random.default_rng(0)
+    problem = noisy_problem
+    run = CalibrationRun(
+        problem=problem,
+        budget=Budget(population=20, generations=4),
+        rng=rng,
+        attempts=Restarts(Eki(), rng, None),
+        settings=Validation(diagnosis=False),
+        first_steps=problem.steps,
+    )
+    shooting, K = noisy_refined.shooting, len(problem.space)
+    shooting.residuals(dataclasses.replace(noisy_refined.point))
+    fits = problem.steps - run.first_steps
+    assert run.fit_steps == fits > 0 and run.allows("a", fits) and not run.allows("b", fits + 1)
+    assert list(run.left_out) == ["b"]
+    with run.check("a"):
+        shooting.residuals(dataclasses.replace(noisy_refined.point))
+        # A check that is running counts already.
+        assert run.fit_steps == fits and run.check_steps_left == 0 and not run.allows("c", 1)
+    assert run.checks == {"a": fits} and run.check_steps_left == 0
+    # Searches of an earlier process are fits, so that a resumed run makes the same checks.
+    run.attempts.earlier_steps = 1000
+    assert run.fit_steps == fits + 1000 and run.allows("d", 1000)
+
+    known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
+    run.attempts.earlier_steps = 0
+    with run.check(AFTER_FIT):
+        kept, facts = judge(problem, noisy_refined, known, run.settings, allows=run.allows)
+    assert "left out" in facts["split_half"]["note"] and HALVES in run.left_out
+    assert len(kept.verdicts) == K
+    thorough = dataclasses.replace(run, settings=Validation(thorough=True))
+    assert thorough.allows(HALVES, 1e12)
+
+
+def test_causes_come_before_halves(
+    noisy_problem: Problem, noisy_refined: Refined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They say what to do, so they are asked for first; what is refused is not simulated."""
+    asked: list[str] = []
+
+    def refuse(name: str, steps: float) -> bool:
+        assert steps > 0
+        asked.append(name)
+        return False
+
+    for wider in ("fit_play", "fit_wider"):
+        monkeypatch.setattr(diagnosis, wider, lambda *_: pytest.fail("a wider model was fitted"))
+    wrong = dataclasses.replace(noisy_refined, chi2=5.0)
+    known = uncertainty_at(noisy_problem, wrong, fixed_latency=True)
+    settings = Validation(physics_step=False)
+    _, facts = judge(noisy_problem, wrong, known, settings, allows=refuse)
+    assert asked[-1] == HALVES and len(asked) > 1
+    assert "diagnosis" in facts and "left out" in facts["split_half"]["note"]
