@@ -20,9 +20,10 @@ from deal_hw.calib.fit.command_delays import (
     with_command_delays,
 )
 from deal_hw.calib.fit.intervals import MISMATCH, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import refine
-from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.validation.random_delay import fit_delays
+from deal_hw.calib.validation.signatures import signatures
 from deal_hw.drivers.cartpole.profiles import PROFILES
 from deal_hw.parameters import Parameter
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -145,6 +146,24 @@ def test_commands_move_to_their_likeliest_delay(noisy: Case, noisy_problem: Prob
     alone = _numbers(problem, data, columns.shape[2]) == late
     by = 0.004 * np.einsum("wdp,wp->wd", columns, alone).reshape(data.measured.shape)
     np.testing.assert_allclose(around.measured, data.measured + by * data.std, atol=1e-12)
+
+
+def test_a_cause_is_whitened_as_the_residual_is(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """Its effect times (1 + s^2 D D^T)^-1/2; otherwise a diagnosis looks for friction where there is none."""
+    plain, problem = noisy_refined, noisy_problem
+    delays = CommandDelays(DELAY_S, plain.theta, plain.latency_s, ({},))
+    delayed = problem.with_command_delays(delays)
+    fit = dataclasses.replace(plain, shooting=Shooting(delayed, plain.shooting.length))
+    (data,) = plain.shooting.data
+    columns = delay_columns(problem, plain.theta, plain.latency_s, data)
+    assert columns is not None
+    size, axes = np.linalg.eigh(DELAY_S**2 * columns @ np.swapaxes(columns, 1, 2))
+    W = (axes / np.sqrt(1 + np.maximum(size, 0.0))[:, None]) @ np.swapaxes(axes, 1, 2)
+    before, after = signatures(problem, plain), signatures(delayed, fit)
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_allclose(other.columns[0], W @ one.columns[0], atol=1e-6, err_msg=one.cause)
+    changed = [not np.allclose(a.columns[0], b.columns[0]) for a, b in zip(before, after, strict=True)]
+    assert "friction" in {a.cause for a, c in zip(before, changed, strict=True) if c}
 
 
 @pytest.fixture(scope="module")
