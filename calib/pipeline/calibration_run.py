@@ -15,7 +15,6 @@ from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
-from deal_hw.calib.validation.random_delay import DelayFit
 from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.types import FloatArray
@@ -69,7 +68,6 @@ class CalibrationRun:
         settings: Which checks to run.
         local: The local fit, if there is one.
         play: The fit with play in the gears, if there is one.
-        late: The fit with random delays of commands, if there is one; then the problem has them.
         progress: Receives progress reports.
         first_steps: Physics steps of the problem before this calibration.
         checks: Physics steps of each check so far, by its name.
@@ -83,7 +81,6 @@ class CalibrationRun:
     settings: Validation
     local: Refined | None = None
     play: WiderFit | None = None
-    late: DelayFit | None = None
     progress: ProgressCallback | None = None
     first_steps: int = 0
     checks: dict[str, int] = field(default_factory=dict)

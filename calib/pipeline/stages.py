@@ -170,10 +170,6 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             run.say(BEFORE_SEARCH, DIVERGED)
         # Another minimum can leave a residual as small as noise, but with a pattern.
         white = local is not None and conclusive(problem, local, MISMATCH.white_samples)
-        if local is not None and not white and (late := fit_delays(problem, local, MISMATCH.evidence)):
-            problem, local = late.problem, late.fit
-            run = dataclasses.replace(run, problem=problem, late=late)
-            white = conclusive(problem, local, MISMATCH.white_samples)
         if local is not None and not white and conclusive(problem, local):
             local = lower_minimum(run, local, RESTARTS) or local
             white = conclusive(problem, local)
@@ -346,12 +342,13 @@ def conclude_fit(
     ``searched`` is the search's result; None where the fit needed no search. ``choice`` is that of
     cross-validation, if it ran.
     """
-    late, scan, whole = run.late, None, None
+    late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
     if choice is not None and choice.chosen == "search":
         length, states = refined.shooting.length, refined.shooting.states(refined.point)
         refined = at_parameters(run.problem, searched.estimate, searched.latency_s, length, states)
-    elif late is None and unexplained(refined, MISMATCH.white_samples):
+    elif unexplained(refined, MISMATCH.white_samples):
+        # Not before: in another minimum delays seem to explain what no parameters there do.
         late = fit_delays(run.problem, refined, MISMATCH.evidence)
         refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem

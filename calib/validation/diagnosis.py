@@ -172,7 +172,8 @@ class Evidence:
         rows: Linearised residuals, per episode.
         prior: Information on the parameters and the latency, (P,).
         found: Signatures of the causes.
-        answers: Responses of the windows to commands, per episode; empty if unknown.
+        answers: Responses of the windows to commands, per episode; empty if unknown, or if each command's
+            delay was an unknown of the fit.
         period_s: Sampling period [s].
         time_s: Time of each sample in its recording, per episode (W, H) [s].
         names: Names of the recordings, per episode.
@@ -318,7 +319,7 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
         rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
         prior=1 / width**2,
         found=signatures(problem, refined),
-        answers=answers(problem, refined),
+        answers=answers(problem, refined) if problem.command_delays is None else [],
         period_s=problem.episodes[0].period_s,
         time_s=[
             np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)

@@ -173,10 +173,10 @@ def _offset(problem: Problem, data: WindowData, velocity: FloatArray, c: int, sp
     A gear in which friction decides on which side of the play the joint lies shows it.
     """
     seen = np.flatnonzero(problem.channels == c)
-    offset = np.zeros((*data.measured.shape, 1))
+    offset = np.zeros(data.measured.shape)
     moving = held_direction(velocity[data.windows.samples()][..., c], speed)
-    offset[:, :, seen, 0] = (moving[..., None] / data.std[:, :, seen]) * problem.noise_std[c]
-    return offset.reshape(len(offset), -1, 1)
+    offset[:, :, seen] = moving[..., None] * problem.noise_std[c]
+    return data.whitened(offset).reshape(len(offset), -1, 1)
 
 
 def _crossing(
@@ -264,8 +264,8 @@ def _predict(
 
 def _changes(observed: FloatArray, data: WindowData) -> FloatArray:
     """Return the whitened differences of members from the first, (1 + n, W, H, M), as (n, W, H M)."""
-    found = np.nan_to_num((observed[1:] - observed[:1]) / data.std, nan=0.0, posinf=0.0, neginf=0.0)
-    return np.asarray(found.reshape(*found.shape[:2], -1))
+    change = np.nan_to_num(observed[1:] - observed[:1], nan=0.0, posinf=0.0, neginf=0.0)
+    return data.whitened(change).reshape(*change.shape[:2], -1)
 
 
 def _along(problem: Problem, data: WindowData, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
