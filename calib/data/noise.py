@@ -88,8 +88,8 @@ class DataSettings:
 
 SETTINGS = DataSettings()
 REST = 24
-"""Steps of one value above which a joint is at rest [-]. In fewer, a slow motion passes a count of its encoder:
-that is rounding, which counts as noise."""
+"""Steps of one value above which a joint is at rest [-]. In fewer, a slow motion passes a count of its
+encoder: that is rounding, which counts as noise."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -149,7 +149,7 @@ def test_commands_move_to_their_likeliest_delay(noisy: Case, noisy_problem: Prob
 
 
 def test_a_fit_of_a_part_is_judged_by_that_part(noisy: Case, noisy_problem: Problem) -> None:
-    """A local fit that explains nothing ends after a part of the recordings: other windows than all of them."""
+    """A local fit that explains nothing ends after a part of the recordings, with that part's windows."""
     usable = [np.arange(len(e.sample)) < len(e.sample) // 2 for e in noisy_problem.episodes]
     found = refine(noisy_problem.part(usable), noisy.theta, noisy.latency_s, (0.2,), 1)
     assert fit_delays(noisy_problem, found, MISMATCH.evidence) is None

@@ -456,7 +456,7 @@ def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Trut
     assert found[0].cause == "mass" and "fore" in found[0].joints
     assert "Weigh" in found[0].alarm.do and "heavier" in found[0].alarm.seen
     known = uncertainty_at(problem, fit, fixed_latency=False)
-    assert known.alarms and with_causes(problem, fit, known)[0].alarms[0] == found[0].alarm
+    assert known.alarms and with_causes(problem, fit, known, found)[0].alarms[0] == found[0].alarm
 
 
 def test_another_minimum_is_no_play(truth: Callable[[str, Fault | None], Truth]) -> None:

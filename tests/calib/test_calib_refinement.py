@@ -302,7 +302,7 @@ def test_a_joint_at_rest_has_no_vote() -> None:
     assert white_noise_std([held, moved])[0] == found
     assert white_noise_std([_encoder(10.0, rest_s=60.0)])[0] == pytest.approx(found, rel=0.1)
     # Alone it shows nothing: it has the noise of a coarse encoder.
-    assert white_noise_std([held])[0] == DataSettings.held_std
+    assert white_noise_std([held])[0] == DataSettings().held_std
 
 
 def test_timing_jitter_is_told_from_noise() -> None:
