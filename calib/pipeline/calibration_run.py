@@ -114,6 +114,11 @@ class CalibrationRun:
         """Physics steps that checks may take: together no more than the fits."""
         return self.fit_steps - self.check_steps
 
+    @property
+    def search_steps(self) -> int:
+        """Physics steps of a search to its budget's end, at one a device period."""
+        return self.budget.population * self.budget.generations * sum(e.steps for e in self.problem.episodes)
+
     def allows(self, name: str, steps: float) -> bool:
         """Return whether a check that takes at most so many steps fits in; one that does not is noted."""
         if self.settings.thorough or steps <= self.check_steps_left:

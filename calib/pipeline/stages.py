@@ -195,7 +195,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             "search_estimate": dict(zip(searched.space.names, map(float, searched.estimate), strict=True)),
             "search_latency_s": searched.latency_s,
             **found.facts,
-            "physics_steps": {"fits": run.fit_steps + attempts.earlier_steps, **run.checks},
+            "physics_steps": {"fits": run.fit_steps, **run.checks},
         }
         if run.left_out:
             provenance["checks_left_out"] = dict(run.left_out)
@@ -459,7 +459,8 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     asked = run.settings.diagnosis and run.settings.local_first
     if not asked or (local is not None and not unexplained(local, MISMATCH.white_samples)):
         return fits.best(run)
-    most = math.inf if run.settings.thorough else run.check_steps_left
+    # The search that follows is a part of the fits.
+    most = math.inf if run.settings.thorough else run.check_steps_left + run.search_steps
     with run.check(SHARED_ERRORS):
         checked = find_shared_error(problem, local, partial(run.say, SHARED_ERRORS, ""), most)
     suspect = checked.found

@@ -201,6 +201,8 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
         budget=Budget(population=8, generations=2),
         rng=np.random.default_rng(0),
         threads=1,
+        # So brief a search would leave this check no steps.
+        thorough=True,
         progress=said.append,
     )
     assert any("the clock were 2 times too fast" in p.message for p in said)
