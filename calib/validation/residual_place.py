@@ -56,10 +56,12 @@ class Stretch:
 
 def unexplained_alarm(problem: Problem, refined: Refined) -> Alarm:
     """Return the alarm of a residual that none of the known causes explains, with the place where it lies."""
-    place = residual_place(problem, refined)
+    seen = (
+        f"None of the known causes explains the residual, which is {np.sqrt(refined.chi2):.1f} times the "
+        f"sensor's noise. {residual_place(problem, refined)}"
+    )
     return Alarm(
-        f"{place} None of the known causes explains this residual, which is {np.sqrt(refined.chi2):.1f} times "
-        "the sensor's noise.",
+        seen,
         "The model lacks something, or a sensor is wrong there: blind or bent in a part of its range, or "
         "with another scale.",
         "Plot the measured positions there, and check the sensor's scale against a known angle or length. "
