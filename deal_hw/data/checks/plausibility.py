@@ -79,8 +79,8 @@ def examine(
     if not table.command_s.size or not table.actuated:
         return (*first, *middle)
     units = _units(table, limits)
-    # Positions in a wrong unit also lie far from commands and outside the limits: no other cause.
-    comparable = units.severity is not Severity.FAIL
+    # Positions in another unit than commands also lie far from them and outside the limits: no other cause.
+    comparable = _OTHER_UNIT not in units.message
     return (
         *first,
         *middle,
@@ -323,6 +323,8 @@ def _slip(table: Table) -> CheckResult:
     )
 
 
+_OTHER_UNIT = "range is about"
+"""In the message of a joint whose positions and commands have different units."""
 _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
 
 
@@ -338,7 +340,7 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
             continue
         ratio = spans[0] / spans[1]
         factors = [
-            (f"the {larger}'s range is about {factor:.3g} times the {smaller}'s", factor)
+            (f"the {larger}'s {_OTHER_UNIT} {factor:.3g} times the {smaller}'s", factor)
             for factor in _FACTORS
             for larger, smaller, share in (
                 ("command", "measurement", ratio / factor),
