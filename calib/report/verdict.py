@@ -68,6 +68,17 @@ def trust(result: CalibrationResult) -> Trust:
             "The calibrated model is worse.",
             "Do not use it. Check units, signs and joint order of the recordings, then the alarms.",
         )
+    elif calibrated * WORSE >= nominal:
+        record = ""
+        error = calibration.percent(calibrated)
+        gain = f"On held-out motion the model errs by {error} of the signal's range, as yours."
+        if mismatch:
+            return Trust(
+                "red",
+                f"{gain} {noise}",
+                "The model predicts no better than yours, and it lacks something that the robot has.",
+                "Keep your own model until that is found." + _first_cause(result),
+            )
     else:
         record = ""
         smaller = nominal / max(calibrated, 1e-300)
@@ -77,8 +88,7 @@ def trust(result: CalibrationResult) -> Trust:
             "amber",
             f"{gain} {noise}",
             "The model is better than yours, but it lacks something that the robot has.",
-            "Use it, but trust predictions more than single values."
-            + (" The first alarm names the likely cause." if result.provenance.get("diagnosis") else ""),
+            "Use it, but trust predictions more than single values." + _first_cause(result),
         )
     if result.alarms:
         many = len(result.alarms)
@@ -119,6 +129,11 @@ def trust(result: CalibrationResult) -> Trust:
             "amber", f"{gain} {noise}", "No recording shows whether the model holds on other motion.", record
         )
     return Trust("green", f"{gain} {noise}", "The remaining error is the sensor's noise.", "Use it.")
+
+
+def _first_cause(result: CalibrationResult) -> str:
+    """Return where a cause stands, if one was named."""
+    return " The first alarm names the likely cause." if result.provenance.get("diagnosis") else ""
 
 
 def grouped(alarms: Sequence[Alarm]) -> list[list[Alarm]]:

@@ -295,7 +295,9 @@ HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
     [
         ({}, "green", "6.0 times smaller"),
         # 2 % worse than nominal is chance, more is not; what is not a number is worse, too.
-        ({"heldout_nrmse": {**HELD, "calibrated": 0.0611}}, "green", "1.0 times smaller"),
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.0611}}, "green", "6.1 % of the signal's range, as yours"),
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.0589}, "chi2": 4.0}, "red", "no better than yours"),
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.0588}, "chi2": 4.0}, "amber", "better than yours"),
         ({"heldout_nrmse": {**HELD, "calibrated": 0.0613}}, "red", "6.1 % of the signal's range"),
         ({"heldout_nrmse": {**HELD, "calibrated": float("nan")}}, "red", "model is worse"),
         ({"heldout_nrmse": {**HELD, "calibrated": 0.07}, "chi2": 4.0}, "red", "model is worse"),
