@@ -31,7 +31,7 @@ from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutErro
 from deal_hw.types import FloatArray
 
 GRAVITY_M_S2: Final = 9.81
-_PATIENCE_S: Final = 3.0
+PATIENCE_S: Final = 3.0
 """Longest wait until the robot is still [s]."""
 
 
@@ -258,7 +258,7 @@ class SupportGuard:
         """
         if self._config is None:
             return
-        deadline_ns = self._clock.now_ns() + round(_PATIENCE_S * 1e9)
+        deadline_ns = self._clock.now_ns() + round(PATIENCE_S * 1e9)
         while (found := self._read(self._config)).support is not self._expected:
             if found.support is not Support.UNDECIDED or self._clock.now_ns() >= deadline_ns:
                 raise SafetyError(self._refusal(found))

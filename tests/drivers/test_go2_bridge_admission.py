@@ -15,11 +15,14 @@ from hypothesis import strategies as st
 from deal_hw.drivers.go2.bridge.admission import Admission, Control
 from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits, is_damping
+from deal_hw.drivers.go2.bridge.robot_side import ASK_NS, RobotSide
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, encode_request
 from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
+from deal_hw.drivers.go2.support import PATIENCE_S
+from deal_hw.drivers.go2.takeover import LISTEN_S, RELEASE_PAUSE_S
 from deal_hw.drivers.transports.zenoh_stamps import Echo, Stamp
 from deal_hw.errors import ConfigurationError
 from deal_hw.transport import Message
@@ -444,3 +447,25 @@ def test_whatever_comes_the_rules_hold(
         if passed:
             holder, last_ns, stiff = stream, bench.now_ns, kind == "hold"
         bench.sequence[stream] = max(bench.sequence[stream], newest)
+
+
+def test_a_program_that_releases_a_mode_has_time_to_command() -> None:
+    """Between release and first command deal-hw's driver pauses and listens; damping would make it refuse."""
+    needs_s = RELEASE_PAUSE_S + LISTEN_S + PATIENCE_S
+    side, asked_ns = RobotSide(), 10**12
+    assert side.to_ask(asked_ns)
+    side.answered("normal")
+    side.commanded(asked_ns)  # by the mode itself
+    times = range(asked_ns + ASK_NS, asked_ns + 7 * 10**9, ASK_NS)
+    deserted = []
+    for now_ns in times:
+        assert side.to_ask(now_ns)
+        side.answered("")
+        if side.deserted(now_ns):
+            deserted.append(now_ns - asked_ns)
+    assert needs_s < deserted[0] * 1e-9 <= 5.0
+    side.commanded(times[-1])
+    assert not side.deserted(times[-1] + ASK_NS - MS)
+    assert side.to_ask(times[-1] + ASK_NS)
+    side.answered("")
+    assert side.deserted(times[-1] + ASK_NS), "after its last command it has 0.5 s, not 5"

@@ -96,7 +96,7 @@ class World:
 
         held = (b._stiff, age(b._last_ns, 10**9)) if b.control is Control.CONTROLLED else None
         longest_ns = robot_side.HAND_BACK_NS + STEP_NS
-        known = (side.mode, side._fresh, side._handed, age(side._quiet_ns, longest_ns))
+        known = (side.mode, side._fresh, side._patience_ns, age(side._quiet_ns, longest_ns))
         world = (self.mode, age(self.foreign_ns, SILENCE_NS), self.damped, self.states, self.doubt)
         idle = known if b.control is Control.IDLE else None
         return b.control, held, idle, age(side._asked_ns, ASK_NS), world, self.alone_ns // STEP_NS
@@ -195,33 +195,37 @@ def starts() -> list[World]:
 
 
 @pytest.fixture(autouse=True)
-def short_hand_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mode has 1.5 s to take the robot: the same decisions in fewer states."""
+def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program has 1 s and a mode 1.5 s to take the robot: the same decisions in fewer states."""
+    monkeypatch.setattr(robot_side, "TAKE_OVER_NS", 4 * STEP_NS)
     monkeypatch.setattr(robot_side, "HAND_BACK_NS", 6 * STEP_NS)
 
 
-def longest(found: Iterable[World], *, handed: bool) -> int:
-    """Return the longest time alone in any state, after a hand-back that no mode took, or else [ns]."""
-    return max(w.alone_ns for w in found if w.bridge.robot_side._handed is handed)
+def longest(found: Iterable[World], patience_ns: int) -> int:
+    """Return the longest time alone in any state in which the bridge waits so long for a commander [ns]."""
+    return max(w.alone_ns for w in found if w.bridge.robot_side._patience_ns == patience_ns)
 
 
 def test_no_state_leaves_the_robot_alone_while_the_switcher_answers() -> None:
     """At most the time between two questions, and the step in which the silence ends."""
     found = reachable(starts(), (event for event in EVENTS if event != "states stop"))
     assert {world.bridge.control for world in found.values()} == set(Control)
-    assert 0 < longest(found.values(), handed=False) <= ASK_NS + STEP_NS
-    assert longest(found.values(), handed=True) <= robot_side.HAND_BACK_NS
+    assert longest(found.values(), SILENCE_NS) <= ASK_NS + STEP_NS
+    assert ASK_NS < longest(found.values(), robot_side.TAKE_OVER_NS) <= robot_side.TAKE_OVER_NS + STEP_NS
+    assert longest(found.values(), robot_side.HAND_BACK_NS) <= robot_side.HAND_BACK_NS
 
 
 def test_no_state_leaves_the_robot_alone_when_answers_are_lost() -> None:
     """Any of them, and for good when states stop: what was known before counts after two seconds more."""
     found = reachable(starts(), (*EVENTS, UNANSWERED))
-    assert ASK_NS < longest(found.values(), handed=False) <= robot_side.ANSWER_NS + STEP_NS
-    assert longest(found.values(), handed=True) <= robot_side.HAND_BACK_NS + robot_side.ANSWER_NS
+    lost_ns = robot_side.ANSWER_NS
+    assert ASK_NS < longest(found.values(), SILENCE_NS) <= lost_ns + STEP_NS
+    assert longest(found.values(), robot_side.TAKE_OVER_NS) <= robot_side.TAKE_OVER_NS + lost_ns + STEP_NS
+    assert longest(found.values(), robot_side.HAND_BACK_NS) <= robot_side.HAND_BACK_NS + lost_ns
 
 
 def test_the_exploration_finds_a_bridge_that_lets_go(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that never takes charge again, as before: the robot is alone for as long as it is followed."""
     monkeypatch.setattr(robot_side.RobotSide, "deserted", lambda self, now_ns: "")
     found = reachable(starts(), (ANSWERED, "controller damps", "foreign command"))
-    assert longest(found.values(), handed=False) == 20 * STEP_NS
+    assert longest(found.values(), SILENCE_NS) == 20 * STEP_NS

@@ -177,9 +177,27 @@ def test_it_takes_charge_once_sport_mode_is_released(make_bench: Callable[[str],
     bench.run(3000)
     assert bench.go2.heard == []
     bench.go2.mode = ""
+    bench.run(4900)
+    assert bench.go2.heard == []
     bench.run(1100)
     assert bench.bridge.admission.control is Control.DAMPING
     assert kinds(bench.go2)[-1] is False
+
+
+def test_it_does_not_disturb_a_run_on_the_robots_own_network(make_bench: Callable[[str], Bench]) -> None:
+    """The run releases sport mode, listens, and then commands; once it has ended, the bridge damps."""
+    bench = make_bench("normal")
+    bench.bridge.open()
+    for k in range(500):
+        bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.002 * k)  # by sport mode itself
+    bench.run(1000)
+    bench.go2.mode = ""
+    for k in range(500):
+        bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=4.5 + 0.002 * k)
+    bench.run(5500)
+    assert kinds(bench.go2) == [True] * 1000
+    bench.run(1100)
+    assert bench.status() == "damping"
 
 
 def test_it_leaves_a_robot_alone_that_another_program_gave_to_sport_mode(
