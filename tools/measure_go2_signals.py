@@ -130,7 +130,16 @@ CASES = (
         seconds=20.0,
         wires=("zenoh",),
     ),
-    Case(name=IDLE, act=hang_up_bridge, phases=(RUNNING,), expect="goes on", codes=(0,), wires=("dds",)),
+    # With sport mode on: a bridge damps a robot that nobody has, and then no run on its side can begin.
+    Case(
+        name=IDLE,
+        act=hang_up_bridge,
+        phases=(RUNNING,),
+        expect="goes on",
+        codes=(0,),
+        wires=("dds",),
+        emulator=("--start", "standing"),
+    ),
     *_each(),
 )
 TITLE = "Go2: signals to the programs that command it"
