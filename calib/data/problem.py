@@ -87,6 +87,12 @@ class WindowData:
         """Which samples were measured, (W, H, M); the others filled a gap."""
         return np.asarray(np.isfinite(self.std))
 
+    @property
+    def freedom(self) -> IntArray:
+        """Measurements minus unknowns of the start state, (W,); priors that count are measurements."""
+        priors = np.sum(np.isfinite(self.prior_std) & self.prior_counts, axis=1)
+        return np.asarray(np.sum(self.reported, axis=(1, 2)) + priors - self.prior_mean.shape[1])
+
 
 @dataclass(frozen=True, slots=True)
 class CommandDelays:

@@ -16,7 +16,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
-from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, solve
+from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, restarted, solve
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -246,6 +246,7 @@ def at_parameters(
         normal = shooting.normal(point)
     else:
         point, normal = converged(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
+        point, normal = restarted(shooting, point, normal)
     return dataclasses.replace(_refined(shooting, point, normal, 0), theta=theta, latency_s=latency_s)
 
 

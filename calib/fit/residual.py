@@ -211,8 +211,11 @@ class Shooting:
         """Return the smoothed states of all episodes."""
         return [(s.position, s.velocity) for s in self.problem.starts]
 
-    def states(self, point: Point) -> States:
-        """Return the fitted states at every sample of every episode; smoothed ones outside the windows."""
+    def states(self, point: Point, *, handed_on: bool = False) -> States:
+        """Return the fitted states at every sample of every episode; smoothed ones outside the windows.
+
+        Where one window ends and the next starts, the start state counts, or, ``handed_on``, the prediction.
+        """
         found = [(x.copy(), v.copy()) for x, v in self.smoothed()]
         for e, data in enumerate(self.data):
             x, v = found[data.episode]
@@ -220,8 +223,9 @@ class Shooting:
             predicted = self._predict(point.value[None], data, start_x, start_v)
             x[data.windows.start], v[data.windows.start] = point.position[e], point.velocity[e]
             # The last sample of a window is the start of the next, where it has a state of its own.
-            inner = data.windows.samples()[:, :-1]
-            x[inner], v[inner] = predicted.position[0, :, :-1], predicted.velocity[0, :, :-1]
+            last = self.length if handed_on else self.length - 1
+            inner = data.windows.samples()[:, :last]
+            x[inner], v[inner] = predicted.position[0, :, :last], predicted.velocity[0, :, :last]
         return found
 
     def theta(self, point: Point) -> FloatArray:
@@ -282,8 +286,8 @@ class Shooting:
             hessian += np.einsum("wri,wrj->ij", jp, jp)
             gradient += np.einsum("wri,wr->i", jp, r_flat)
             cost += float(np.sum(r_flat**2))
-            count += int(np.count_nonzero(data.reported))
             if self.given:
+                count += int(np.count_nonzero(data.reported))
                 back.append((np.zeros((W, 2 * C, K + 1)), np.zeros((W, 2 * C))))
                 if keep:
                     rows.append(WindowRows(r_flat, jp, js))
@@ -300,7 +304,7 @@ class Shooting:
             hessian -= np.einsum("wsi,wsj->ij", msp, solved[..., :-1])
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
-            count += int((np.isfinite(data.prior_std) & data.prior_counts).sum()) - W * 2 * C
+            count += int(np.sum(data.freedom))
         found = tuple(residuals), self.prior_information, tuple(back), tuple(rows)
         return Normal(cost, count, hessian, gradient, *found)
 

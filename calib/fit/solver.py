@@ -18,9 +18,10 @@ from typing import Protocol
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.stats import chi2 as chi2_law
 
-from deal_hw.calib.data.noise import MAD_TO_STD, autocorrelations
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
+from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 
@@ -43,6 +44,8 @@ class SolverSettings:
         gain: Relative decrease of the cost below which the solver is not started again.
         hopeless: Mean squared residual above which it is not started again either.
         settled: Relative decrease of the cost below which a step of start states alone is the last.
+        false_restarts: Chance that noise alone puts any window out of line [-].
+        restart_iterations: Most steps of a start state from each other start.
     """
 
     iterations: int = 12
@@ -57,6 +60,8 @@ class SolverSettings:
     gain: float = 3e-3
     hopeless: float = np.inf
     settled: float = 1e-4
+    false_restarts: float = 1e-3
+    restart_iterations: int = 6
 
 
 SOLVER = SolverSettings()
@@ -163,6 +168,7 @@ def solve(
         fit = _Following(shooting, point, normal, notify)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=shooting.fixed_latency)
         point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
+        point, normal = restarted(shooting, point, normal)
         used += max(more, 1)
         gained = normal.cost < before * (1 - settings.gain)
         if used >= settings.iterations or not gained or normal.cost > settings.hopeless * normal.count:
@@ -183,6 +189,45 @@ def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int)
             break
         point, normal = moved, shooting.normal(moved, keep=bool(normal.rows))
     return point, normal
+
+
+def restarted(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, Normal]:
+    """Fit start states out of line again from other starts, without contacts, and keep each window's best.
+
+    While parameters are far off, start states follow them. One that crosses a kink (a velocity that changes
+    its sign against dry friction) can stay behind it: no derivative leads back, and its window bends all
+    parameters. Given the parameters, windows are independent. So a window that fits much worse than the
+    others starts again from the smoothed state, and from where the window before it ends.
+    """
+    chosen = [] if shooting.given else out_of_line(shooting, point)
+    if not any(mine.any() for mine in chosen):
+        return point, normal
+    place = [(e, np.flatnonzero(mine)) for e, mine in enumerate(chosen) if mine.any()]
+    part = shooting.on([taken(shooting.data[e], windows) for e, windows in place])
+    position, velocity = list(point.position), list(point.velocity)
+    for states in (shooting.smoothed(), shooting.states(point, handed_on=True)):
+        start = part.start(shooting.theta(point), float(point.value[-1]), states)
+        tried, _ = converged(part, start, part.normal(start), SOLVER.restart_iterations)
+        here = Point(point.value, *(tuple(s[e][w] for e, w in place) for s in (position, velocity)))
+        costs = zip(part.window_costs(tried), part.window_costs(here), strict=True)
+        for k, ((e, windows), (new, old)) in enumerate(zip(place, costs, strict=True)):
+            lower = new < old * (1 - SOLVER.settled)
+            for states_of, found in ((position, tried.position), (velocity, tried.velocity)):
+                states_of[e] = states_of[e].copy()
+                states_of[e][windows[lower]] = found[k][lower]
+    moved = Point(point.value, tuple(position), tuple(velocity))
+    if not shooting.cost(moved) < normal.cost * (1 - SOLVER.settled):
+        return point, normal
+    return converged(shooting, moved, shooting.normal(moved, keep=bool(normal.rows)), 1)
+
+
+def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
+    """Return which windows fit worse than noise of the others' size would let them, (W,) per episode."""
+    costs = shooting.window_costs(point)
+    freedom = [np.maximum(d.freedom, 1) for d in shooting.data]
+    size = max(float(np.median(np.concatenate([c / f for c, f in zip(costs, freedom, strict=True)]))), 1.0)
+    chance = SOLVER.false_restarts / sum(map(len, costs))
+    return [c > size * chi2_law.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
 
 
 class _Following:

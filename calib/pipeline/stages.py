@@ -50,7 +50,7 @@ from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
-from deal_hw.calib.validation.time_steps import averaged, scan_latency
+from deal_hw.calib.validation.time_steps import STEP, averaged, check_step, halved, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     Alarm,
@@ -173,6 +173,9 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         if local is not None and not white and conclusive(problem, local):
             local = lower_minimum(run, local, RESTARTS) or local
             white = conclusive(problem, local)
+        if local is not None and not white and (finer := with_finer_step(run, local)) is not None:
+            run, local = finer
+            white = True
         if local is not None and white:
             found = conclude_fit(run, None, local)
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
@@ -328,6 +331,35 @@ def lower_minimum(
         return None
     lower = refined_from(run, best.theta, best.latency_s)
     return lower if better(lower, found, settings) else None
+
+
+def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun, Refined] | None:
+    """Return the run with a finer physics step, and its fit, if only noise is left then; otherwise None.
+
+    The error of a step is correlated, as that of a wrong model, and fine encoders show it. Where half the
+    step explains a part of the residual, fits with it come before a search.
+    """
+    problem, fit = run.problem, local
+    if problem.noise_free or not local.chi2 < REFINEMENT.local_hopeless:
+        return None
+    for _ in range(STEP.halvings):
+        step = check_step(problem, with_rows(fit))
+        # Residuals grow with the step, so half of it removes three quarters of what it adds to chi2.
+        if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH.chi2:
+            break
+        problem = halved(problem)
+        window_s = fit.shooting.length * problem.episodes[0].period_s
+        states = fit.shooting.states(fit.point)
+        fit = refine(problem, fit.theta, fit.latency_s, (window_s,), states=states)
+    if problem is run.problem or not conclusive(problem, fit):
+        return None
+    run.offer("local fit", fit)
+    run.say(
+        BEFORE_SEARCH,
+        "the error of the model's physics step shows in these recordings: with "
+        f"{1e3 * problem.robot.step_s:.3g} ms only noise is left, and the fit uses that step",
+    )
+    return dataclasses.replace(run, problem=problem), fit
 
 
 def conclude_fit(

@@ -131,6 +131,8 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         "chi2": result.chi2,
         "seconds": result.seconds,
         "steps": result.steps,
+        "physics_steps": result.provenance.get("physics_steps", {}),
+        "left_out": result.provenance.get("checks_left_out", {}),
         **{f"heldout_nrmse_{name}": value for name, value in result.heldout_nrmse.items()},
         **against_truth(robot, result),
     }

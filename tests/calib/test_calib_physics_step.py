@@ -7,10 +7,16 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.stages import with_finer_step
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.time_steps import (
     STEP,
     StepCheck,
@@ -20,6 +26,8 @@ from deal_hw.calib.validation.time_steps import (
     halved,
     step_alarm,
 )
+from deal_hw.calibration import Budget
+from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -124,3 +132,25 @@ def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:
     finer = halved(problem)
     assert finer.robot.step_s == STEP_S / 2 and problem.robot.step_s == STEP_S
     assert finer.starts is problem.starts and finer.steps == problem.steps > 0
+
+
+def test_a_step_that_fine_encoders_show_is_halved_before_a_search(tmp_path: Path) -> None:
+    """A right model of 2 ms, on a grid of 2.5 ms, beside a robot of 0.25 ms: no search is needed.
+
+    With 2.5 ms chi2 is 1.12, correlated over 4 samples, and play in the gears was named.
+    """
+    model, paths, held_out = write(make_robot("cart-pole", 0, "encoders"), tmp_path, seconds=3.0)
+    recordings = Recordings(model=model, data=tuple(paths))
+    work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    local = local_fit(problem)
+    assert local is not None and local.chi2 > 1.1
+    rng = np.random.default_rng(0)
+    run = CalibrationRun(
+        problem=problem, budget=Budget(), rng=rng, attempts=Restarts(Eki(), rng, None), settings=Validation()
+    )
+    finer = with_finer_step(run, local)
+    assert finer is not None and finer[0].problem.robot.step_s < 0.002
+    assert finer[1].chi2 == pytest.approx(1.0, abs=0.1) and not unexplained(finer[1])
+    # A poor fit has other reasons.
+    assert with_finer_step(run, dataclasses.replace(local, chi2=9.0)) is None

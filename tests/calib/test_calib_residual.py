@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import refine, refine_windows
+from deal_hw.calib.fit.refinement import at_parameters, refine, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.validation.time_steps import scan_latency
+from deal_hw.testing.plain_robots import make_robot, write
+from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 
 def stepped(shooting: Shooting, problem: Problem) -> tuple[Point, Point]:
@@ -61,3 +65,36 @@ def test_a_scan_of_the_latency_ends_where_each_tick_fitted_alone_ends(
         alone = refine_windows(free.shooting.on(free.shooting.data, fixed_latency=True), start, 10)
         assert found.normal.cost == pytest.approx(alone.normal.cost, rel=2e-3)
     assert scan.ticks[scan.best] == 3
+
+
+def test_a_start_state_behind_a_kink_starts_again(tmp_path: Path) -> None:
+    """Dry friction: of 28 windows two stay where their velocity has the wrong sign, and chi2 is 15.
+
+    The parameters are the true ones, so 1 is right. Windows from smoothed start states end there.
+    """
+    robot = make_robot("pendulum", 0)
+    model, paths, held_out = write(robot, tmp_path, seconds=3.0)
+    recordings = Recordings(model=model, data=tuple(paths))
+    work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    theta = np.array([robot.truth[name] for name in problem.space.names])
+    right = at_parameters(problem, theta, robot.delay_s, 40)
+    states = right.shooting.states(right.point)
+    disturbed = [(x - 0.02, v - 0.6 * np.sign(v)) for x, v in states]
+    found = at_parameters(problem, theta, robot.delay_s, 40, disturbed)
+    assert right.chi2 == pytest.approx(1.0, abs=0.15)
+    assert found.chi2 == pytest.approx(right.chi2, abs=0.1)
+
+
+def test_a_window_may_start_where_the_one_before_it_ends(small_problem: Callable[..., Problem]) -> None:
+    """By the prediction of one window of twice the length."""
+    problem = small_problem()
+    short, long = Shooting(problem, 20), Shooting(problem, 40)
+    theta = problem.space.nominal
+    handed_on = short.states(short.start(theta, 0.0), handed_on=True)
+    own, through = short.states(short.start(theta, 0.0)), long.states(long.start(theta, 0.0))
+    first = int(short.data[0].windows.start[0])
+    for e, (x, v) in enumerate(handed_on):
+        for found, start, expected in zip((x, v), own[e], through[e], strict=True):
+            np.testing.assert_allclose(found[first + 20], expected[first + 20], rtol=1e-9)
+            assert not np.array_equal(found[first + 20], start[first + 20])
