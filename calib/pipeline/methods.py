@@ -1,10 +1,15 @@
-"""The table of calibration methods: name and factory, imported on use."""
+"""The table of calibration methods: name and factory, imported on use.
+
+A calibration is a pipeline with a search inside it. ``default+eki`` names both; ``default`` alone has the
+search :data:`DEFAULT_SEARCH`. The other names are baselines, and the searches alone, for comparison.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
-from typing import TYPE_CHECKING, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final, cast
 
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import UnknownNameError
@@ -12,8 +17,20 @@ from deal_hw.errors import UnknownNameError
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
 
+PIPELINES = ("default", "output-error", "local", "gait", "nominal")
+"""Whole calibrations, as a user names them."""
+
+SEARCHES = ("deal", "eki", "deal-paper")
+"""Searches inside a pipeline, as a user names them."""
+
+DEFAULT_SEARCH: Final = "eki"
+"""The search where none is named."""
+
+SEARCHING = frozenset({"default", "output-error"})
+"""Pipelines with a search."""
+
 METHODS: dict[str, str] = {
-    "default": "deal_hw.calib.search.eki:Eki",
+    "default": "deal_hw.calib.pipeline.stages:CalibrationPipeline",
     "eki": "deal_hw.calib.search.eki:Eki",
     "deal": "deal_hw.calib.search.deal:Deal",
     "deal-paper": "deal_hw.calib.search.algorithm1:paper",
@@ -42,7 +59,8 @@ METHODS: dict[str, str] = {
     "midpoint-linear": "deal_hw.calib.search.no_data:linear_midpoint",
     "nominal": "deal_hw.calib.search.no_data:nominal",
 }
-"""Name -> ``module:callable`` without arguments. ``default`` did best on the tuning seeds."""
+"""Name -> ``module:callable``: of a pipeline with a search, its factory by the search; of all others without
+arguments."""
 
 NO_DATA_METHODS = frozenset({"midpoint", "midpoint-linear", "nominal", "deal-paper-flat"})
 """Baselines that must not read the data. They are never refined."""
@@ -59,15 +77,38 @@ WHOLE_METHODS = frozenset({"output-error", "local", "gait", "mujoco-sysid"})
 """Methods with their own refinement, or that represent another tool. They are never refined."""
 
 
+def divided(name: str) -> tuple[str, str]:
+    """Return a method's pipeline and its search; the search is "" where the name is no pipeline with one."""
+    pipeline, plus, search = name.partition("+")
+    if pipeline not in SEARCHING:
+        return name, ""
+    return pipeline, search if plus else DEFAULT_SEARCH
+
+
+def with_search(pipeline: str, search: str) -> str:
+    """Return the name of a pipeline with a search inside it."""
+    return pipeline if search == DEFAULT_SEARCH else f"{pipeline}+{search}"
+
+
+def search_of(name: str) -> str:
+    """Return the search of a method, which is the method itself where it is no pipeline."""
+    pipeline, search = divided(name)
+    return search or pipeline
+
+
 def check_method(name: str) -> None:
     """Raise `UnknownNameError`, which lists the table, where there is no such method."""
-    if name not in METHODS:
+    pipeline, search = divided(name)
+    if pipeline not in METHODS:
         raise UnknownNameError("calibration method", name, METHODS)
+    if search and search not in SEARCHES:
+        raise UnknownNameError("search", search, SEARCHES)
 
 
 def usual_population(name: str) -> int:
     """Return a method's default population."""
-    paper = name in CLOSED_LOOP_METHODS or name.startswith("deal-paper")
+    search = search_of(name)
+    paper = search in CLOSED_LOOP_METHODS or search.startswith("deal-paper")
     return PAPER_POPULATION if paper else Budget().population
 
 
@@ -80,19 +121,38 @@ def usual_budget(
 
 
 def make_method(name: str, *, refine: bool = False, thorough: bool = False) -> CalibrationMethod[Problem]:
-    """Return a new method; see `check_method`. ``refine`` has no effect on baselines and whole methods.
+    """Return a new method; see `check_method`.
 
+    ``refine`` has no effect on baselines and whole methods; `default` without it is its search alone.
     ``thorough``: checks run to their end where they take more physics steps than the fits.
     """
     from deal_hw.calib.pipeline.stages import CalibrationPipeline
     from deal_hw.calib.validation.checks import Validation
 
     check_method(name)
-    module, _, attribute = METHODS[name].partition(":")
-    search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
-    if isinstance(search, CalibrationPipeline):
-        search.settings = dataclasses.replace(search.settings, thorough=thorough)
+    pipeline, inside = divided(name)
+    if inside:
+        search = _made(inside)
+        if pipeline == "default" and not refine:
+            return search
+        made: CalibrationMethod[Problem] = _factory(pipeline)(search, name)
+    else:
+        made = _made(name)
+    if isinstance(made, CalibrationPipeline):
+        made.settings = dataclasses.replace(made.settings, thorough=thorough)
+        return made
     if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
-        return search
-    # A user who names a search wants it to run, even where refining the nominal values would be enough.
-    return CalibrationPipeline(search, name, Validation(local_first=name == "default", thorough=thorough))
+        return made
+    # Who compares searches wants each to run, even where refining the nominal values would be enough.
+    return CalibrationPipeline(made, name, Validation(local_first=False, thorough=thorough))
+
+
+def _factory(name: str) -> Callable[..., CalibrationMethod[Problem]]:
+    module, _, attribute = METHODS[name].partition(":")
+    return cast(
+        "Callable[..., CalibrationMethod[Problem]]", getattr(importlib.import_module(module), attribute)
+    )
+
+
+def _made(name: str) -> CalibrationMethod[Problem]:
+    return _factory(name)()

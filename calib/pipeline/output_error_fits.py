@@ -39,7 +39,6 @@ from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
-from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import (
     HALVES,
@@ -59,7 +58,7 @@ from deal_hw.calib.validation.cross_validation import (
     time_masks,
 )
 from deal_hw.calib.validation.diagnosis import Diagnosis, diagnose
-from deal_hw.calibration import Z90, CalibrationResult
+from deal_hw.calibration import Z90, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
@@ -332,9 +331,11 @@ class OutputErrorFits(Fits):
         return agreement(known, [h.theta for h in halves], both, problem.steps - before)
 
 
-def output_error_method() -> CalibrationPipeline:
-    """Return `output-error`: fits by cross-validation, after the local fit and the search `eki`."""
-    return CalibrationPipeline(Eki(), "output-error", fits=OutputErrorFits())
+def output_error_method(
+    search: CalibrationMethod[Problem], name: str = "output-error"
+) -> CalibrationPipeline:
+    """Return `output-error`: fits by cross-validation, after the local fit and a search."""
+    return CalibrationPipeline(search, name, fits=OutputErrorFits())
 
 
 def local() -> CalibrationPipeline:

@@ -55,7 +55,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
         PipedProgress("calibrate deal", sys.stderr.isatty()),
     ):
         beside = calibrate(
-            dataclasses.replace(calibration, out=out / "deal", method="deal", refine=False, quiet=True)
+            dataclasses.replace(calibration, out=out / "deal", search="deal", refine=False, quiet=True)
         )
     policy = folder.policies / "calibrated.onnx"
     with stages.stage("train", "a policy under the calibrated distribution"):

@@ -100,7 +100,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             extra="calib",
             function="calibrate_or_write_parameters",
             common="model data columns parameters write_parameters holdout holdout_part leave_out method "
-            "known space out resume json quiet",
+            "search known space out resume json quiet",
         ),
         "train": _verb(
             "train",

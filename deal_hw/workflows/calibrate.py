@@ -18,7 +18,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
 from deal_hw.workflows.calibration.recordings import Source
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S, CalibrationInputs, judged
-from deal_hw.workflows.calibration.settings import DEFAULT, CalibrateSettings, Recordings, check_source
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings, check_source
 from deal_hw.workflows.say import Say, html_table, silent, text_table
 
 _HEAD = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
@@ -183,7 +183,8 @@ def calibrate(
     sample_hz: float | None = None,
     spike_ratio: float = CalibrateSettings.spike_ratio,
     heldout_window_s: float = HELDOUT_WINDOW_S,
-    method: str = DEFAULT,
+    method: str = "",
+    search: Literal["deal", "eki", "deal-paper"] = CalibrateSettings.search,
     checks: Literal["usual", "all"] = CalibrateSettings.checks,
     refine: bool = True,
     population: int | None = None,
@@ -227,7 +228,9 @@ def calibrate(
         spike_ratio: A sample is left out if it jumps away and back by more than this multiple of the joint's
             fastest motion.
         heldout_window_s: Held-out predictions restart from the measured state after this time [s].
-        method: Name of the method; by default chosen from the recordings.
+        method: The pipeline (default, output-error, local, gait, nominal) or a baseline; by default chosen
+            from the recordings.
+        search: The search inside the pipeline: deal, eki or deal-paper.
         checks: "usual" ends the checks of recordings that the model does not explain where they take more
             physics steps than the fits; "all" runs them to their end.
         refine: Follow the search by multiple shooting on prediction error.
@@ -283,6 +286,7 @@ def calibrate(
             episodes=tuple(episodes),
             heldout_window=heldout_window_s,
             method=method,
+            search=search,
             checks=checks,
             policy=policy,
             space=space,

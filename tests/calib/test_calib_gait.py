@@ -102,6 +102,7 @@ def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
 
     assert method(walks=True) == "gait"
     assert method(walks=False) == "default"
-    assert method(walks=True, method="eki") == "eki"
+    assert method(walks=True, method="default") == "default"
+    assert method(walks=True, search="deal-paper") == "default+deal-paper"
     assert make_method("gait", refine=True).name == "gait"
     assert GAIT.robust and GAIT.long_s < 0.4

@@ -15,10 +15,15 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
+    DEFAULT_SEARCH,
     METHODS,
     NO_DATA_METHODS,
+    SEARCHES,
+    SEARCHING,
     check_method,
     make_method,
+    usual_population,
+    with_search,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings, _Box
@@ -225,10 +230,31 @@ def test_raw_units_differ_from_the_normalised_in_one_thing() -> None:
 def test_every_name_in_the_table_makes_a_method(name: str) -> None:
     """Each row imports, and names its result after itself; the default is one of the others."""
     method = make_method(name)
-    assert method.name == name or name == "default"
+    assert method.name == (DEFAULT_SEARCH if name == "default" else name)
     whole = make_method(name, refine=True)
     assert isinstance(whole, CalibrationPipeline) == (name not in NO_DATA_METHODS | {"mujoco-sysid"})
     assert whole.name == name
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize("pipeline", sorted(SEARCHING))
+def test_a_pipeline_takes_each_search(pipeline: str, search: str) -> None:
+    """The name says both; without refinement `default` is its search alone."""
+    name = f"{pipeline}+{search}"
+    made = make_method(name, refine=True)
+    assert isinstance(made, CalibrationPipeline) and made.search.name == search and made.name == name
+    assert made.settings.local_first
+    assert make_method(f"default+{search}").name == search
+    assert usual_population(name) == usual_population(search)
+    assert with_search(pipeline, search) == (pipeline if search == DEFAULT_SEARCH else name)
+
+
+def test_a_search_goes_only_into_a_pipeline_that_has_one() -> None:
+    """Neither a baseline inside a pipeline, nor a search inside a fit."""
+    with pytest.raises(UnknownNameError, match="unknown search 'cma'; known: deal, eki, deal-paper"):
+        check_method("default+cma")
+    with pytest.raises(UnknownNameError, match=r"unknown calibration method 'local\+eki'"):
+        check_method("local+eki")
 
 
 def test_unknown_method_lists_the_names() -> None:

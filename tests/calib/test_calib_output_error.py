@@ -171,7 +171,7 @@ def result(problem: Problem) -> CalibrationResult:
 
 def test_a_right_model_needs_no_search(problem: Problem) -> None:
     """The refined nominal values explain the recordings: no search, no alarm, the truth in the intervals."""
-    found = output_error_method().run(problem, BUDGET, np.random.default_rng(0))
+    found = output_error_method(Eki()).run(problem, BUDGET, np.random.default_rng(0))
     assert found.provenance["search"] == "local fit" and "cross_validation" not in found.provenance
     assert found.alarms == () and 0.5 < found.chi2 < 1.3
     assert np.all(found.interval[:, 0] <= TRUTH) and np.all(found.interval[:, 1] >= TRUTH)

@@ -192,7 +192,7 @@ def test_spikes_do_not_move_the_estimate(
         )
 
 
-@pytest.mark.parametrize("method", ["local", "eki"])
+@pytest.mark.parametrize("method", ["local", "default"])
 def test_latency_at_the_end_of_its_range(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:

@@ -50,7 +50,7 @@ def settings(folder: Path, **changes: Any) -> Calibrate:
     """A calibration by the paper's method that is over in two generations."""
     values: dict[str, Any] = {
         "dataset": folder,
-        "method": "deal-paper",
+        "search": "deal-paper",
         "refine": False,
         "population": 6,
         "generations": 2,
@@ -109,7 +109,7 @@ def test_another_policy_than_the_recordings_is_refused(dataset: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"method": "eki", "policy": POLICY}, "--method eki runs no policy"),
+        ({"search": "eki", "policy": POLICY}, "eki runs no policy"),
         (
             {"dataset": None, "recordings": Recordings(model=Path("robot.xml"), data=(Path("a.csv"),))},
             "which is unknown for --model",

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +41,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def command(dataset: Path, out: Path, *more: str) -> list[str]:
+SEARCH_ALONE = ("--search", "eki", "--no-refine")
+
+
+def command(dataset: Path, out: Path, *more: str, method: Sequence[str] = SEARCH_ALONE) -> list[str]:
     """Return the arguments of a short calibration of two parameters."""
     words = ["calibrate", str(dataset), "--out", str(out), "--free", "cart.mass", "servo.stiffness"]
     words += ["--latency", "0.009", "--population", "12", "--generations", "8", "--quiet"]
-    # A search that is named is always run.
-    words += ["--method", "eki"]
-    return [*words, *more]
+    return [*words, *method, *more]
 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
@@ -72,15 +73,17 @@ def test_stopped_calibration_says_how_to_go_on_and_does(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exit status 130 and the way to resume; then the numbers of a run that was never stopped."""
-    assert main(command(dataset, tmp_path / "whole")) == EXIT_OK
+    # A search with a refinement, which always runs.
+    refined = ("--method", "deal-paper-replay")
+    assert main(command(dataset, tmp_path / "whole", method=refined)) == EXIT_OK
     checkpoint = tmp_path / "parts" / "calibration" / "checkpoint.npz"
     with pytest.MonkeyPatch.context() as patch:
         stop_after(patch, 4)
-        assert main(command(dataset, tmp_path / "parts")) == EXIT_INTERRUPTED
+        assert main(command(dataset, tmp_path / "parts", method=refined)) == EXIT_INTERRUPTED
     told = capsys.readouterr().err
     assert str(checkpoint) in told and "--resume" in told
     assert checkpoint.exists()
-    assert main(command(dataset, tmp_path / "parts", "--resume")) == EXIT_OK
+    assert main(command(dataset, tmp_path / "parts", "--resume", method=refined)) == EXIT_OK
     assert not checkpoint.exists()
     whole, parts = (
         json.loads((tmp_path / name / "calibration" / "result.json").read_text())
@@ -146,7 +149,7 @@ def test_the_best_fit_so_far_is_said_and_kept(
 
         yield progress
 
-    words = [w for w in command(dataset, tmp_path) if w not in ("--quiet", "--method", "eki")]
+    words = [w for w in command(dataset, tmp_path) if w not in ("--quiet", *SEARCH_ALONE)]
     latency = words.index("--latency")
     del words[latency : latency + 2]
     with monkeypatch.context() as patch:

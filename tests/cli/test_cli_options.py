@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from verb_options import dataclasses_of
 
-from deal_hw.calib.pipeline.methods import METHODS
+from deal_hw.calib.pipeline.methods import DEFAULT_SEARCH, METHODS, SEARCHES
 from deal_hw.cli.main import VERBS, main, run
 from deal_hw.control.posture import PostureConfig
 from deal_hw.errors import ConfigurationError, UnknownNameError
@@ -319,10 +319,11 @@ def test_help_explains_common_options_and_names_rare_ones(
 
 
 def test_the_help_of_calibrate_lists_each_method(capsys: pytest.CaptureFixture[str]) -> None:
-    """A user need not mistype a name to see the names."""
+    """A user need not mistype a name to see the names; searches stand at their own option."""
     page = " ".join(help_page("calibrate", capsys, "--help").replace("│", " ").split())
-    named = page.partition("--method STR")[2].partition("(default:")[0]
-    assert set(METHODS) <= set(re.findall(r"[a-z][\w-]*", named))
+    named, _, rest = page.partition("--method STR")[2].partition("--search {deal,eki,deal-paper}")
+    assert set(METHODS) - set(SEARCHES) <= set(re.findall(r"[a-z][\w-]*", named))
+    assert f"{DEFAULT_SEARCH}" in rest
 
 
 @pytest.mark.parametrize(

@@ -207,11 +207,17 @@ def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, P
     with pytest.raises(ConfigurationError, match="--feet, --data would have no effect: a dataset defines it"):
         deal_hw.calibrate(None, fit, dataset="d", feet=["FL"])
     with pytest.raises(ConfigurationError, match="eki runs no policy"):
-        deal_hw.calibrate(model, fit, method="eki", policy="pi.onnx")
+        deal_hw.calibrate(model, fit, search="eki", policy="pi.onnx")
     with pytest.raises(ConfigurationError, match="which is unknown for --model"):
-        deal_hw.calibrate(model, fit, method="deal-paper")
-    with pytest.raises(UnknownNameError, match="eki"):
+        deal_hw.calibrate(model, fit, search="deal-paper")
+    with pytest.raises(UnknownNameError, match="output-error"):
         deal_hw.calibrate(model, fit, method="gradient")
+    with pytest.raises(ConfigurationError, match="--search eki --no-refine runs it alone"):
+        deal_hw.calibrate(model, fit, method="eki")
+    with pytest.raises(
+        ConfigurationError, match="--search would have no effect: --method local has no search"
+    ):
+        deal_hw.calibrate(model, fit, method="local", search="deal")
     with pytest.raises(UnknownNameError, match="pivot"):
         deal_hw.calibrate(model, fit, residual_std={"elbow": 0.01})
     with pytest.raises(ConfigurationError, match="allowed are"):

@@ -143,8 +143,8 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
     ),
     ({"dataset": "d", "method": "gradient"}, "d --method gradient", "gradient"),
     (
-        {"dataset": "d", "method": "eki", "policy": "p.onnx"},
-        "d --method eki --policy p.onnx",
+        {"dataset": "d", "search": "eki", "policy": "p.onnx"},
+        "d --search eki --policy p.onnx",
         "runs no policy",
     ),
     ({"dataset": "d", "latency_s": 2.0}, "d --latency 2", "--latency 2.0 s: allowed are 0 to"),
@@ -181,8 +181,8 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
     ({**MODEL, "physics_step_s": 1.0}, f"{ON_MODEL} --physics-step 1", "--physics-step 1.0 s: allowed are"),
     ({**MODEL, "space": "k9"}, f"{ON_MODEL} --space k9", "--space would have no effect: only datasets"),
     (
-        {**MODEL, "method": "deal-paper"},
-        f"{ON_MODEL} --method deal-paper",
+        {**MODEL, "search": "deal-paper"},
+        f"{ON_MODEL} --search deal-paper",
         "which is unknown for --model",
     ),
     ({"model": "m.xml"}, "--model m.xml", "--model needs recordings to fit: --data rec.csv"),

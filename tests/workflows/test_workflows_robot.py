@@ -81,7 +81,6 @@ def test_a_dataset_and_the_files_themselves_give_the_same(made: Path) -> None:
     """Recordings that went through a dataset are fitted as those that did not."""
     files = [made / "fit1.csv"], made / "held-out.csv"
     short: dict[str, Any] = {
-        "method": "eki",
         "population": 8,
         "generations": 2,
         "refine": False,
@@ -101,7 +100,7 @@ def test_parameters_of_a_carried_robot(made: Path, tmp_path: Path) -> None:
     names = described(dataset).joint_names
     path.write_text(path.read_text(encoding="utf-8").replace("joint1", names[0]), encoding="utf-8")
     found = deal_hw.calibrate(
-        dataset=dataset, parameters=path, method="eki", population=4, generations=1, refine=False, threads=1
+        dataset=dataset, parameters=path, population=4, generations=1, refine=False, threads=1
     )
     assert found.result.space.names == (f"{names[0]}.damping",)
 
@@ -179,7 +178,7 @@ def test_a_rehearsal_without_a_robot(noisy: Path, tmp_path: Path, capsys: pytest
 
 
 REFUSED: list[tuple[str, str]] = [
-    ("calibrate {made}/run/dataset --method deal-paper", "and for a dataset with its own robot.yaml"),
+    ("calibrate {made}/run/dataset --search deal-paper", "and for a dataset with its own robot.yaml"),
     ("robot new {made}/robot.xml", "robot.yaml exists; name another file with --out, or remove it"),
     (
         "robot new {made}/robot.xml --out o.yaml --name so101",

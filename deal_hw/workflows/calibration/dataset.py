@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
 from deal_hw.calibration import listed
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.data.recording.spikes import SpikeSettings
@@ -60,7 +60,7 @@ def prepare_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Sa
     space = settings.searched(space)
     episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
-    if settings.method in CLOSED_LOOP_METHODS:
+    if search_of(settings.named(settings.method or "default")) in CLOSED_LOOP_METHODS:
         runs = {i: episodes_read[i].metadata for i in fit}
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, runs, description, given)

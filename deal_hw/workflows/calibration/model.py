@@ -30,7 +30,7 @@ from deal_hw.workflows.calibration.recordings import (
     without_scraps,
 )
 from deal_hw.workflows.calibration.run import CalibrationInputs
-from deal_hw.workflows.calibration.settings import DEFAULT, CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 from deal_hw.workflows.options import File
 from deal_hw.workflows.robot import carries_robot, recorded_robot
 from deal_hw.workflows.say import Say
@@ -169,22 +169,23 @@ def prepare_model(
     )
 
 
-def method_for(work: CalibrationInputs, *, fit_given: bool, real: bool) -> str:
+def method_for(work: CalibrationInputs, *, fit_given: bool, searches: bool, real: bool) -> str:
     """Return the method that suits recordings of a robot.
 
     Args:
         work: Robot and recordings.
         fit_given: Whether the user gave --residual-std or --no-refine.
+        searches: Whether the user named a search.
         real: Whether the robot is described by the user's own MJCF.
     """
     facts = work.robot.description
     held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
     if fit_given:
-        return DEFAULT
-    if work.walks:
+        return "default"
+    if work.walks and not searches:
         return "gait"
     # Output-error compares predictions over seconds, which are useless for a robot that falls.
-    return "output-error" if real and work.robot.base is None and held else DEFAULT
+    return "output-error" if real and work.robot.base is None and held else "default"
 
 
 def parts_to_calibrate(

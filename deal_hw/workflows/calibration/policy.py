@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
 from deal_hw.control.velocity import FixedVelocity, make_source
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
@@ -29,11 +29,12 @@ def check_policy(method: str, *, given: bool, model: bool) -> None:
     Raises:
         ConfigurationError: A policy would have no effect, or the method needs one that is unknown.
     """
-    if method not in CLOSED_LOOP_METHODS:
-        refuse(["--policy"] if given else [], f"--method {method} runs no policy")
+    search = search_of(method)
+    if search not in CLOSED_LOOP_METHODS:
+        refuse(["--policy"] if given else [], f"{search} runs no policy")
     elif model:
         raise ConfigurationError(
-            f"--method {method} runs the policy that moved the robot, which is unknown for --model and for "
+            f"{search} runs the policy that moved the robot, which is unknown for --model and for "
             "a dataset with its own robot.yaml; use eki, deal or deal-paper-replay"
         )
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.calib.pipeline.methods import DEFAULT_SEARCH
 from deal_hw.calibration import CalibrationResult, ProgressCallback
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.carried import prepare_carried
@@ -15,7 +16,7 @@ from deal_hw.workflows.calibration.dataset import prepare_dataset
 from deal_hw.workflows.calibration.model import method_for, prepare_model
 from deal_hw.workflows.calibration.recordings import Source
 from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
-from deal_hw.workflows.calibration.settings import DEFAULT, CalibrateSettings
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.calibration.walking import WALK_TELLS
 from deal_hw.workflows.robot import carries_robot
 from deal_hw.workflows.say import Say, silent
@@ -62,16 +63,16 @@ def prepare(
 
 def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say = silent) -> str:
     """Return the named method, or the one that suits the recordings."""
-    if settings.method != DEFAULT:
-        return settings.method
+    if settings.method:
+        return settings.named(settings.method)
     fit_given = settings.residual_std not in ((), None) or not settings.refine
     real = settings.recordings.model is not None or carries_robot(settings.dataset)
-    method = method_for(work, fit_given=fit_given, real=real)
-    if work.walks and not fit_given:
+    method = method_for(work, fit_given=fit_given, searches=settings.search != DEFAULT_SEARCH, real=real)
+    if work.walks and method == "gait":
         say(WALK_TELLS)
-    if method != DEFAULT:
-        say(f"method: {method} (alternative: --method eki, which searches and refines to the sensor noise)")
-    return method
+    if method != "default":
+        say(f"method: {method} (alternative: --method default, which refines to the sensor noise)")
+    return settings.named(method)
 
 
 def calibrate_inputs(

@@ -7,7 +7,14 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from deal_hw.calib.pipeline.methods import check_method, usual_budget
+from deal_hw.calib.pipeline.methods import (
+    DEFAULT_SEARCH,
+    SEARCHES,
+    SEARCHING,
+    check_method,
+    usual_budget,
+    with_search,
+)
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
 from deal_hw.data.files import dataset_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
@@ -26,9 +33,6 @@ from deal_hw.workflows.robot import carries_robot
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
-
-DEFAULT = "default"
-"""Name of the default method."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,14 +113,20 @@ class CalibrateSettings(Checked):
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
     """Held-out predictions restart from the measured state after this time [s]."""
 
-    method: str = DEFAULT
-    """How to calibrate. default is eki with refinement; for a walk it is gait; with --model, for servos on a
-    fixed base, it is output-error, unless --residual-std or --no-refine is given. Fits without a search:
-    output-error, local, gait. Searches: eki, deal. The DEAL paper's Algorithm 1 and its variants: deal-paper,
-    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay. Baselines: easi,
-    easi-log, bo, bo-critic, cma, gauss-newton, least-squares, least-squares-random,
-    least-squares-multistart, ekf, ekf-one-pass, mujoco-sysid, random. Without data: midpoint,
-    midpoint-linear, nominal."""
+    method: str = ""
+    """The pipeline. default: a local fit; where it does not explain the recordings a search, then refinement
+    to the sensor noise. output-error: fits of predictions, and a search; the best predictor is chosen. local:
+    those fits without a search. gait: short fits for a walk. nominal: no fit. By default gait for a walk,
+    unless --search is given; output-error with --model for servos on a fixed base; but default with
+    --residual-std or --no-refine, and for all else. Baselines to compare with: easi, easi-log, bo, bo-critic,
+    cma, gauss-newton, least-squares, least-squares-random, least-squares-multistart, ekf, ekf-one-pass,
+    mujoco-sysid, random, midpoint, midpoint-linear, and variants of the DEAL paper's Algorithm 1:
+    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay."""
+
+    search: Literal["deal", "eki", "deal-paper"] = DEFAULT_SEARCH
+    """The search of default and output-error. deal: a critic tells recording and simulators apart, and the
+    population moves to where it cannot. eki: an ensemble Kalman search, without a critic.
+    deal-paper: the DEAL paper's Algorithm 1. With --no-refine the search alone."""
 
     policy: File | None = None
     """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
@@ -217,14 +227,28 @@ class CalibrateSettings(Checked):
             )
         if self.latency is not None:
             refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency gives the latency")
-        check_method(self.method)
+        if self.method in SEARCHES:
+            raise ConfigurationError(
+                f"--method {self.method}: that is a search; --search {self.method} runs it where the local "
+                f"fit does not explain the recordings, --search {self.method} --no-refine runs it alone"
+            )
+        check_method(self.named(self.method or "default"))
+        if self.method and self.method not in SEARCHING:
+            refuse(
+                given(self, CalibrateSettings(), ("search",)), f"--method {self.method} has no search inside"
+            )
         own = self.recordings.model is not None or carries_robot(self.dataset)
-        check_policy(self.method, given=self.policy is not None, model=own)
+        check_policy(self.named(self.method or "default"), given=self.policy is not None, model=own)
+
+    def named(self, pipeline: str) -> str:
+        """Return the name of a pipeline with the search that is asked for."""
+        return with_search(pipeline, self.search) if pipeline in SEARCHING else pipeline
 
     @property
     def budget(self) -> Budget:
         """Budget of the method."""
-        return usual_budget(self.method, self.population, self.generations, refine=self.refine)
+        method = self.named(self.method or "default")
+        return usual_budget(method, self.population, self.generations, refine=self.refine)
 
     def known_std(self, robot: RobotModel) -> FloatArray | None:
         """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
