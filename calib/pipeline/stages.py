@@ -352,8 +352,10 @@ def conclude_fit(
         late = fit_delays(run.problem, refined, MISMATCH.evidence)
         refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem
-    # The mean of random delays is no whole number of ticks.
-    if problem.fixed_latency_s is None and late is None and not (choice and choice.chosen == "search"):
+    # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
+    # tell whether they vary.
+    steady = late is None and not unexplained(refined)
+    if problem.fixed_latency_s is None and steady and not (choice and choice.chosen == "search"):
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -365,7 +367,7 @@ def conclude_fit(
     if whole is not None:
         known = averaged(problem, whole, known)
     if late is not None and unexplained(refined):
-        known = late.widened(known)
+        known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
     if late is not None:

@@ -202,7 +202,7 @@ def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     assert low <= jittering.latency_s <= high and high - low < 3e-3
     assert np.all((known.interval[:, 0] <= theta) & (theta <= known.interval[:, 1]))
     # Where more than noise is left, intervals are no narrower than with one constant delay.
-    wide, before = late.widened(known), uncertainty_at(problem, with_rows(constant))
+    wide, before = late.widened(known, late.fit.latency_s), uncertainty_at(problem, with_rows(constant))
     assert np.all(np.diag(wide.covariance) >= np.diag(before.covariance) * (1 - 1e-9))
     assert np.ptp(wide.latency_interval_s) >= 0.99 * np.ptp(before.latency_interval_s)
     # Commands that a part of a recording counts from another beginning have no known delays.
