@@ -366,7 +366,7 @@ def conclude_fit(
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:
         known = averaged(problem, whole, known)
-    if late is not None and unexplained(refined):
+    if late is not None:
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)

@@ -99,8 +99,8 @@ class DelayFit:
     def widened(self, known: Uncertainty, latency_s: float) -> Uncertainty:
         """Return an uncertainty that is at least that of the fit with one constant delay.
 
-        Delays also take up a part of what else a model lacks. So they make intervals narrower only where
-        they leave nothing but noise. ``latency_s`` is the mean delay.
+        Delays also take up a part of what else a model lacks, even where they leave nothing but noise. So
+        they make no interval narrower. ``latency_s`` is the mean delay.
         """
         before = with_rows(self.before)
         wide = uncertainty_at(before.shooting.problem, before)
