@@ -45,7 +45,7 @@ from deal_hw.calib.pipeline.calibration_run import (
     FitOutcome,
 )
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.validation.checks import Validation, judge, unexplained
+from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
@@ -370,6 +370,7 @@ def conclude_fit(
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
+    known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause.alarm)

@@ -119,6 +119,38 @@ def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples)
     return correlation_time(refined.normal.residual) > longest
 
 
+def hold_shorter(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertainty:
+    """Return ``known`` with intervals that hold what shorter windows say, where noise does not explain a fit.
+
+    A model's error adds up along a window. So estimates of a wrong model change with the window's length, by
+    more than their own uncertainty, which alone is no reason (Hausman 1978). Every part of the recordings
+    shares that error: it shows neither in their halves nor in blocks of time.
+
+    Args:
+        known: The uncertainty of an estimate.
+        latency_s: Its latency [s].
+        fit: The estimate's fit, or that from which it began, with shorter ones.
+    """
+    if not unexplained(fit):
+        return known
+    space, problem = known.space, fit.shooting.problem
+    excess = np.zeros(len(space) + 1)
+    shorter = fit.shorter
+    while shorter is not None:
+        own = uncertainty_at(problem, shorter)
+        late_std = own.latency_reach_s(shorter.latency_s) / Z90
+        std = np.append(np.sqrt(np.diag(own.covariance)), late_std)
+        moved = space.to_scale(shorter.theta) - space.to_scale(known.theta)
+        square = np.append(moved, shorter.latency_s - latency_s) ** 2
+        excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
+        shorter = shorter.shorter
+    excess[:-1][known.blind] = 0.0
+    wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
+    if reach_s := known.latency_reach_s(latency_s):
+        wider = wider.latency_widened_to(reach_s + excess[-1], latency_s, problem.latency_range_s)
+    return wider
+
+
 def judge(
     problem: Problem,
     refined: Refined,
@@ -355,8 +387,8 @@ def agreement(
         rows.append(SplitHalfRow(name=LATENCY, first=of_halves[0], second=of_halves[1]))
         identified = np.append(identified, True)
         scaled = np.column_stack([scaled, each])
-        reaches = [h.latency_reach_s(late) / Z90 for late, h in zip(each, halves, strict=True)]
-        expected = np.append(expected, np.hypot(*reaches))
+        reach_s = [h.latency_reach_s(late) for late, h in zip(each, halves, strict=True)]
+        expected = np.append(expected, np.linalg.norm(reach_s) / Z90)
         reach[-1] = max(abs(late - latency_s) for late in each)
     least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
     z = np.abs(scaled[0] - scaled[1]) / np.maximum(expected, 1e-300)

@@ -242,6 +242,7 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     problem, theta = _problem_of(case, ("cart.frictionloss", "servo.stiffness", "servo.damping"))
     fit = refine(problem, theta, case.latency_s, (0.2, 0.4))
     assert fit.latency_s - case.latency_s > 4e-3
+    assert fit.shorter is not None and fit.shorter.shooting.length < fit.shooting.length
     rng = np.random.default_rng(0)
     run = CalibrationRun(
         problem=problem,

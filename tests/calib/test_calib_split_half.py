@@ -23,10 +23,11 @@ from deal_hw.calib.validation.checks import (
     agreement,
     check_split_half,
     half_of,
+    hold_shorter,
     judge,
     widened_by_split_half,
 )
-from deal_hw.calibration import BEFORE_SEARCH, Budget, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Z90, Budget, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 
 
@@ -44,18 +45,18 @@ def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refin
 
 def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
-    known = uncertainty_at(noisy_problem, noisy_refined)
+    known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
     split = check_split_half(noisy_problem, noisy_refined, known)
     assert split.flagged == () and split.alarms(noisy_problem.space) == () and split.steps > 0
-    assert [r.name for r in split.rows] == [*noisy_problem.space.names, "latency"]
+    assert [r.name for r in split.rows] == list(noisy_problem.space.names)
     for row in split.rows:
         for estimate, low, high in (row.first, row.second):
             assert estimate is None or low <= estimate <= high
-    assert set(split.to_json()["parameters"]) == {*noisy_problem.space.names, "latency"}
+    assert set(split.to_json()["parameters"]) == set(noisy_problem.space.names)
     assert _widened(known, split) is known
 
 
-def _widened(known: Uncertainty, split: SplitHalf, latency_s: float = 0.01) -> Uncertainty:
+def _widened(known: Uncertainty, split: SplitHalf, latency_s: float = 0.012) -> Uncertainty:
     return widened_by_split_half(known, split, latency_s, (0.0, 0.04))
 
 
@@ -114,7 +115,7 @@ def test_halves_that_differ_more_than_intervals_expect_widen_all_of_them(
     split = agreement(known, halves(2.1), [wide, wide], None, 0)
     assert split.flagged == () and split.scale == pytest.approx(2.1 * np.sqrt(2), rel=1e-6)
     assert split.to_json()["scale"] == split.scale
-    wider = _widened(known, split)
+    wider = _widened(known, split, noisy_refined.latency_s)
     assert np.sqrt(np.diag(wider.covariance)) == pytest.approx(split.scale * std)
     # A given latency has no interval.
     assert wider.latency_interval_s == known.latency_interval_s
@@ -141,6 +142,27 @@ def test_halves_disagree_about_the_latency_like_about_any_value(
     assert _widened(known, three, 0.012).latency_interval_s == pytest.approx((0.009, 0.015))
     late = dataclasses.replace(known, latency_interval_s=(0.036, 0.04))
     assert _widened(late, three, 0.039).latency_interval_s == pytest.approx((0.030, 0.04))
+
+
+def test_intervals_hold_what_shorter_windows_say(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """Stiffness five standard deviations lower in shorter windows: its interval reaches there, but for one.
+
+    A model's error adds up along a window; where noise explains the fit, only noise differs.
+    """
+    known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
+    space, std = noisy_problem.space, np.sqrt(np.diag(known.covariance))
+    k = space.names.index("servo.stiffness")
+    short = dataclasses.replace(noisy_refined, normal=dataclasses.replace(noisy_refined.normal, rows=()))
+    own = float(np.sqrt(uncertainty_at(noisy_problem, short).covariance[k, k]))
+    at = space.to_scale(noisy_refined.theta) - 5.0 * own * np.eye(len(space))[k]
+    short = dataclasses.replace(short, theta=space.from_scale(at))
+    fit = dataclasses.replace(noisy_refined, shorter=short)
+    assert hold_shorter(known, fit.latency_s, fit) is known
+    wide = hold_shorter(known, fit.latency_s, dataclasses.replace(fit, chi2=2.0))
+    expected = std.copy()
+    expected[k] += np.sqrt(5.0**2 - 1.0) * own / Z90
+    assert np.sqrt(np.diag(wide.covariance)) == pytest.approx(expected, rel=1e-3)
+    assert wide.latency_interval_s == known.latency_interval_s
 
 
 def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:
