@@ -336,11 +336,14 @@ def conclude_fit(
     refined: Refined,
     choice: Choice | None = None,
     restarts: int = 0,
+    *,
+    wrong: bool = False,
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
     ``searched`` is the search's result; None where the fit needed no search. ``choice`` is that of
-    cross-validation, if it ran.
+    cross-validation, if it ran. With ``wrong`` the model does not explain the recordings, although the
+    residual is as large as the weights say.
     """
     late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
@@ -354,7 +357,7 @@ def conclude_fit(
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
-    steady = late is None and not unexplained(refined)
+    steady = late is None and not (wrong or unexplained(refined))
     if problem.fixed_latency_s is None and steady and not (choice and choice.chosen == "search"):
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
@@ -370,7 +373,9 @@ def conclude_fit(
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
-    known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
+    constant = refined if late is None else late.before
+    if wrong or unexplained(constant):
+        known = hold_shorter(known, refined.latency_s, constant)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause.alarm)
@@ -425,7 +430,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         "these sensors are finer than the model; the fit weights them by the model's residual "
         f"(multiples of their noise): {words}",
     )
-    found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit)
+    found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit, wrong=True)
     return found.but(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
 
 

@@ -120,35 +120,41 @@ def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples)
 
 
 def hold_shorter(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertainty:
-    """Return ``known`` with intervals that hold what shorter windows say, where noise does not explain a fit.
+    """Return ``known`` of a model that is wrong, with intervals that hold what shorter windows say.
 
     A model's error adds up along a window. So estimates of a wrong model change with the window's length, by
     more than their own uncertainty, which alone is no reason (Hausman 1978). Every part of the recordings
-    shares that error: it shows neither in their halves nor in blocks of time.
+    shares that error: it shows neither in their halves nor in blocks of time. Shorter windows are easier to
+    explain; those with a larger residual ended in another minimum, and do not count.
 
     Args:
         known: The uncertainty of an estimate.
         latency_s: Its latency [s].
         fit: The estimate's fit, or that from which it began, with shorter ones.
     """
-    if not unexplained(fit):
-        return known
     space, problem = known.space, fit.shooting.problem
     excess = np.zeros(len(space) + 1)
-    shorter = fit.shorter
-    while shorter is not None:
+    longer, shorter = fit, fit.shorter
+    while shorter is not None and _chi2_as(shorter, longer) < longer.chi2:
         own = uncertainty_at(problem, shorter)
         late_std = own.latency_reach_s(shorter.latency_s) / Z90
         std = np.append(np.sqrt(np.diag(own.covariance)), late_std)
         moved = space.to_scale(shorter.theta) - space.to_scale(known.theta)
         square = np.append(moved, shorter.latency_s - latency_s) ** 2
         excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
-        shorter = shorter.shorter
+        longer, shorter = shorter, shorter.shorter
     excess[:-1][known.blind] = 0.0
     wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
     if reach_s := known.latency_reach_s(latency_s):
         wider = wider.latency_widened_to(reach_s + excess[-1], latency_s, problem.latency_range_s)
     return wider
+
+
+def _chi2_as(fit: Refined, other: Refined) -> float:
+    """Return a fit's chi2 with the channels' weights of another."""
+    ratio = fit.shooting.problem.noise.position_std / other.shooting.problem.noise.position_std
+    every = np.concatenate([r.reshape(-1, r.shape[-1]) for r in fit.normal.residual])
+    return float(fit.chi2 * np.sum((every * ratio) ** 2) / max(np.sum(every**2), 1e-300))
 
 
 def judge(

@@ -147,7 +147,7 @@ def test_halves_disagree_about_the_latency_like_about_any_value(
 def test_intervals_hold_what_shorter_windows_say(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """Stiffness five standard deviations lower in shorter windows: its interval reaches there, but for one.
 
-    A model's error adds up along a window; where noise explains the fit, only noise differs.
+    By hand: what exceeds their own standard deviation, sqrt(25 - 1) of it, is added.
     """
     known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
     space, std = noisy_problem.space, np.sqrt(np.diag(known.covariance))
@@ -156,13 +156,16 @@ def test_intervals_hold_what_shorter_windows_say(noisy_problem: Problem, noisy_r
     own = float(np.sqrt(uncertainty_at(noisy_problem, short).covariance[k, k]))
     at = space.to_scale(noisy_refined.theta) - 5.0 * own * np.eye(len(space))[k]
     short = dataclasses.replace(short, theta=space.from_scale(at))
-    fit = dataclasses.replace(noisy_refined, shorter=short)
-    assert hold_shorter(known, fit.latency_s, fit) is known
-    wide = hold_shorter(known, fit.latency_s, dataclasses.replace(fit, chi2=2.0))
+    wrong = dataclasses.replace(noisy_refined, chi2=2.0, shorter=short)
+    wide = hold_shorter(known, wrong.latency_s, wrong)
     expected = std.copy()
     expected[k] += np.sqrt(5.0**2 - 1.0) * own / Z90
     assert np.sqrt(np.diag(wide.covariance)) == pytest.approx(expected, rel=1e-3)
     assert wide.latency_interval_s == known.latency_interval_s
+    # Shorter windows that are explained worse ended in another minimum.
+    other = dataclasses.replace(wrong, shorter=dataclasses.replace(short, chi2=3.0))
+    same = hold_shorter(known, wrong.latency_s, other)
+    assert np.sqrt(np.diag(same.covariance)) == pytest.approx(std)
 
 
 def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:
