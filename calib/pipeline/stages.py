@@ -373,9 +373,9 @@ def conclude_fit(
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
-    constant = refined if late is None else late.before
-    if wrong or unexplained(constant):
-        known = hold_shorter(known, refined.latency_s, constant)
+    if late is not None or wrong or unexplained(refined):
+        # Delays were found because the fit with a constant one is not right.
+        known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause.alarm)
