@@ -169,7 +169,7 @@ class Uncertainty:
         """Return it with a latency interval that reaches at least so far from the estimate, in its range."""
         (low, high), (first, last) = self.latency_interval_s, latency_range_s
         interval_s = max(min(low, latency_s - reach_s), first), min(max(high, latency_s + reach_s), last)
-        return dataclasses.replace(self, latency_interval_s=interval_s)
+        return dataclasses.replace(self, latency_interval_s=(float(interval_s[0]), float(interval_s[1])))
 
     def latency_reach_s(self, latency_s: float) -> float:
         """Return how far the latency's interval reaches from the estimate [s]; 0 for a given latency.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -255,5 +256,6 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     found = conclude_fit(run, None, fit)
     low, high = found.known.latency_interval_s
     assert low <= case.latency_s <= high and "latency_scan" not in found.facts
+    json.dumps(found.facts)
     # It is wide, and is said to be.
     assert high - low < 20e-3 and found.facts["split_half"]["scale"] > 1.5
