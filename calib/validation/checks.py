@@ -389,8 +389,9 @@ def agreement(
     reach = np.append(np.max(np.abs(scaled - space.to_scale(known.theta)), axis=0), 0.0)
     if latency_s is not None:
         each = [late for _, late in fits]
-        one, other = ((late, *map(float, h.latency_interval_s)) for late, h in zip(each, halves, strict=True))
-        rows.append(SplitHalfRow(name=LATENCY, first=one, second=other))
+        ends = [tuple(map(float, h.latency_interval_s)) for h in halves]
+        first, second = ((late, low, high) for late, (low, high) in zip(each, ends, strict=True))
+        rows.append(SplitHalfRow(name=LATENCY, first=first, second=second))
         identified = np.append(identified, True)
         scaled = np.column_stack([scaled, each])
         reach_s = [h.latency_reach_s(late) for late, h in zip(each, halves, strict=True)]
