@@ -8,7 +8,7 @@ residual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,7 +92,9 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
             break
         if weighted is not None and np.any(longer.scale > SETTINGS.adds_up * weighted.scale):
             break
-        weighted, scale = longer, longer.scale
+        shorter = None if weighted is None else weighted.fit
+        weighted = replace(longer, fit=replace(longer.fit, shorter=shorter))
+        scale = longer.scale
     return weighted
 
 

@@ -163,6 +163,22 @@ class Uncertainty:
         wider = self.with_covariance(self.covariance * np.outer(factor, factor))
         return dataclasses.replace(wider, widened=self.widened * factor)
 
+    def latency_widened_to(
+        self, reach_s: float, latency_s: float, latency_range_s: tuple[float, float]
+    ) -> Uncertainty:
+        """Return it with a latency interval that reaches at least so far from the estimate, in its range."""
+        (low, high), (first, last) = self.latency_interval_s, latency_range_s
+        interval_s = max(min(low, latency_s - reach_s), first), min(max(high, latency_s + reach_s), last)
+        return dataclasses.replace(self, latency_interval_s=(float(interval_s[0]), float(interval_s[1])))
+
+    def latency_reach_s(self, latency_s: float) -> float:
+        """Return how far the latency's interval reaches from the estimate [s]; 0 for a given latency.
+
+        An end of the range cuts off one side.
+        """
+        low, high = self.latency_interval_s
+        return max(high - latency_s, latency_s - low)
+
 
 def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:
     """Return the integrated autocorrelation time of whitened residuals, (W, H, J) each, in samples.

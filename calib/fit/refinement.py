@@ -81,6 +81,7 @@ class Refined:
         point: The solver's point.
         shooting: The windows used last.
         iterations: Iterations over all stages.
+        shorter: The fit in shorter windows from which it began, if there is one.
     """
 
     theta: FloatArray
@@ -90,6 +91,7 @@ class Refined:
     point: Point
     shooting: Shooting
     iterations: int
+    shorter: Refined | None = None
 
 
 def refine(
@@ -156,7 +158,8 @@ def refine(
         found = _refined(shooting, point, normal, done)
         if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
             break
-        result, theta, latency_s = found, found.theta, found.latency_s
+        result = dataclasses.replace(found, shorter=result)
+        theta, latency_s = found.theta, found.latency_s
         if not shooting.given:
             states = shooting.states(point)
         if notify is not None:

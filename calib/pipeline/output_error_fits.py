@@ -187,7 +187,7 @@ class OutputErrorFits(Fits):
                 if judged[1] is not None and unexplained(judged[1]):
                     causes = diagnose(judged[0], judged[1], run.play, run.allows)
             split = self._split_half(run, problem, fit, recipe, known)
-        known = widened_by_split_half(known, split)
+        known = widened_by_split_half(known, split, latency_s, problem.latency_range_s)
         if settings.hold_first:
             known = _including(known, first.theta)
         for kinds, std in settings.common_std:
@@ -328,7 +328,9 @@ class OutputErrorFits(Fits):
         except InsufficientDataError as err:
             return SplitHalf(note=f"a half cannot be fitted: {err}")
         both = [uncertainty_at(problem, half, own_scale=True) for half in halves]
-        return agreement(known, [h.theta for h in halves], both, problem.steps - before)
+        fits = [(h.theta, h.latency_s) for h in halves]
+        searched = fit.latency_s if recipe.latency and problem.fixed_latency_s is None else None
+        return agreement(known, fits, both, searched, problem.steps - before)
 
 
 def output_error_method(

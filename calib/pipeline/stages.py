@@ -45,7 +45,7 @@ from deal_hw.calib.pipeline.calibration_run import (
     FitOutcome,
 )
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.validation.checks import Validation, judge, unexplained
+from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
@@ -368,11 +368,14 @@ def conclude_fit(
     refined: Refined,
     choice: Choice | None = None,
     restarts: int = 0,
+    *,
+    wrong: bool = False,
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
     ``searched`` is the search's result; None where the fit needed no search. ``choice`` is that of
-    cross-validation, if it ran.
+    cross-validation, if it ran. With ``wrong`` the model does not explain the recordings, although the
+    residual is as large as the weights say.
     """
     late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
@@ -384,8 +387,10 @@ def conclude_fit(
         late = fit_delays(run.problem, refined, MISMATCH.evidence)
         refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem
-    # The mean of random delays is no whole number of ticks.
-    if problem.fixed_latency_s is None and late is None and not (choice and choice.chosen == "search"):
+    # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
+    # tell whether they vary.
+    steady = late is None and not (wrong or unexplained(refined))
+    if problem.fixed_latency_s is None and steady and not (choice and choice.chosen == "search"):
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -396,10 +401,13 @@ def conclude_fit(
     known = uncertainty_at(problem, refined, fixed_latency=decided)
     if whole is not None:
         known = averaged(problem, whole, known)
-    if late is not None and unexplained(refined):
-        known = late.widened(known)
+    if late is not None:
+        known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
+    if late is not None or wrong or unexplained(refined):
+        # Delays were found because the fit with a constant one is not right.
+        known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause.alarm)
@@ -454,7 +462,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         "these sensors are finer than the model; the fit weights them by the model's residual "
         f"(multiples of their noise): {words}",
     )
-    found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit)
+    found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit, wrong=True)
     return found.but(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
 
 

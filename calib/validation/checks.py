@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
-from deal_hw.calib.data.problem import Problem, taken
+from deal_hw.calib.data.problem import Member, Problem, taken
 from deal_hw.calib.fit.intervals import (
     MISMATCH,
     Uncertainty,
@@ -119,6 +119,44 @@ def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples)
     return correlation_time(refined.normal.residual) > longest
 
 
+def hold_shorter(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertainty:
+    """Return ``known`` of a model that is wrong, with intervals that hold what shorter windows say.
+
+    A model's error adds up along a window. So estimates of a wrong model change with the window's length, by
+    more than their own uncertainty, which alone is no reason (Hausman 1978). Every part of the recordings
+    shares that error: it shows neither in their halves nor in blocks of time. Shorter windows are easier to
+    explain; those with a larger residual ended in another minimum, and do not count.
+
+    Args:
+        known: The uncertainty of an estimate.
+        latency_s: Its latency [s].
+        fit: The estimate's fit, or that from which it began, with shorter ones.
+    """
+    space, problem = known.space, fit.shooting.problem
+    excess = np.zeros(len(space) + 1)
+    longer, shorter = fit, fit.shorter
+    while shorter is not None and _chi2_as(shorter, longer) < longer.chi2:
+        own = uncertainty_at(problem, shorter)
+        late_std = own.latency_reach_s(shorter.latency_s) / Z90
+        std = np.append(np.sqrt(np.diag(own.covariance)), late_std)
+        moved = space.to_scale(shorter.theta) - space.to_scale(known.theta)
+        square = np.append(moved, shorter.latency_s - latency_s) ** 2
+        excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
+        longer, shorter = shorter, shorter.shorter
+    excess[:-1][known.blind] = 0.0
+    wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
+    if reach_s := known.latency_reach_s(latency_s):
+        wider = wider.latency_widened_to(reach_s + excess[-1], latency_s, problem.latency_range_s)
+    return wider
+
+
+def _chi2_as(fit: Refined, other: Refined) -> float:
+    """Return a fit's chi2 with the channels' weights of another."""
+    ratio = fit.shooting.problem.noise.position_std / other.shooting.problem.noise.position_std
+    every = np.concatenate([r.reshape(-1, r.shape[-1]) for r in fit.normal.residual])
+    return float(fit.chi2 * np.sum((every * ratio) ** 2) / max(np.sum(every**2), 1e-300))
+
+
 def judge(
     problem: Problem,
     refined: Refined,
@@ -157,7 +195,7 @@ def judge(
     causes = diagnose(problem, refined, fitted, allows) if asked else ()
     if settings.split_half:
         split = check_split_half(problem, refined, known, allows)
-        known = widened_by_split_half(known, split)
+        known = widened_by_split_half(known, split, refined.latency_s, problem.latency_range_s)
         facts["split_half"] = split.to_json()
     if asked:
         known, facts["diagnosis"] = with_causes(problem, refined, known, causes)
@@ -219,7 +257,7 @@ class SplitHalfRow:
     """One parameter's estimates from two halves of the data.
 
     Attributes:
-        name: The parameter.
+        name: The parameter, or "latency" [s].
         first: Estimate and 90 % interval (low, high) of one half. The estimate is None where that half does
             not identify the parameter: the interval is then the range's own.
         second: The same of the other half.
@@ -242,10 +280,10 @@ class SplitHalf:
     """Result of the split-half check.
 
     Attributes:
-        rows: One per parameter; empty without a comparison.
-        flagged: Parameters that differ by more than chance.
+        rows: One per parameter, and one of a searched latency; empty without a comparison.
+        flagged: Those that differ by more than chance.
         reach: Largest distance of a half's estimate from that on all data, in each parameter's own scale,
-            (K,).
+            and of the latency [s], (K + 1,).
         scale: Factor on all standard deviations: the root mean square distance of the halves over that which
             the intervals expect. 1 where chance explains the distance. Tables of particle data use the same
             factor where measurements disagree.
@@ -278,11 +316,11 @@ class SplitHalf:
         """Return one alarm that names all flagged parameters, if there are any."""
         if not self.flagged:
             return ()
-        both = {
-            r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g} {space[r.name].unit})"
-            for r in self.rows
-            if r.agree is not None
-        }
+        both = {}
+        for r in self.rows:
+            unit, scale = ("ms", 1e3) if r.name == LATENCY else (space[r.name].unit, 1.0)
+            if r.first[0] is not None and r.second[0] is not None:
+                both[r.name] = f" ({scale * r.first[0]:.4g} and {scale * r.second[0]:.4g} {unit})"
         return (
             Alarm(
                 "Two halves of the data disagree about "
@@ -297,7 +335,7 @@ class SplitHalf:
 def check_split_half(
     problem: Problem, refined: Refined, known: Uncertainty, allows: Allows = all_allowed
 ) -> SplitHalf:
-    """Refine two halves of the windows alone and compare with ``refined``; the latency stays.
+    """Refine two halves of the windows alone and compare with ``refined``, the latency where that is free.
 
     Parameters that ``known`` calls unidentified are not compared.
     """
@@ -314,62 +352,85 @@ def check_split_half(
         # Blocks as long as residuals are correlated, but at least two blocks in each half.
         longest = windows // SETTINGS.fewest_windows
         block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
-    estimates, halves = [], []
+    latency_s = None if shooting.fixed_latency else refined.latency_s
+    fits, halves = [], []
     for half in range(2):
         found = refine_windows(*half_of(shooting, refined.point, half, block), SETTINGS.half_iterations)
-        own = uncertainty_at(problem, with_rows(found), fixed_latency=True)
+        own = uncertainty_at(problem, with_rows(found), fixed_latency=latency_s is None)
         # A half holds few blocks: the clustering of all blocks holds for it, too.
         std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
-        estimates.append(found.theta)
+        fits.append((found.theta, found.latency_s))
         halves.append(own.widened_to(std))
-    return agreement(known, estimates, halves, problem.steps - before)
+    return agreement(known, fits, halves, latency_s, problem.steps - before)
 
 
 def agreement(
-    known: Uncertainty, estimates: Sequence[FloatArray], halves: Sequence[Uncertainty], steps: int
+    known: Uncertainty,
+    fits: Sequence[Member],
+    halves: Sequence[Uncertainty],
+    latency_s: float | None,
+    steps: int,
 ) -> SplitHalf:
-    """Return whether two halves agree, from their estimates, (K,), and from what is known of all data."""
+    """Return whether the fits of two halves agree.
+
+    ``known`` is the uncertainty of all data, and ``latency_s`` their latency; None where it was not searched.
+    """
     space = known.space
 
     def three(half: int, k: int) -> tuple[float | None, float, float]:
-        estimate, (low, high) = float(estimates[half][k]), map(float, halves[half].interval[k])
+        estimate, (low, high) = float(fits[half][0][k]), map(float, halves[half].interval[k])
         identified = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
         return estimate if identified else None, low, high
 
-    rows = tuple(
-        SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
-    )
+    rows = [SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)]
     identified = ~known.blind
+    scaled = space.to_scale(np.stack([theta for theta, _ in fits]))
+    expected = np.sqrt(np.sum([np.diag(h.covariance) for h in halves], axis=0))
+    reach = np.append(np.max(np.abs(scaled - space.to_scale(known.theta)), axis=0), 0.0)
+    if latency_s is not None:
+        each = [late for _, late in fits]
+        ends = [tuple(map(float, h.latency_interval_s)) for h in halves]
+        first, second = ((late, low, high) for late, (low, high) in zip(each, ends, strict=True))
+        rows.append(SplitHalfRow(name=LATENCY, first=first, second=second))
+        identified = np.append(identified, True)
+        scaled = np.column_stack([scaled, each])
+        reach_s = [h.latency_reach_s(late) for late, h in zip(each, halves, strict=True)]
+        expected = np.append(expected, np.linalg.norm(reach_s) / Z90)
+        reach[-1] = max(abs(late - latency_s) for late in each)
     least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
-    scaled = space.to_scale(np.stack(estimates))
-    expected = np.sqrt(sum(np.diag(h.covariance) for h in halves))
     z = np.abs(scaled[0] - scaled[1]) / np.maximum(expected, 1e-300)
     flagged = tuple(r.name for k, r in enumerate(rows) if z[k] > least and identified[k] and r.agree is False)
     compared = z[identified & [r.agree is not None for r in rows]]
     power, count = float(np.sum(compared**2)), len(compared)
     by_chance = not count or power <= chi2_law.ppf(1 - SETTINGS.false_alarms, count)
     scale = 1.0 if by_chance else float(np.sqrt(power / count))
-    reach = np.max(np.abs(scaled - space.to_scale(known.theta)), axis=0)
-    return SplitHalf(rows, flagged, reach, scale, steps)
+    return SplitHalf(tuple(rows), flagged, reach, scale, steps)
 
 
-def widened_by_split_half(known: Uncertainty, split: SplitHalf) -> Uncertainty:
+def widened_by_split_half(
+    known: Uncertainty, split: SplitHalf, latency_s: float, latency_range_s: tuple[float, float]
+) -> Uncertainty:
     """Return ``known`` with all intervals wider by the scale of the halves' distance.
 
-    Those of flagged parameters hold the estimates of both halves.
+    Those of flagged parameters, and of a flagged latency, hold the estimates of both halves. ``latency_s`` is
+    the latency of all data.
     """
     if not split.flagged and split.scale == 1.0:
         return known
-    flagged = np.array([name in split.flagged for name in known.space.names])
+    flagged = np.array([name in split.flagged for name in (*known.space.names, LATENCY)])
+    held = np.where(flagged, split.reach, 0.0)
     std = split.scale * np.sqrt(np.diag(known.covariance))
-    wider = known.widened_to(np.maximum(std, np.where(flagged, split.reach / Z90, 0.0)))
+    wider = known.widened_to(np.maximum(std, held[:-1] / Z90))
+    if reach_s := known.latency_reach_s(latency_s):
+        reach_s = max(split.scale * reach_s, float(held[-1]))
+        wider = wider.latency_widened_to(reach_s, latency_s, latency_range_s)
     return wider.with_alarms(last=split.alarms(known.space))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
     """Return every other block of the windows, from block ``half``, and the point in them.
 
-    The count of windows continues over recordings. The latency is fixed.
+    The count of windows continues over recordings.
     """
     data, position, velocity, first = [], [], [], 0
     for e, of_episode in enumerate(shooting.data):
@@ -380,7 +441,7 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
             data.append(taken(of_episode, mine))
             position.append(point.position[e][mine])
             velocity.append(point.velocity[e][mine])
-    return shooting.on(data, fixed_latency=True), Point(point.value, tuple(position), tuple(velocity))
+    return shooting.on(data), Point(point.value, tuple(position), tuple(velocity))
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:

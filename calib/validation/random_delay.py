@@ -96,24 +96,20 @@ class DelayFit:
     found: RandomDelay
     before: Refined
 
-    def widened(self, known: Uncertainty) -> Uncertainty:
+    def widened(self, known: Uncertainty, latency_s: float) -> Uncertainty:
         """Return an uncertainty that is at least that of the fit with one constant delay.
 
-        Delays also take up a part of what else a model lacks. So they make intervals narrower only where
-        they leave nothing but noise.
+        Delays also take up a part of what else a model lacks, even where they leave nothing but noise. So
+        they make no interval narrower. ``latency_s`` is the mean delay.
         """
         before = with_rows(self.before)
         wide = uncertainty_at(before.shooting.problem, before)
         std = np.zeros(len(known.space))
         std[: len(wide.space)] = np.sqrt(np.diag(wide.covariance))
-        first, last = before.shooting.problem.latency_range_s
-        low, high = (
-            (a + b) / 2 + side * max(b - a, wide.latency_interval_s[1] - wide.latency_interval_s[0]) / 2
-            for side in (-1, 1)
-            for a, b in [known.latency_interval_s]
+        reach_s = wide.latency_reach_s(before.latency_s)
+        return known.widened_to(std).latency_widened_to(
+            reach_s, latency_s, before.shooting.problem.latency_range_s
         )
-        interval_s = max(low, first), min(high, last)
-        return replace(known.widened_to(std), latency_interval_s=interval_s)
 
 
 def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | None:

@@ -215,9 +215,9 @@ def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_star
 
 
 def test_halves_of_a_right_model_agree(problem: Problem, result: CalibrationResult) -> None:
-    """Two motions of one hinge: every parameter is compared, none is flagged."""
+    """Two motions of one hinge: every parameter and the latency are compared, none is flagged."""
     halves = result.provenance["split_half"]
-    assert set(halves["parameters"]) == set(problem.space.names) and halves["flagged"] == []
+    assert set(halves["parameters"]) == {*problem.space.names, "latency"} and halves["flagged"] == []
 
 
 class StoppedError(Exception):

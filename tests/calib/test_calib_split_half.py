@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deal_hw.bench.tasks import Case, make_case
-from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
+from deal_hw.calib.data.problem import Member, Problem
+from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
@@ -23,12 +23,12 @@ from deal_hw.calib.validation.checks import (
     agreement,
     check_split_half,
     half_of,
+    hold_shorter,
     judge,
     widened_by_split_half,
 )
-from deal_hw.calibration import BEFORE_SEARCH, Budget, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Z90, Budget, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
-from deal_hw.types import FloatArray
 
 
 def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refined: Refined) -> None:
@@ -53,7 +53,11 @@ def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Re
         for estimate, low, high in (row.first, row.second):
             assert estimate is None or low <= estimate <= high
     assert set(split.to_json()["parameters"]) == set(noisy_problem.space.names)
-    assert widened_by_split_half(known, split) is known
+    assert _widened(known, split) is known
+
+
+def _widened(known: Uncertainty, split: SplitHalf, latency_s: float = 0.012) -> Uncertainty:
+    return widened_by_split_half(known, split, latency_s, (0.0, 0.04))
 
 
 def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
@@ -65,13 +69,13 @@ def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
     ends = np.stack([problem.space.unnormalize(np.full(K, u)) for u in (0.05, 0.95)], axis=1)
     blind = dataclasses.replace(known, interval=ends, blind=np.ones(K, dtype=bool))
     low = problem.space.unnormalize(np.full(K, 0.01))
-    split = agreement(known, [low, noisy_refined.theta], [blind, known], 0)
+    split = agreement(known, [(low, 0.0), (noisy_refined.theta, 0.0)], [blind, known], None, 0)
     assert all(row.first[0] is None and row.second[0] is not None for row in split.rows)
     assert all(row.agree is None for row in split.rows) and split.flagged == ()
     assert split.to_json()["parameters"][problem.space.names[0]]["agree"] is None
     # The same two estimates from halves that tell them disagree, and are flagged.
     tight = dataclasses.replace(known, interval=np.stack([low, 1.01 * low], axis=1))
-    split = agreement(known, [low, noisy_refined.theta], [tight, known], 0)
+    split = agreement(known, [(low, 0.0), (noisy_refined.theta, 0.0)], [tight, known], None, 0)
     assert all(row.agree is False for row in split.rows)
     told = np.array(problem.space.names)[~known.blind]
     assert set(split.flagged) <= set(told) and "servo.stiffness" in split.flagged
@@ -89,7 +93,7 @@ def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
     far = noisy_problem.space.from_scale(far + 10 * std * np.eye(len(noisy_problem.space))[k])[k]
     reach = np.zeros(len(noisy_problem.space))
     reach[k] = 10 * std
-    wide = widened_by_split_half(known, SplitHalf((), ("servo.stiffness",), reach))
+    wide = _widened(known, SplitHalf((), ("servo.stiffness",), np.append(reach, 0.0)))
     assert wide.interval[k, 1] == pytest.approx(far)
     assert wide.interval[0] == pytest.approx(known.interval[0])
     assert any("disagree about servo.stiffness" in alarm.seen for alarm in wide.alarms)
@@ -104,17 +108,64 @@ def test_halves_that_differ_more_than_intervals_expect_widen_all_of_them(
     std, at = np.sqrt(np.diag(known.covariance)), problem.space.to_scale(theta)
     told = ~known.blind
 
-    def halves(off: float) -> list[FloatArray]:
-        return [problem.space.from_scale(at + side * off * std * told) for side in (-1, 1)]
+    def halves(off: float) -> list[Member]:
+        return [(problem.space.from_scale(at + side * off * std * told), 0.01) for side in (-1, 1)]
 
     wide = dataclasses.replace(known, interval=np.stack([problem.space.low, problem.space.high], axis=1))
-    split = agreement(known, halves(2.1), [wide, wide], 0)
+    split = agreement(known, halves(2.1), [wide, wide], None, 0)
     assert split.flagged == () and split.scale == pytest.approx(2.1 * np.sqrt(2), rel=1e-6)
     assert split.to_json()["scale"] == split.scale
-    wider = widened_by_split_half(known, split)
+    wider = _widened(known, split, noisy_refined.latency_s)
     assert np.sqrt(np.diag(wider.covariance)) == pytest.approx(split.scale * std)
-    by_chance = agreement(known, halves(0.7), [wide, wide], 0)
-    assert by_chance.scale == 1.0 and widened_by_split_half(known, by_chance) is known
+    # A given latency has no interval.
+    assert wider.latency_interval_s == known.latency_interval_s
+    by_chance = agreement(known, halves(0.7), [wide, wide], None, 0)
+    assert by_chance.scale == 1.0 and _widened(known, by_chance) is known
+
+
+def test_halves_disagree_about_the_latency_like_about_any_value(
+    noisy_problem: Problem, noisy_refined: Refined
+) -> None:
+    """By hand: 10 and 16 ms, with reaches of 1 ms each: the interval of +-1 ms around 12 ms holds both.
+
+    Where all values differ by more than chance, it is wider by the same factor, and its range cuts it off.
+    """
+    theta, known = noisy_refined.theta, uncertainty_at(noisy_problem, noisy_refined)
+    known = dataclasses.replace(known, latency_interval_s=(0.011, 0.013))
+    of_half = [dataclasses.replace(known, latency_interval_s=(t - 1e-3, t + 1e-3)) for t in (0.010, 0.016)]
+    split = agreement(known, [(theta, 0.010), (theta, 0.016)], of_half, 0.012, 0)
+    assert split.flagged == ("latency",) and split.reach[-1] == pytest.approx(0.004)
+    assert "latency (10 and 16 ms)" in split.alarms(noisy_problem.space)[0].seen
+    assert _widened(known, split, 0.012).latency_interval_s == pytest.approx((0.008, 0.016))
+    reach = np.zeros(len(theta) + 1)
+    three = SplitHalf((), (), reach, scale=3.0)
+    assert _widened(known, three, 0.012).latency_interval_s == pytest.approx((0.009, 0.015))
+    late = dataclasses.replace(known, latency_interval_s=(0.036, 0.04))
+    assert _widened(late, three, 0.039).latency_interval_s == pytest.approx((0.030, 0.04))
+
+
+def test_intervals_hold_what_shorter_windows_say(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """Stiffness five standard deviations lower in shorter windows: its interval reaches there, but for one.
+
+    By hand: what exceeds their own standard deviation, sqrt(25 - 1) of it, is added.
+    """
+    known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
+    space, std = noisy_problem.space, np.sqrt(np.diag(known.covariance))
+    k = space.names.index("servo.stiffness")
+    short = dataclasses.replace(noisy_refined, normal=dataclasses.replace(noisy_refined.normal, rows=()))
+    own = float(np.sqrt(uncertainty_at(noisy_problem, short).covariance[k, k]))
+    at = space.to_scale(noisy_refined.theta) - 5.0 * own * np.eye(len(space))[k]
+    short = dataclasses.replace(short, theta=space.from_scale(at))
+    wrong = dataclasses.replace(noisy_refined, chi2=2.0, shorter=short)
+    wide = hold_shorter(known, wrong.latency_s, wrong)
+    expected = std.copy()
+    expected[k] += np.sqrt(5.0**2 - 1.0) * own / Z90
+    assert np.sqrt(np.diag(wide.covariance)) == pytest.approx(expected, rel=1e-3)
+    assert wide.latency_interval_s == known.latency_interval_s
+    # Shorter windows that are explained worse ended in another minimum.
+    other = dataclasses.replace(wrong, shorter=dataclasses.replace(short, chi2=3.0))
+    same = hold_shorter(known, wrong.latency_s, other)
+    assert np.sqrt(np.diag(same.covariance)) == pytest.approx(std)
 
 
 def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:
