@@ -17,10 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
 
+import numpy as np
 import tyro
 from rich.markup import escape
 
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import CalibrationResult, percent
 from deal_hw.cli.calibrate import CalibrateReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
@@ -272,6 +273,7 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
             for name, value in result.space.known.items()
             if name in done.truth
         },
+        "median_error": _median_errors(done),
         "heldout_nrmse": dict(result.heldout_nrmse),
         "latency_s": {"true": done.latency_s, "found": result.latency_s},
         **{m.name: {policy: float(v.mean()) for policy, v in m.values.items()} for m in done.measures},
@@ -282,6 +284,21 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
         "cpu_seconds": stages.cpu_seconds,
         "paths": {"episode": str(done.episode), **done.paths},
     }
+
+
+def _median_errors(done: Demonstrated) -> dict[str, float]:
+    """Return the median relative error of the parameters that have a value, by estimate."""
+    result, beside = done.found.result, done.beside
+    has_value = [v != "not identifiable" for v in result.verdicts]
+    rows = [k for k, p in enumerate(result.space) if p.name in done.truth and has_value[k]]
+    if not rows:
+        return {}
+    truth = np.array([done.truth[result.space.names[k]] for k in rows])
+    estimates = {"the model as it is": result.space.nominal}
+    if beside is not None:
+        estimates[f"{done.beside_name} alone"] = beside.estimate
+    estimates["the calibration"] = result.estimate
+    return {name: float(np.median(np.abs(e[rows] / truth - 1))) for name, e in estimates.items()}
 
 
 def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationResult, folder: Path) -> None:
@@ -302,6 +319,9 @@ def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationR
     low, high = (1e3 * end for end in result.latency_interval_s)
     _add(table, "latency", "ms", "0", f"{1e3 * latency['found']:.1f}", (low, high), 1e3 * latency["true"])
     console.print(table)
+    if errors := summary["median_error"]:
+        each = ", ".join(f"{name} {percent(value)}" for name, value in errors.items())
+        console.print(f"median error of the parameters that have a value: {each}", markup=False)
     for command in (
         f"deal-hw inspect {summary['paths']['episode']} --calibration {folder / 'calibration'}",
         f"python3 -m webbrowser {folder / 'calibration' / 'report.html'}",

@@ -18,6 +18,7 @@ import mujoco
 import pytest
 
 from deal_hw.calib.pipeline import output_error_fits
+from deal_hw.calibration import percent
 from deal_hw.cli import demo_cartpole, demo_go2, demo_runs
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.demo import Demo, Stages, demo
@@ -70,6 +71,11 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     words = " ".join(end.split())
     assert "The policy trained under the calibration held the pole up for" in words
     assert words.count("in 1 deployment") == 2 and "\u00b1" not in end
+    of_nominal, of_search, of_all = summary["median_error"].values()
+    assert of_all < of_nominal and of_all < of_search
+    assert (
+        f"the model as it is {percent(of_nominal)}, deal alone {percent(of_search)}, the calibration" in words
+    )
     assert "cart.mass" in end and "latency" in end and end.count("estimates of the calibration") == 1
     inspect, page = end.strip().splitlines()[-2:]
     assert (
