@@ -99,7 +99,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             example="calibrate runs/first/dataset",
             extra="calib",
             function="calibrate_or_write_parameters",
-            common="model data columns parameters write_parameters holdout holdout_part leave_out method "
+            common="model data columns parameters write_parameters holdout leave_out method "
             "search known space out resume json quiet",
         ),
         "train": _verb(

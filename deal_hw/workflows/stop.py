@@ -14,7 +14,7 @@ from deal_hw.control.claim import LocalClaim
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.run_note import FoundRun, find_runs
 from deal_hw.drivers import claim_name, default_transport, make_robot, wire_claim
-from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.errors import ConfigurationError, DealHwError, PortBusyError
 from deal_hw.ranges import Checked, Range
 from deal_hw.signals import taken
 from deal_hw.transport import WireOptions
@@ -196,6 +196,26 @@ def _send(number: int, pids: Callable[[], list[int]]) -> None:
             os.kill(pid, number)
 
 
+def _claimed(resource: str, clock: Clock) -> LocalClaim:
+    """Return the claim on a robot, which is taken here.
+
+    A process that was killed keeps its claim until it is gone, which takes longest on a busy computer.
+
+    Raises:
+        PortBusyError: A run holds it for longer than a killed one can.
+    """
+    claim, end_ns = LocalClaim(resource), clock.now_ns() + round(TAKE_OVER_S * 1e9)
+    while True:
+        try:
+            claim.acquire()
+        except PortBusyError:
+            if clock.now_ns() >= end_ns:
+                raise
+            clock.sleep_until_ns(clock.now_ns() + round(_POLL_S * 1e9))
+        else:
+            return claim
+
+
 def _directly(settings: StopSettings, clock: Clock, say: Say) -> StopReport:
     """Make a robot passive that no run commands."""
 
@@ -211,7 +231,7 @@ def _directly(settings: StopSettings, clock: Clock, say: Say) -> StopReport:
     robot = make_robot(settings.robot, transport, settings.port, clock, settings.wire, own)
     try:
         with contextlib.ExitStack() as held:
-            held.enter_context(LocalClaim(_claim(settings)))
+            held.callback(_claimed(_claim(settings), clock).release)
             claim = wire_claim(settings.robot, transport, settings.port, clock, who(), settings.wire)
             if claim is not None:
                 claim.acquire()

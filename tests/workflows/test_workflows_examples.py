@@ -25,7 +25,7 @@ SCRIPTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "compare_models": ([], ("nominal: position error", "calibrated: position error", "compare.rrd")),
 }
 """Script -> arguments, and what it must have told at its end."""
-SHORT: dict[str, Any] = {"method": "eki", "refine": False, "population": 20, "generations": 3}
+SHORT: dict[str, Any] = {"refine": False, "population": 20, "generations": 3}
 """A calibration that ends at once, for a script in real time, for which other such tests have to wait."""
 NOTEBOOK = EXAMPLES / "hidden_payload.ipynb"
 EXECUTE = """

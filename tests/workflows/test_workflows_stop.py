@@ -13,13 +13,14 @@ from pathlib import Path
 import pytest
 
 from deal_hw.cli.main import main
-from deal_hw.clock import MonotonicClock
+from deal_hw.clock import MonotonicClock, VirtualClock
+from deal_hw.control.claim import LocalClaim
 from deal_hw.control.run_note import RunNote, find_runs
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError, PortBusyError, UnknownNameError
 from deal_hw.workflows import stop as module
 from deal_hw.workflows.emulation.process import EmulatorProcess
-from deal_hw.workflows.stop import StopSettings, stop
+from deal_hw.workflows.stop import StopSettings, _claimed, stop
 
 PATIENCE_S = 60.0
 HOLDER = """
@@ -151,6 +152,23 @@ def test_what_cannot_work_is_refused() -> None:
         StopSettings("cartpole", port="x", state_check="length")
 
 
+def test_a_killed_run_may_take_its_time_to_die() -> None:
+    """Its claim is free once its last process is gone; that of a run that lives is refused after 2 s."""
+    dying = LocalClaim("test of stop")
+    dying.acquire()
+
+    class Dying(VirtualClock):
+        def sleep_until_ns(self, deadline_ns: int) -> None:
+            super().sleep_until_ns(deadline_ns)
+            if self.now_ns() > 1_000_000_000:
+                dying.release()
+
+    _claimed("test of stop", Dying()).release()
+    with LocalClaim("test of stop"), pytest.raises(PortBusyError, match="in use by"):
+        _claimed("test of stop", clock := VirtualClock())
+    assert clock.now_ns() == 2_000_000_000
+
+
 def test_without_a_run_and_a_port_nothing_is_done(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,7 +217,6 @@ def test_a_go2_is_damped_whoever_holds_it(
     assert robot.told()[-1] == DAMPING
 
     monkeypatch.setattr(module, "OBEY_S", 0.5)
-    monkeypatch.setattr(module, "TAKE_OVER_S", 0.5)
     run = robot.run(*motion)
     for pid in robot.processes():
         os.kill(pid, signal.SIGSTOP)
