@@ -52,6 +52,8 @@ class DiagnosisSettings:
         poor: Chi2 that a cause may leave without explaining the share ``decisive`` [-]. Effects are computed
             around the fit. Where most of a residual of three times the noise stays unexplained, the fit is
             not the robot, and what remains can look like any cause.
+        reversals: Share that play must explain in a poor fit [-],
+        alone: and its deviance over that of each other signature [-].
         most_play: Widest play, as a share of the commands' span [-].
         least_play: Least play of a named joint, as a share of the widest one [-].
         sure: Least value of a named parameter that is 0 in the model, in its standard deviations [-].
@@ -71,6 +73,8 @@ class DiagnosisSettings:
     alike: float = 0.8
     decisive: float = 0.5
     poor: float = 9.0
+    reversals: float = 0.2
+    alone: float = 2.0
     most_play: float = 0.5
     least_play: float = 0.2
     sure: float = 5.0
@@ -442,6 +446,9 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
         groups = [g for g in groups if g[0].cause != group[0].cause]
     if found and not supported(1 - float(np.prod([1 - one.share for one in found])), chi2):
         found, taken = [], []
+        if (play := _alone_at_reversals(known)) is not None:
+            # A delay of its own for each command would take up a part of any residual.
+            return [play]
     left = chi2 * float(np.prod([1 - one.share for one in found]))
     varying, bursts = _varying_delay(known, taken), _bursts(known, known.residual(taken))
     if varying is not None and supported(varying.share, left):
@@ -450,6 +457,24 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     if bursts is not None and left * (1 - bursts.share) <= SETTINGS.burst_left:
         found.append(bursts)
     return sorted(found, key=lambda f: -f.deviance)
+
+
+def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
+    """Return play as the cause of a poor fit's residual, if no other signature comes near to it.
+
+    Effects of masses and friction are those around the fit, which is not the robot. Play acts where the
+    measured motion or load turns round, wherever the parameters are.
+    """
+    groups = [group for group in _groups(known.found) if _possible(known, [], group)]
+    gains = sorted(((known.gain([], group), k) for k, group in enumerate(groups)), reverse=True)
+    if not gains or groups[gains[0][1]][0].cause != "backlash":
+        return None
+    group, gain = groups[gains[0][1]], gains[0][0]
+    share = 1 - float(np.exp(-gain / known.count))
+    rival = gains[1][0] if len(gains) > 1 else 0.0
+    if share < SETTINGS.reversals or gain < SETTINGS.alone * rival:
+        return None
+    return _cause_diagnosis(known, [], group, share, gain)
 
 
 def _groups(found: Sequence[Signature]) -> list[list[Signature]]:

@@ -244,6 +244,23 @@ def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:
     assert [f.cause for f in name_causes(_evidence(load), 100.0)] == ["load"]
 
 
+def test_play_alone_stands_in_a_poor_fit() -> None:
+    """It acts where the measured motion turns round, wherever the parameters are; a mass there is a guess."""
+    known = _evidence(np.zeros((WINDOWS, SAMPLES)))
+    (play,) = [s for s in known.found if s.cause == "backlash"]
+    effect = play.columns[0][..., 0]
+    effect = effect * 20 * STD / np.std(effect)
+    strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
+    strange *= np.std(effect) / np.std(strange)
+    (found,) = name_causes(_evidence(effect + 0.8 * strange), 100.0)
+    assert found.cause == "backlash" and 0.3 < found.share < 0.5
+    # With another cause near to it nothing is named, nor where it explains little.
+    load = _moved_by(np.full((WINDOWS, SAMPLES), 1.0))
+    near = 0.7 * load * np.std(effect) / np.std(load)
+    assert name_causes(_evidence(effect + near + 1.5 * strange), 100.0) == []
+    assert name_causes(_evidence(effect + 1.6 * strange), 100.0) == []
+
+
 def test_a_residual_without_a_cause_is_placed(small_problem: Callable[..., Problem]) -> None:
     """A sensor is wrong in a part of the travel: the alarm names these positions, and no cause."""
     rng = np.random.default_rng(0)
