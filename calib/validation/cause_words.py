@@ -145,3 +145,14 @@ def _joints(model: Any, kind: str, element: str) -> list[str]:
         first, count = int(body.jntadr[0]), int(body.jntnum[0])
         return [model.joint(j).name for j in range(first, first + count)]
     return []
+
+
+def stretch_words(numbers: Sequence[int], unit_s: float) -> list[str]:
+    """Return stretches of time as text, from the numbers of the units of time that they cover, in order."""
+    found: list[list[int]] = []
+    for number in numbers:
+        if found and number <= found[-1][1] + 1:
+            found[-1][1] = number
+        else:
+            found.append([number, number])
+    return [f"{max(a - 0.5, 0.0) * unit_s:.2f} to {(b + 0.5) * unit_s:.2f} s" for a, b in found]

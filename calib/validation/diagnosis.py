@@ -22,7 +22,7 @@ from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
-from deal_hw.calib.validation.cause_words import LOOKS, SearchedKinds, advice
+from deal_hw.calib.validation.cause_words import LOOKS, SearchedKinds, advice, stretch_words
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
@@ -466,15 +466,13 @@ def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
     measured motion or load turns round, wherever the parameters are.
     """
     groups = [group for group in _groups(known.found) if _possible(known, [], group)]
-    gains = sorted(((known.gain([], group), k) for k, group in enumerate(groups)), reverse=True)
-    if not gains or groups[gains[0][1]][0].cause != "backlash":
-        return None
-    group, gain = groups[gains[0][1]], gains[0][0]
-    share = 1 - float(np.exp(-gain / known.count))
-    rival = gains[1][0] if len(gains) > 1 else 0.0
-    if share < SETTINGS.reversals or gain < SETTINGS.alone * rival:
-        return None
-    return _cause_diagnosis(known, [], group, share, gain)
+    rivals = [known.gain([], group) for group in groups if group[0].cause != "backlash"]
+    for group in (group for group in groups if group[0].cause == "backlash"):
+        gain = known.gain([], group)
+        share = 1 - float(np.exp(-gain / known.count))
+        if share >= SETTINGS.reversals and gain >= SETTINGS.alone * max(rivals, default=0.0):
+            return _cause_diagnosis(known, [], group, share, gain)
+    return None
 
 
 def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
@@ -592,20 +590,10 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     stretches = [
         f"{name} {stretch}".strip()
         for name in dict.fromkeys(known.names)
-        for stretch in _stretches(
+        for stretch in stretch_words(
             sorted({round(t / unit_s) for t in time[most][source[most] == name].tolist()}), unit_s
         )
     ]
     where = ", ".join(stretches[:5]) + (" and more" if len(stretches) > 5 else "")
     deviance = -len(each) * float(np.log(max(1 - share, 1e-300)))
     return _diagnosis(known, "contact", share, deviance, (), where)
-
-
-def _stretches(numbers: Sequence[int], unit_s: float) -> list[str]:
-    found: list[list[int]] = []
-    for number in numbers:
-        if found and number <= found[-1][1] + 1:
-            found[-1][1] = number
-        else:
-            found.append([number, number])
-    return [f"{max(a - 0.5, 0.0) * unit_s:.2f} to {(b + 0.5) * unit_s:.2f} s" for a, b in found]
