@@ -319,7 +319,7 @@ def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationR
     low, high = (1e3 * end for end in result.latency_interval_s)
     _add(table, "latency", "ms", "0", f"{1e3 * latency['found']:.1f}", (low, high), 1e3 * latency["true"])
     console.print(table)
-    if errors := summary["median_error"]:
+    if errors := summary.get("median_error"):  # Summaries of older runs have none.
         each = ", ".join(f"{name} {percent(value)}" for name, value in errors.items())
         console.print(f"median error of the parameters that have a value: {each}", markup=False)
     for command in (
