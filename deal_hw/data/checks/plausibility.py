@@ -78,15 +78,14 @@ def examine(
     middle = [rate, _gaps(clock), jumps, _frozen(table), speed_verdict(table), _commands(table, efforts)]
     if not table.command_s.size or not table.actuated:
         return (*first, *middle)
-    units = _units(table, limits)
+    units, other_unit = _units(table, limits)
     # Positions in another unit than commands also lie far from them and outside the limits: no other cause.
-    comparable = _OTHER_UNIT not in units.message
     return (
         *first,
         *middle,
         _copy(table),
         units,
-        *([_levels(table), _inside_limits(table, limits)] if comparable else []),
+        *([] if other_unit else [_levels(table), _inside_limits(table, limits)]),
         *match(table),
         _slip(kept or table),
         _clipped_commands(table, limits),
@@ -323,13 +322,15 @@ def _slip(table: Table) -> CheckResult:
     )
 
 
-_OTHER_UNIT = "range is about"
-"""In the message of a joint whose positions and commands have different units."""
 _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
 
 
-def _units(table: Table, limits: FloatArray | None) -> CheckResult:
-    """Compare the spans of command and measurement, and both with the model's limits."""
+def _units(table: Table, limits: FloatArray | None) -> tuple[CheckResult, bool]:
+    """Compare the spans of command and measurement, and both with the model's limits.
+
+    Returns:
+        The result, and whether commands and positions of a joint have different units.
+    """
     held, found = table.target_at(table.time_s), list[str]()
     alike_factor: dict[tuple[str, float], list[str]] = {}
     for column, index in enumerate(table.actuated_index):
@@ -340,7 +341,7 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
             continue
         ratio = spans[0] / spans[1]
         factors = [
-            (f"the {larger}'s {_OTHER_UNIT} {factor:.3g} times the {smaller}'s", factor)
+            (f"the {larger}'s range is about {factor:.3g} times the {smaller}'s", factor)
             for factor in _FACTORS
             for larger, smaller, share in (
                 ("command", "measurement", ratio / factor),
@@ -363,7 +364,7 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
     found += _beyond_limits(table, limits, explained)
     if found:
         text = f"{'; '.join(found)}. Give the unit in the column map (unit, target_unit, normalised)"
-        return _verdict("units", Severity.FAIL, text)
+        return _verdict("units", Severity.FAIL, text), bool(explained)
     suspects = [
         f"{name} ({bottom}..{top})"
         for name, index in zip(table.actuated, table.actuated_index, strict=True)
@@ -375,8 +376,8 @@ def _units(table: Table, limits: FloatArray | None) -> CheckResult:
             f"positions that seem normalised (they fill a range without a unit): {', '.join(suspects)}; if "
             "they are, give `normalised` in the column map"
         )
-        return _verdict("units", Severity.WARN, text)
-    return _verdict("units", Severity.OK, "ranges of commands and measurements agree")
+        return _verdict("units", Severity.WARN, text), False
+    return _verdict("units", Severity.OK, "ranges of commands and measurements agree"), False
 
 
 def _levels(table: Table) -> CheckResult:
