@@ -86,8 +86,8 @@ def divided(name: str) -> tuple[str, str]:
 
 
 def with_search(pipeline: str, search: str) -> str:
-    """Return the name of a pipeline with a search inside it."""
-    return pipeline if search == DEFAULT_SEARCH else f"{pipeline}+{search}"
+    """Return the name of a pipeline with a search inside it; the same name where it has none."""
+    return pipeline if search == DEFAULT_SEARCH or pipeline not in SEARCHING else f"{pipeline}+{search}"
 
 
 def search_of(name: str) -> str:

@@ -54,6 +54,7 @@ def trust(result: CalibrationResult) -> Trust:
     if "shared_error" in result.provenance:
         first = result.alarms[0]
         return Trust("red", first.seen, first.means, f"Do not use it. {first.do}")
+    record = ""
     if nominal is None or calibrated is None:
         record = "Record one more motion and name it with --holdout."
         if mismatch:
@@ -69,7 +70,6 @@ def trust(result: CalibrationResult) -> Trust:
             "Do not use it. Check units, signs and joint order of the recordings, then the alarms.",
         )
     elif calibrated * WORSE >= nominal:
-        record = ""
         error = calibration.percent(calibrated)
         gain = f"On held-out motion the model errs by {error} of the signal's range, as yours."
         if mismatch:
@@ -80,7 +80,6 @@ def trust(result: CalibrationResult) -> Trust:
                 "Keep your own model until that is found." + _first_cause(result),
             )
     else:
-        record = ""
         smaller = nominal / max(calibrated, 1e-300)
         gain = f"On held-out motion the error is {smaller:.1f} times smaller than your own model's."
     if mismatch:

@@ -60,7 +60,7 @@ def prepare_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Sa
     space = settings.searched(space)
     episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
-    if search_of(settings.named(settings.method or "default")) in CLOSED_LOOP_METHODS:
+    if search_of(settings.named()) in CLOSED_LOOP_METHODS:
         runs = {i: episodes_read[i].metadata for i in fit}
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, runs, description, given)

@@ -64,7 +64,7 @@ def prepare(
 def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say = silent) -> str:
     """Return the named method, or the one that suits the recordings."""
     if settings.method:
-        return settings.named(settings.method)
+        return settings.named()
     fit_given = settings.residual_std not in ((), None) or not settings.refine
     real = settings.recordings.model is not None or carries_robot(settings.dataset)
     method = method_for(work, fit_given=fit_given, searches=settings.search != DEFAULT_SEARCH, real=real)

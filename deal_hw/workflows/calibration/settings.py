@@ -232,23 +232,22 @@ class CalibrateSettings(Checked):
                 f"--method {self.method}: that is a search; --search {self.method} runs it where the local "
                 f"fit does not explain the recordings, --search {self.method} --no-refine runs it alone"
             )
-        check_method(self.named(self.method or "default"))
+        check_method(self.named())
         if self.method and self.method not in SEARCHING:
             refuse(
                 given(self, CalibrateSettings(), ("search",)), f"--method {self.method} has no search inside"
             )
         own = self.recordings.model is not None or carries_robot(self.dataset)
-        check_policy(self.named(self.method or "default"), given=self.policy is not None, model=own)
+        check_policy(self.named(), given=self.policy is not None, model=own)
 
-    def named(self, pipeline: str) -> str:
-        """Return the name of a pipeline with the search that is asked for."""
-        return with_search(pipeline, self.search) if pipeline in SEARCHING else pipeline
+    def named(self, pipeline: str = "") -> str:
+        """Return the name of a pipeline, by default the one that is asked for, with its search."""
+        return with_search(pipeline or self.method or "default", self.search)
 
     @property
     def budget(self) -> Budget:
         """Budget of the method."""
-        method = self.named(self.method or "default")
-        return usual_budget(method, self.population, self.generations, refine=self.refine)
+        return usual_budget(self.named(), self.population, self.generations, refine=self.refine)
 
     def known_std(self, robot: RobotModel) -> FloatArray | None:
         """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
