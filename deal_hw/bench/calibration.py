@@ -94,7 +94,7 @@ def make_cells(
     Raises:
         UnknownNameError: There is no such task or method.
     """
-    from deal_hw.calib.pipeline.methods import check_method
+    from deal_hw.calib.pipeline.methods import check_method, is_default
 
     for task in tasks:
         if task not in TASKS:
@@ -112,7 +112,7 @@ def make_cells(
             checkpoint="" if policy is None else policy.stem,
             policy=policy,
             method=method,
-            refined=refine_all or method == "default",
+            refined=refine_all or is_default(method),
             range_ratio=range_ratio,
             seed=seed,
         )

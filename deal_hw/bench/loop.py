@@ -18,7 +18,7 @@ import numpy as np
 from deal_hw.bench.rows import Cells, per_parameter
 from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
-from deal_hw.calib.pipeline.methods import check_method
+from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -82,6 +82,7 @@ def calibration_row(
         "seconds": result.seconds,
         "flagged": bool(result.alarms) or bool(untold),
         "chi2": result.chi2,
+        "search": result.provenance.get("search", ""),
         "alarms": [str(alarm) for alarm in result.alarms],
         "untold": untold,
         "null_directions": list(result.null_directions),
@@ -198,7 +199,7 @@ def loop_row(
         threads: Simulation threads.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    refine = method == "default"
+    refine = is_default(method)
     row: dict[str, Any] = {
         "bench": "loop",
         "task": "cartpole",

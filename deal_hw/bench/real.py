@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import Cells, Row
-from deal_hw.calib.pipeline.methods import check_method
+from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
@@ -130,7 +130,7 @@ def cells(
 
     runs = []
     for seed, method in itertools.product(seeds, methods):
-        refine = method == "default" or refine_all
+        refine = is_default(method) or refine_all
         runs.append(((task, split, method, refine, range_ratio, seed), make(method, seed, refine)))
     return Cells(names=KEY, runs=runs)
 

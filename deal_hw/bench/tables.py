@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from deal_hw.calib.pipeline.methods import is_default
+
 
 def line(row: Mapping[str, Any]) -> str:
     """Return one row in words."""
@@ -101,7 +103,7 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 def method_name(row: Mapping[str, Any]) -> str:
     """Return a row's method, and whether a refinement followed, if that is a choice."""
     method = str(row["method"])
-    return f"{method} + refinement" if row.get("refined") and method != "default" else method
+    return f"{method} + refinement" if row.get("refined") and not is_default(method) else method
 
 
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
