@@ -23,7 +23,10 @@ PIPELINES = ("default", "output-error", "local", "gait", "nominal")
 SEARCHES = ("deal", "eki", "deal-paper")
 """Searches inside a pipeline, as a user names them."""
 
-DEFAULT_SEARCH: Final = "eki"
+SEARCH_VARIANTS = ("deal-critic", "deal-untrained", "deal-no-critic")
+"""Parts of `deal`, for comparison: `bench` takes them inside a pipeline, too."""
+
+DEFAULT_SEARCH: Final = "deal"
 """The search where none is named."""
 
 SEARCHING = frozenset({"default", "output-error"})
@@ -33,6 +36,9 @@ METHODS: dict[str, str] = {
     "default": "deal_hw.calib.pipeline.stages:CalibrationPipeline",
     "eki": "deal_hw.calib.search.eki:Eki",
     "deal": "deal_hw.calib.search.deal:Deal",
+    "deal-critic": "deal_hw.calib.search.deal:critic_alone",
+    "deal-untrained": "deal_hw.calib.search.deal:untrained",
+    "deal-no-critic": "deal_hw.calib.search.deal:without_critic",
     "deal-paper": "deal_hw.calib.search.algorithm1:paper",
     "deal-paper-literal": "deal_hw.calib.search.algorithm1:literal",
     "deal-paper-fn": "deal_hw.calib.search.algorithm1:without_noise_adaptation",
@@ -90,6 +96,11 @@ def with_search(pipeline: str, search: str) -> str:
     return pipeline if search == DEFAULT_SEARCH or pipeline not in SEARCHING else f"{pipeline}+{search}"
 
 
+def is_default(name: str) -> bool:
+    """Return whether a method is the default pipeline, whatever search it has."""
+    return divided(name)[0] == "default"
+
+
 def search_of(name: str) -> str:
     """Return the search of a method, which is the method itself where it is no pipeline."""
     pipeline, search = divided(name)
@@ -101,8 +112,8 @@ def check_method(name: str) -> None:
     pipeline, search = divided(name)
     if pipeline not in METHODS:
         raise UnknownNameError("calibration method", name, METHODS)
-    if search and search not in SEARCHES:
-        raise UnknownNameError("search", search, SEARCHES)
+    if search and search not in SEARCHES + SEARCH_VARIANTS:
+        raise UnknownNameError("search", search, SEARCHES + SEARCH_VARIANTS)
 
 
 def usual_population(name: str) -> int:

@@ -6,11 +6,11 @@ reason:
 
 - Input of the critic: innovations of short windows that restart at recorded states, not whole rollouts. After
   the first second, a replay of an unstable robot has little information about its parameters.
-- Output per member: not one score, but the mean of every hidden activation and of the output. One number per
-  member and a softmax lose what the critic knows. With the paper's update even the exact prediction error as
-  fitness ends at 27-54 % error.
-- Update: an ensemble Kalman step regresses parameters on those statistics towards the recording's own
-  statistics, instead of the denoising step of eqs. 1-3 and 8-10.
+- Output per member: not one score, but the mean of every hidden activation and of the output, and beside
+  them the innovations themselves. One number per member and a softmax lose what the critic knows. With the
+  paper's update even the exact prediction error as fitness ends at 27-54 % error.
+- Update: an ensemble Kalman step regresses parameters on those values towards the recording's own values,
+  instead of the denoising step of eqs. 1-3 and 8-10.
 
 The critic is a WGAN-GP of 64-64 units with Adam, not a clipped WGAN of 256-256 (section 3.1): with clipped
 weights, hidden features hardly depend on the parameters.
@@ -38,6 +38,7 @@ from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import KalmanStepper
 from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 _CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
@@ -55,11 +56,14 @@ class DealSettings:
         widen: Least spread of a coordinate at the start of each further stage, in logits.
         least_spread: Spread below which members cannot be separated and the search ends, in logits.
         near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
-        keep: Share of the statistics' residual that one step leaves (noise-free recordings).
+        keep: Share of the residual that one step leaves (noise-free recordings, without innovations).
         step_clip: Largest step of a coordinate, in logits.
         alarm_chi2: Chi2 of a noisy recording above which the result carries an alarm.
         noise_draws: Draws of the noise that estimate its effect on the statistics (noisy recordings).
         smooth_draws: Number of these draws in a member's mean statistics.
+        innovations: Whether the update regresses on the innovations, too, as that of `eki`.
+        features: Whether it regresses on the critic's statistics; off is a search without a critic.
+        trained: Whether the critic is trained; off leaves the features of its random first weights.
     """
 
     critic: CriticSettings = field(default_factory=lambda: _CRITIC)
@@ -74,6 +78,18 @@ class DealSettings:
     alarm_chi2: float = 3.0
     noise_draws: int = 100
     smooth_draws: int = 4
+    innovations: bool = True
+    features: bool = True
+    trained: bool = True
+
+    def __post_init__(self) -> None:
+        if not (self.innovations or self.features):
+            raise ConfigurationError("without innovations and features nothing is left to fit; set one")
+
+    @property
+    def with_critic(self) -> bool:
+        """Whether a critic learns."""
+        return self.features and self.trained
 
 
 class _Deal(KalmanStepper):
@@ -102,15 +118,15 @@ class _Deal(KalmanStepper):
         z = self.kalman.ask()
         members, centre = self.population(z)
         residual, gap = self._view.residual(members, centre)
-        # Statistics of noisy recordings are whitened by their noise, so the tempering ends at the noise.
-        # Noise-free ones have no such end: each step leaves a fixed share of the residual.
-        step = self.kalman.tell(residual, keep=None if self._noisy else self.settings.keep)
+        # Innovations and statistics of noisy recordings are whitened by their noise, so the tempering ends
+        # there. Noise-free statistics alone have no such end: each step leaves a share of the residual.
+        ends = self._noisy or self.settings.innovations
+        step = self.kalman.tell(residual, keep=None if ends else self.settings.keep)
         self._spread = step.spread
-        self.log.note(
-            f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
-            members,
-            {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
-        )
+        values = {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation}
+        if self.settings.with_critic:
+            values["wasserstein"] = gap
+        self.log.note(f"misfit {step.misfit:.3g}, spread {step.spread:.3g}", members, values)
         self._skip_empty_stages()
 
     def result(self) -> CalibrationResult:
@@ -199,10 +215,19 @@ class _View(Stateful, abc.ABC):
     ) -> tuple[FloatArray, FloatArray, float]:
         """Train the critic; return whitened statistics of recording and members, and the distance."""
 
-    def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
-        """Return the recording's statistics minus each member's, (N, F), and the Wasserstein estimate.
+    def _whitened(self, difference: FloatArray) -> FloatArray:
+        """Return recording minus sound members, (N, n, width), in units of the noise, (N, n width)."""
+        return difference.reshape(len(difference), -1)
 
-        Innovations are relative to the prediction of ``centre``.
+    def _unit(self, innovations: FloatArray) -> float:
+        """Return the unit of the statistics beside innovations in units of the noise, (N, F)."""
+        return 1.0
+
+    def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
+        """Return the recording's values minus each member's, (N, F), and the Wasserstein estimate.
+
+        Values are the critic's statistics and the innovations, the latter relative to the prediction of
+        ``centre``. The estimate is nan without a critic.
         """
         parts = [self._innovations(members, centre, data) for data in self._windows]
         real = np.concatenate([part[0] for part in parts])
@@ -210,10 +235,24 @@ class _View(Stateful, abc.ABC):
         good = np.isfinite(fake).all(axis=(1, 2))
         if not good.any() or not np.isfinite(real).all():
             return np.full((len(fake), 1), np.nan), float("nan")
-        target, found, gap = self._statistics(real, np.nan_to_num(fake), good)
-        residual = target - found
-        residual[~good] = np.nan
+        kinds, gap = [], float("nan")
+        if self._settings.features:
+            target, found, gap = self._statistics(real, np.nan_to_num(fake), good)
+            kinds.append((target - found)[good])
+        if self._settings.innovations:
+            innovations = self._whitened(real - fake[good])
+            if kinds:
+                kinds[0] *= self._unit(innovations)
+            kinds.append(innovations)
+        residual = np.full((len(fake), sum(kind.shape[1] for kind in kinds)), np.nan)
+        residual[good] = np.concatenate(kinds, axis=1)
         return residual, gap
+
+    def _train(self, real: Samples, fake: Samples) -> float:
+        """Update the critic; return the Wasserstein estimate, nan where it stays untrained."""
+        if not self._settings.with_critic:
+            return float("nan")
+        return self._critic.train(real, fake.reshape(-1, real.shape[1]))
 
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
         # Windows of distant members run away by many scales. Without a limit the critic would fit those
@@ -225,6 +264,11 @@ class _View(Stateful, abc.ABC):
 
 class _CleanView(_View):
     """Noise-free recordings: one sample is one window of innovations at the control rate."""
+
+    @property
+    def _at(self) -> slice:
+        """The samples of a window at the control rate."""
+        return slice(self._every - 1, None, self._every)
 
     def _width(self) -> int:
         return self._ticks * len(self._problem.channels)
@@ -239,13 +283,12 @@ class _CleanView(_View):
     def _innovations(
         self, members: Members, centre: Members, data: WindowData
     ) -> tuple[FloatArray, FloatArray]:
-        at = slice(self._every - 1, None, self._every)
         both = Members(
             np.concatenate([members.theta, centre.theta]),
             np.concatenate([members.latency_s, centre.latency_s]),
         )
-        predicted = predict(self._problem, both, data).observed[:, :, at]
-        real = data.measured[:, at] - predicted[-1]
+        predicted = predict(self._problem, both, data).observed[:, :, self._at]
+        real = data.measured[:, self._at] - predicted[-1]
         fake = predicted[:-1] - predicted[-1]
         return real.reshape(len(real), -1), fake.reshape(*fake.shape[:2], -1)
 
@@ -254,12 +297,20 @@ class _CleanView(_View):
     ) -> tuple[FloatArray, FloatArray, float]:
         scale = np.maximum(np.sqrt(np.mean(fake[good] ** 2, axis=(0, 1))), 1e-12)
         data, imitation = self._join(real, scale), self._join(fake, scale)
-        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
+        gap = self._train(data, imitation[good])
         target, found = self._critic.statistics(data[None])[0], self._critic.statistics(imitation)
         std = found[good].std(axis=0)
         # Units that are never active carry no information and would divide by zero.
         alive = std > 1e-6 * max(float(std.max()), 1e-30)
         return target[alive] / std[alive], found[:, alive] / std[alive], gap
+
+    def _whitened(self, difference: FloatArray) -> FloatArray:
+        std = np.concatenate([data.std[:, self._at].reshape(len(data.std), -1) for data in self._windows])
+        return super()._whitened(difference / std)
+
+    def _unit(self, innovations: FloatArray) -> float:
+        # Statistics without a noise of their own count as much as innovations of the same spread.
+        return float(np.sqrt(np.mean(innovations.var(axis=0))))
 
 
 class _NoisyView(_View):
@@ -298,7 +349,7 @@ class _NoisyView(_View):
         scale = np.sqrt(1.0 + np.mean(fake[good] ** 2, axis=(0, 1)))
         noise = draws[self._rng.integers(len(draws), size=len(fake))]
         data, imitation = self._join(real, scale), self._join(fake + noise, scale)
-        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
+        gap = self._train(data, imitation[good])
         target = self._critic.statistics(data[None])[0]
         repeats = [
             self._critic.statistics(self._join(fake + d, scale)) for d in draws[: settings.smooth_draws]
@@ -315,8 +366,23 @@ class _NoisyView(_View):
 
 @dataclass(frozen=True)
 class Deal(Search):
-    """Critic features and an ensemble Kalman step."""
+    """Critic features, innovations, and an ensemble Kalman step."""
 
-    name = "deal"
-    stepper = _Deal
     settings: DealSettings = field(default_factory=DealSettings)
+    name: str = "deal"
+    stepper = _Deal
+
+
+def critic_alone() -> Deal:
+    """Return `deal` that regresses on the critic's features alone."""
+    return Deal(DealSettings(innovations=False), "deal-critic")
+
+
+def untrained() -> Deal:
+    """Return `deal` with a critic that is never trained."""
+    return Deal(DealSettings(trained=False), "deal-untrained")
+
+
+def without_critic() -> Deal:
+    """Return `deal` that regresses on the innovations alone, without a critic."""
+    return Deal(DealSettings(features=False), "deal-no-critic")
