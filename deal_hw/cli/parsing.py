@@ -137,6 +137,8 @@ def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:
     if NoneType not in kinds or len(kinds) != 2:
         return None
     (kind,) = kinds - {NoneType}
+    if get_origin(kind) is Literal:
+        return f"{{{','.join(map(str, get_args(kind)))}}}"
     return "True|False" if kind is bool else str(getattr(kind, "__name__", kind)).upper()
 
 

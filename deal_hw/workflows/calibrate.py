@@ -184,7 +184,7 @@ def calibrate(
     spike_ratio: float = CalibrateSettings.spike_ratio,
     heldout_window_s: float = HELDOUT_WINDOW_S,
     method: str = "",
-    search: Literal["deal", "eki", "deal-paper"] = CalibrateSettings.search,
+    search: Literal["deal", "eki", "deal-paper"] | None = None,
     checks: Literal["usual", "all"] = CalibrateSettings.checks,
     refine: bool = True,
     population: int | None = None,

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.pipeline.methods import DEFAULT_SEARCH
 from deal_hw.calibration import CalibrationResult, ProgressCallback
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.carried import prepare_carried
@@ -67,7 +66,7 @@ def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say 
         return settings.named()
     fit_given = settings.residual_std not in ((), None) or not settings.refine
     real = settings.recordings.model is not None or carries_robot(settings.dataset)
-    method = method_for(work, fit_given=fit_given, searches=settings.search != DEFAULT_SEARCH, real=real)
+    method = method_for(work, fit_given=fit_given, searches=settings.search is not None, real=real)
     if work.walks and method == "gait":
         say(WALK_TELLS)
     if method != "default":

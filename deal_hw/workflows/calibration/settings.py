@@ -121,11 +121,12 @@ class CalibrateSettings(Checked):
     --residual-std or --no-refine, and for all else. Baselines to compare with: easi, easi-log, bo, bo-critic,
     cma, gauss-newton, least-squares, least-squares-random, least-squares-multistart, ekf, ekf-one-pass,
     mujoco-sysid, random, midpoint, midpoint-linear, and variants of the DEAL paper's Algorithm 1:
-    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay."""
+    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay; and parts of deal:
+    deal-critic, deal-untrained, deal-no-critic."""
 
-    search: Literal["deal", "eki", "deal-paper"] = DEFAULT_SEARCH
-    """The search of default and output-error. deal: a critic tells recording and simulators apart, and the
-    population moves to where it cannot. eki: an ensemble Kalman search, without a critic.
+    search: Literal["deal", "eki", "deal-paper"] | None = None
+    """The search of default and output-error, by default deal. deal: a critic tells recording and simulators
+    apart, and the population moves to where it cannot. eki: an ensemble Kalman search, without a critic.
     deal-paper: the DEAL paper's Algorithm 1. With --no-refine the search alone."""
 
     policy: File | None = None
@@ -242,7 +243,7 @@ class CalibrateSettings(Checked):
 
     def named(self, pipeline: str = "") -> str:
         """Return the name of a pipeline, by default the one that is asked for, with its search."""
-        return with_search(pipeline or self.method or "default", self.search)
+        return with_search(pipeline or self.method or "default", self.search or DEFAULT_SEARCH)
 
     @property
     def budget(self) -> Budget:
