@@ -64,6 +64,8 @@ def torch_threads(count: int) -> Iterator[None]:
 class Critic(Stateful):
     """A network with two hidden layers, ReLU, and one output (the paper's D).
 
+    ``diverged`` is the number of rounds of training whose weights were not finite, and which were undone.
+
     Args:
         inputs: Width of a sample.
         settings: Size and training.
@@ -77,6 +79,7 @@ class Critic(Stateful):
     ) -> None:
         self.settings = settings
         self._threads = threads
+        self.diverged = 0
         self.generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         first, second = settings.hidden
         self.layers = [nn.Linear(inputs, first), nn.Linear(first, second), nn.Linear(second, 1)]
@@ -116,7 +119,8 @@ class Critic(Stateful):
 
         Samples are (n, inputs). Those of the simulators come in blocks that are never joined: a replay of 50
         generations of 200 x 200 transitions is 72 MB. Return the estimate of the Wasserstein distance in the
-        last update: mean output on real minus fake samples.
+        last update: mean output on real minus fake samples. If the weights diverge, they go back to what they
+        were before, and the estimate is nan.
         """
         settings = self.settings
         data = torch.from_numpy(real)
@@ -131,11 +135,16 @@ class Critic(Stateful):
             imitation[mine] = block[other[mine] - (ends[i] - len(block))]
         shape = (settings.updates, settings.batch, real.shape[1])
         batches, copies = data[rows].reshape(shape), torch.from_numpy(imitation).reshape(shape)
-        gap = 0.0
+        gap, sound = 0.0, self.save()
         with self._pool() as pool:
             for k in range(settings.updates):
                 gap = self._update(batches[k], copies[k], pool)
-        return gap
+        if all(bool(torch.isfinite(parameter).all()) for parameter in self._parameters):
+            return gap
+        # The generator goes on: the same draws would diverge again.
+        self.load({**sound, "generator": self.generator.get_state().numpy()})
+        self.diverged += 1
+        return float("nan")
 
     def save(self) -> State:
         """Return weights, the optimiser's memory and the generator as arrays."""
@@ -147,6 +156,7 @@ class Critic(Stateful):
                 for number, state in memory.items()
             },
             "generator": self.generator.get_state().numpy().copy(),
+            "diverged": self.diverged,
         }
 
     @torch.no_grad()
@@ -162,6 +172,7 @@ class Critic(Stateful):
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": memory, "param_groups": groups})
         self.generator.set_state(torch.tensor(state["generator"]))
+        self.diverged = state["diverged"]
 
     def score(self, samples: Samples, chunk: int = 2048) -> Samples:
         """Return the output on samples, (n,)."""

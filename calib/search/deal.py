@@ -37,7 +37,7 @@ from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import KalmanStepper
 from deal_hw.calib.search.resume import Stateful
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -95,7 +95,7 @@ class DealSettings:
 class _Deal(KalmanStepper):
     """A run of `deal`: stages of windows, one round of critic updates and one Kalman step a generation."""
 
-    STATE = ("kalman", "_stage", "_spread", "_view")
+    STATE = ("kalman", "_stage", "_spread", "_view", "_diverged")
 
     settings: DealSettings
 
@@ -105,6 +105,7 @@ class _Deal(KalmanStepper):
         self._least_spread = settings.near_spread if self._brief else settings.least_spread
         self._most = min(settings.generations, log.budget.generations)
         self._view: _View
+        self._diverged = 0
         self._enter_stage(0)
         self._skip_empty_stages()
 
@@ -133,6 +134,14 @@ class _Deal(KalmanStepper):
         members, centre = self.population(self.kalman.ask())
         chi2 = explained(self.problem, centre, self._lengths[-1])
         alarms = []
+        if diverged := self._diverged + self._view.diverged:
+            alarms.append(
+                Alarm(
+                    f"The critic's training diverged in {diverged} of {len(self.log.trace)} generations.",
+                    "Its last sound weights were used there, and they tell less about the simulators.",
+                    "Search again with another --seed, or with --search eki, which has no critic.",
+                )
+            )
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
         if self._noisy and not chi2 <= self.settings.alarm_chi2:
             alarms.append(self.log.unexplained(chi2))
@@ -164,6 +173,7 @@ class _Deal(KalmanStepper):
 
     def _enter_stage(self, stage: int) -> None:
         super()._enter_stage(stage)
+        self._diverged += self._view.diverged if stage else 0
         self._spread = float("inf")
         kind: type[_View] = _NoisyView if self._noisy else _CleanView
         self._view = kind(self.problem, self.settings, self._lengths[stage], self.rng, stage > 0)
@@ -194,6 +204,11 @@ class _View(Stateful, abc.ABC):
         spread = np.maximum(context.std(axis=0), 1e-9)
         self._context = np.asarray((context - context.mean(axis=0)) / spread, dtype=np.float32)
         self._critic = PenaltyCritic(self._width() + self._context.shape[1], settings.critic, rng)
+
+    @property
+    def diverged(self) -> int:
+        """How often the critic's training diverged, and was undone."""
+        return self._critic.diverged
 
     @abc.abstractmethod
     def _width(self) -> int:

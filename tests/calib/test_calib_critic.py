@@ -123,3 +123,20 @@ def test_thread_count_is_restored() -> None:
     with torch_threads(1):
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("kind", [ClippedCritic, PenaltyCritic])
+def test_a_round_that_diverges_is_undone(kind: type[Critic]) -> None:
+    """The weights go back, the estimate is nan, and the generator goes on to other draws."""
+    rng = np.random.default_rng(0)
+    critic = kind(2, CriticSettings(hidden=(8, 8), updates=2, batch=16), rng)
+    real, fake = (rng.standard_normal((50, 2)).astype(np.float32) for _ in range(2))
+    assert np.isfinite(critic.train(real, fake)) and critic.diverged == 0
+    before = critic.save()
+    assert np.isnan(critic.train(np.full_like(real, np.nan), fake))
+    after = critic.save()
+    assert after["diverged"] == critic.diverged == 1
+    for was, now in zip(before["weights"], after["weights"], strict=True):
+        np.testing.assert_array_equal(was, now)
+    assert not np.array_equal(before["generator"], after["generator"])
+    assert np.isfinite(critic.train(real, fake)) and critic.diverged == 1

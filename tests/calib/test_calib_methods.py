@@ -27,6 +27,7 @@ from deal_hw.calib.pipeline.methods import (
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings, _Box
+from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
@@ -287,6 +288,18 @@ def test_parts_of_deal_differ_in_what_the_update_sees(noise: float) -> None:
         assert ("wasserstein" in found[name].trace[-1]) == trained
     estimates = np.array([result.estimate for result in found.values()])
     assert len(np.unique(estimates, axis=0)) == len(found)
+
+
+def test_a_critic_that_diverges_is_said_and_the_search_goes_on() -> None:
+    """Adam with a step of 1e38 has no finite weights; the innovations still move the population."""
+    wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
+    problem, truth = small_problem(), two_parameters()[1]
+    budget = Budget(population=30, generations=20)
+    result = Deal(DealSettings(critic=wild)).run(problem, budget, np.random.default_rng(0))
+    generations = len(result.trace)
+    assert f"diverged in {generations} of {generations} generations" in result.alarms[0].seen
+    assert "--search eki" in result.alarms[0].do
+    assert np.abs(np.log(result.estimate / truth)).max() < 0.01
 
 
 def test_deal_without_anything_to_fit_is_refused() -> None:
