@@ -16,7 +16,14 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.wider_models import WiderFit
-from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import (
+    BEFORE_SEARCH,
+    Alarm,
+    Budget,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+)
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
@@ -130,6 +137,15 @@ class CalibrationRun:
         """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""
         if self.progress is not None:
             self.progress(Progress(stage, done, total, message, **candidate))
+
+    def say_search(self) -> None:
+        """Report that the search begins, of which kind, and why; nothing where it stands in for none."""
+        name = self.attempts.search.name
+        if name == "nominal":
+            return
+        kind = "an adversarial search" if name.startswith("deal") else "a search"
+        why = "" if self.local is None else "the local fit leaves more than noise, so "
+        self.say(BEFORE_SEARCH, f"{why}{kind} follows ({name})")
 
     def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""

@@ -154,6 +154,7 @@ class OutputErrorFits(Fits):
         problem = first.plain.problem
         # The fits continue from the search's estimate, so it only has to find the neighbourhood.
         run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
+        run.say_search()
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
         run.offer("search", searched)
         # Drawn after the search, so that a resumed run draws the same seed.

@@ -237,6 +237,7 @@ class Refinement(Fits):
         """Search, refine, and let cross-validation decide about the refinement. See :meth:`Fits.best`."""
         settings, left, floating = self.restarts, run.budget.generations, run.problem.robot.base is not None
         best: tuple[CalibrationResult, Refined] | None = None
+        run.say_search()
         attempt = 0
         for attempt in range(1 + settings.restarts):
             budget = dataclasses.replace(run.budget, generations=left, brief=attempt == 0 or floating)

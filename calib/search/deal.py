@@ -125,9 +125,11 @@ class _Deal(KalmanStepper):
         step = self.kalman.tell(residual, keep=None if ends else self.settings.keep)
         self._spread = step.spread
         values = {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation}
+        words = f"misfit {step.misfit:.3g}, spread {step.spread:.3g}"
         if self.settings.with_critic:
             values["wasserstein"] = gap
-        self.log.note(f"misfit {step.misfit:.3g}, spread {step.spread:.3g}", members, values)
+            words = f"adversarial, critic's distance {gap:.3g}, {words}"
+        self.log.note(words, members, values)
         self._skip_empty_stages()
 
     def result(self) -> CalibrationResult:

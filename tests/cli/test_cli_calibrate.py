@@ -26,15 +26,13 @@ from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 
-def record(folder: Path, runs: list[tuple[str, Behaviour, float]]) -> Path:
+def record(folder: Path, runs: list[tuple[str, Behaviour, float]], profile: str = "sensor") -> Path:
     """Record runs of a nominal robot into a dataset, through driver, bytes and recorder, in virtual time."""
-    robot = VirtualCartpole(nominal_truth("sensor", 4, actuation_ticks=9))
+    robot = VirtualCartpole(nominal_truth(profile, 4, actuation_ticks=9))
     with Dataset.create_or_open(folder, DESCRIPTION) as store:
-        for profile, behaviour, seconds in runs:
+        for motion, behaviour, seconds in runs:
             path = store.next_episode_path()
-            robot.run(
-                behaviour, seconds, path, {"motion": profile, "purpose": "collect", "robot": "cartpole"}
-            )
+            robot.run(behaviour, seconds, path, {"motion": motion, "purpose": "collect", "robot": "cartpole"})
             store.note_episode(path)
     return folder
 
@@ -60,6 +58,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rich = RichBehaviour(DESCRIPTION, None, RichConfig(duration_s=2.6, balance_s=0.0), 1)
     chirp = ChirpBehaviour(DESCRIPTION, ChirpConfig(duration_s=2.2))
     return record(tmp_path_factory.mktemp("run") / "dataset", [("rich", rich, 2.6), ("chirp", chirp, 2.2)])
+
+
+@pytest.fixture(scope="module")
+def realistic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """4 s of random set-points of a robot that the model does not explain."""
+    rich = RichBehaviour(DESCRIPTION, None, RichConfig(duration_s=4.6, balance_s=0.0), 1)
+    return record(tmp_path_factory.mktemp("realistic") / "dataset", [("rich", rich, 4.6)], "realistic")
 
 
 def settings(folder: Path, **changes: object) -> Calibrate:
@@ -115,6 +120,24 @@ def test_writes_everything_a_user_needs(
     assert provenance["episodes"] == [0] and provenance["holdout"] == [1]
     assert provenance["seed"] == 0 and "mujoco" in provenance["versions"]
     assert json.loads(report.files["distribution.json"].read_text())["latency_s"][0] <= 9e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("search", "words"), [(None, "an adversarial search follows (deal)"), ("eki", "a search follows (eki)")]
+)
+def test_a_realistic_robot_is_searched_adversarially(
+    realistic: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], search: str | None, words: str
+) -> None:
+    """Friction, play and jitter that no parameter expresses: after the local fit the search is announced."""
+    asked = {"free": (), "population": 10, "generations": 2, "quiet": False}
+    report = calibrate(settings(realistic, **asked, search=search, out=tmp_path))
+    told = " ".join(capsys.readouterr().err.split())
+    announced = f"before the search: the local fit leaves more than noise, so {words}"
+    assert told.index("local fit:") < told.index(announced)
+    provenance = report.result.provenance
+    assert provenance["search"] == (search or "deal")
+    assert provenance["settings"].get("trained", False) == (search is None)
 
 
 def test_no_document_of_a_calibration_that_does_not_run(tmp_path: Path) -> None:

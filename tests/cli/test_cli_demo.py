@@ -36,7 +36,7 @@ from deal_hw.workflows.running.settings import LegOptions
 
 def beside_in_short(config: Calibrate) -> CalibrateReport:
     """Calibrate; the search beside it, whose estimates are only noted, gets 20 members and 4 generations."""
-    beside = config.method == "deal"
+    beside = not config.refine
     return calibrate(dataclasses.replace(config, population=20, generations=4) if beside else config)
 
 
