@@ -57,7 +57,7 @@ METHODS = {"weki": "eki", "near": "local", "open-loop": "output-error", "centre"
 WHOLE = frozenset({"default", "local", "output-error"})
 """Methods, by their new names, that choose the refinement themselves."""
 
-NULL = frozenset({"midpoint", "nominal", "deal-paper-flat"})
+NULL = frozenset({"midpoint", "midpoint-linear", "nominal", "deal-paper-flat", "deal-paper-literal-flat"})
 """Methods, by their new names, that ignore the data and are never refined."""
 
 KEY = (

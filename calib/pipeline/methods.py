@@ -41,6 +41,9 @@ METHODS: dict[str, str] = {
     "deal-no-critic": "deal_hw.calib.search.deal:without_critic",
     "deal-paper": "deal_hw.calib.search.algorithm1:paper",
     "deal-paper-literal": "deal_hw.calib.search.algorithm1:literal",
+    "deal-paper-literal-fn": "deal_hw.calib.search.algorithm1:literal_without_noise_adaptation",
+    "deal-paper-literal-pn": "deal_hw.calib.search.algorithm1:literal_without_normalisation",
+    "deal-paper-literal-flat": "deal_hw.calib.search.algorithm1:literal_flat",
     "deal-paper-fn": "deal_hw.calib.search.algorithm1:without_noise_adaptation",
     "deal-paper-pn": "deal_hw.calib.search.algorithm1:without_normalisation",
     "deal-paper-flat": "deal_hw.calib.search.algorithm1:flat",
@@ -68,11 +71,23 @@ METHODS: dict[str, str] = {
 """Name -> ``module:callable``: of a pipeline with a search, its factory by the search; of all others without
 arguments."""
 
-NO_DATA_METHODS = frozenset({"midpoint", "midpoint-linear", "nominal", "deal-paper-flat"})
+NO_DATA_METHODS = frozenset(
+    {"midpoint", "midpoint-linear", "nominal", "deal-paper-flat", "deal-paper-literal-flat"}
+)
 """Baselines that must not read the data. They are never refined."""
 
 CLOSED_LOOP_METHODS = frozenset(
-    {"deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "easi", "easi-log", "bo-critic"}
+    {
+        "deal-paper",
+        "deal-paper-literal",
+        "deal-paper-literal-fn",
+        "deal-paper-literal-pn",
+        "deal-paper-fn",
+        "deal-paper-pn",
+        "easi",
+        "easi-log",
+        "bo-critic",
+    }
 )
 """Methods that run the recordings' policy in every simulator."""
 

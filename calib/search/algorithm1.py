@@ -32,7 +32,9 @@ class PaperSettings(FitnessSettings):
             n and batch M are not in the paper.
         diffusion: The search's choices; its number of generations is the budget's.
         normalise: Whether the search moves in the normalised range (section 3.2). Off is the ablation
-            DEAL\PN, which moves in SI units from the middle of each range.
+            DEAL\PN, which moves in SI units.
+        centred: Whether SI units, without normalisation, count from the middle of each range. Off is SI units
+            from zero, as the paper's words say: then the factors sqrt(alpha) pull every parameter to zero.
         box: Low and high end of the normalised range. It is centred: with a flat fitness, a box [0, 1] drifts
             to its lower corner. A uniform start has unit variance, as in eq. 12 at t = T. In [-1, 1] the unit
             noise of eq. 10 puts a third of all coordinates outside the range, where they are simulated at its
@@ -48,6 +50,7 @@ class PaperSettings(FitnessSettings):
     critic: CriticSettings = field(default_factory=CriticSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     normalise: bool = True
+    centred: bool = True
     box: tuple[float, float] = (-(3.0**0.5), 3.0**0.5)
     linear: bool = True
     latency: bool = False
@@ -63,17 +66,19 @@ class PaperSettings(FitnessSettings):
 
 
 class _Box:
-    """The search's box: the normalised range, or SI units from the middle of each range."""
+    """The search's box: the normalised range, or SI units from the middle of each range or from zero."""
 
     def __init__(self, coordinates: Coordinates, settings: PaperSettings) -> None:
         self._coordinates = coordinates
         low, high = np.full((2, coordinates.count), [[settings.box[0]], [settings.box[1]]])
         if not settings.normalise:
             ends = coordinates.members(np.repeat([[0.0], [1.0]], coordinates.count, axis=1))
-            span = np.diff(ends.theta, axis=0)[0]
-            if coordinates.count > len(span):
-                span = np.append(span, np.diff(ends.latency_s))
-            low, high = -0.5 * span, 0.5 * span
+            low, high = ends.theta
+            if coordinates.count > len(low):
+                low, high = np.append(low, ends.latency_s[0]), np.append(high, ends.latency_s[1])
+            if settings.centred:
+                half = 0.5 * (high - low)
+                low, high = -half, half
         self._low, self._width = low, high - low
 
     def from_unit(self, unit: FloatArray) -> FloatArray:
@@ -154,23 +159,6 @@ def paper() -> DealPaper:
     return DealPaper()
 
 
-def literal() -> DealPaper:
-    """Return `deal-paper-literal`: Algorithm 1 with the paper's words taken literally.
-
-    Raw softmax (eq. 22), distance summed over K (eq. 1), range normalised to [0, 1], raw inputs, and a critic
-    trained against all rollouts so far (line 3 stores them).
-    """
-    return DealPaper(
-        PaperSettings(
-            diffusion=DiffusionSettings(temperature=None, divide_distance=False),
-            box=(0.0, 1.0),
-            standardise=False,
-            replay_generations=None,
-        ),
-        name="deal-paper-literal",
-    )
-
-
 def without_noise_adaptation() -> DealPaper:
     r"""Return the paper's ablation DEAL\FN: without eq. 9."""
     return DealPaper(PaperSettings(diffusion=DiffusionSettings(adapt_noise=False)), name="deal-paper-fn")
@@ -189,3 +177,44 @@ def flat() -> DealPaper:
 def replayed() -> DealPaper:
     """Return `deal-paper` for recordings without their policy: it replays the commands in open loop."""
     return DealPaper(PaperSettings(replay=True), name="deal-paper-replay")
+
+
+def _literal(
+    name: str, *, adapt_noise: bool = True, normalise: bool = True, fitness: str = "critic"
+) -> DealPaper:
+    return DealPaper(
+        PaperSettings(
+            diffusion=DiffusionSettings(temperature=None, divide_distance=False, adapt_noise=adapt_noise),
+            normalise=normalise,
+            centred=False,
+            box=(0.0, 1.0),
+            fitness=fitness,
+            standardise=False,
+            replay_generations=None,
+        ),
+        name=name,
+    )
+
+
+def literal() -> DealPaper:
+    """Return `deal-paper-literal`: Algorithm 1 with the paper's words taken literally.
+
+    Raw softmax (eq. 22), distance summed over K (eq. 1), range normalised to [0, 1], raw inputs, and a critic
+    trained against all rollouts so far (line 3 stores them).
+    """
+    return _literal("deal-paper-literal")
+
+
+def literal_without_noise_adaptation() -> DealPaper:
+    r"""Return the literal DEAL\FN: without eq. 9."""
+    return _literal("deal-paper-literal-fn", adapt_noise=False)
+
+
+def literal_without_normalisation() -> DealPaper:
+    r"""Return the literal DEAL\PN: the search moves in SI units, counted from zero."""
+    return _literal("deal-paper-literal-pn", normalise=False)
+
+
+def literal_flat() -> DealPaper:
+    """Return `deal-paper-literal` with a constant fitness: what its update does without data."""
+    return _literal("deal-paper-literal-flat", fitness="flat")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.bench.tables import method_name
+from deal_hw.calib.pipeline.methods import NO_DATA_METHODS
 from deal_hw.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 
-NO_DATA = ("midpoint", "midpoint-linear", "nominal", "deal-paper-flat")
-"""Methods that do not use the recording."""
 POLICIES = {
     "udr": "uniform\nrandomisation",
     "retrained": "the calibrated\ndistribution",
@@ -170,7 +169,7 @@ def _methods(axes: Axes, panel: _Panel, ratios: Sequence[float], settings: Figur
                 axes.axvline(
                     np.median(values), color=color, ls=style, lw=1, label=f"{baseline}{of} (no data)"
                 )
-    marked = [f"{name}\n(no data)" if name in NO_DATA else name for name in names]
+    marked = [f"{name}\n(no data)" if name in NO_DATA_METHODS else name for name in names]
     axes.set_yticks(range(len(names)), marked)
     axes.set_ylim(len(names) - 0.4, -0.6)
     cut = panel.floor and min(panel.values(panel.rows, panel.field)) <= panel.floor

@@ -121,8 +121,9 @@ class CalibrateSettings(Checked):
     --residual-std or --no-refine, and for all else. Baselines to compare with: easi, easi-log, bo, bo-critic,
     cma, gauss-newton, least-squares, least-squares-random, least-squares-multistart, ekf, ekf-one-pass,
     mujoco-sysid, random, midpoint, midpoint-linear, and variants of the DEAL paper's Algorithm 1:
-    deal-paper-literal, deal-paper-fn, deal-paper-pn, deal-paper-flat, deal-paper-replay; and parts of deal:
-    deal-critic, deal-untrained, deal-no-critic."""
+    deal-paper-literal, deal-paper-literal-fn, deal-paper-literal-pn, deal-paper-literal-flat, deal-paper-fn,
+    deal-paper-pn, deal-paper-flat, deal-paper-replay; and parts of deal: deal-critic, deal-untrained,
+    deal-no-critic."""
 
     search: Literal["deal", "eki", "deal-paper"] | None = None
     """The search of default and output-error, by default deal. deal: a critic tells recording and simulators
