@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.bench.rows import Cells, Row, per_parameter
+from deal_hw.bench.scores import check_truth
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity import ScriptVelocity
@@ -71,6 +72,7 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
     }
     try:
         truth, out = draw_truth(profile, seed), folder / f"{profile}_{seed}"
+        check_truth(walk_space(), truth.walk_parameters())
         out.mkdir(parents=True, exist_ok=True)
         began = time.process_time()
         dataset = recorded(truth, out)

@@ -2,15 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import Z90
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
+
+ROUNDING = 1e-9
+"""Part of a range by which a truth may lie outside it: a draw passes through logarithms."""
+
+
+def outside_range(space: ParameterSpace, truth: Mapping[str, float]) -> str:
+    """Return why no search of this space can find the truth, or "".
+
+    Args:
+        space: The searched parameters and their ranges.
+        truth: True values by name; names that are not searched are not read.
+    """
+    for p in space:
+        value = truth.get(p.name, p.nominal)
+        slack = ROUNDING * (p.high - p.low)
+        if not p.low - slack <= value <= p.high + slack:
+            return (
+                f"the true {p.name}, {value:.4g} {p.unit}, lies outside its search range, {p.low:.4g} to "
+                f"{p.high:.4g}, so no search can find it; use the parameter set (--space) from which the "
+                "truth is drawn, or a larger --range-ratio"
+            )
+    return ""
+
+
+def check_truth(space: ParameterSpace, truth: Mapping[str, float]) -> None:
+    """Raise `ConfigurationError` where a truth lies outside its range; see :func:`outside_range`."""
+    if why := outside_range(space, truth):
+        raise ConfigurationError(why)
 
 
 def error_percent(theta: FloatArray, truth: FloatArray) -> float:

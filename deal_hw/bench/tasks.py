@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deal_hw.bench.scores import check_truth
 from deal_hw.calib.data.problem import PopulationPolicy
 from deal_hw.control.excitation_level import ATTEMPTS
 from deal_hw.description import RobotDescription
@@ -134,9 +135,12 @@ def make_case(
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
+        ConfigurationError: The truth lies outside its search range.
         CalibrationError: No drawn robot could perform the demonstration.
     """
-    return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, checkpoint, seconds))
+    case = TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, checkpoint, seconds))
+    check_truth(case.space, dict(zip(case.space.names, case.theta, strict=True)))
+    return case
 
 
 def _cartpole(ask: _Ask) -> Case:
@@ -147,7 +151,7 @@ def _cartpole(ask: _Ask) -> Case:
         preset = {p.name: p.nominal for p in space.parameters}
         truth = replace(truth, parameters={**truth.parameters, **preset})
     else:
-        truth = draw_truth(profile, seed, range_ratio=ask.range_ratio)
+        truth = draw_truth(profile, seed, range_ratio=ask.range_ratio, space=space)
     virtual = VirtualCartpole(truth)
     plan = RunPlan(
         robot="cartpole",
@@ -161,15 +165,13 @@ def _cartpole(ask: _Ask) -> Case:
     chirp = replace(plan, motion="chirp")
     recordings = (shown, virtual.run(make_behaviour(chirp, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
-    # The truth has the parameters of K9; other searched ones have their nominal values.
-    values = space.known | {p.name: p.nominal for p in space} | dict(truth.parameters)
     return Case(
         task="cartpole",
         profile=profile,
         seed=seed,
         robot=load_model(DESCRIPTION),
         space=space,
-        theta=np.array([values[name] for name in space.names]),
+        theta=np.array([truth.parameters[name] for name in space.names]),
         latency_s=truth.latency_s,
         fit=fit,
         heldout=heldout,

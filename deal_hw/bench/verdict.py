@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import Cells
+from deal_hw.bench.scores import outside_range
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation.checks import SETTINGS
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
@@ -100,6 +101,8 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
         try:
             work = prepare(config, say=said.append)
+            if why := outside_range(work.space, robot.truth):
+                return row | {"error": f"ConfigurationError: {why}"}
             method = usual_method(config, work)
             result = calibrate_episodes(
                 work.robot,

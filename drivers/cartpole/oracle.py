@@ -15,19 +15,23 @@ from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportTimeoutError
+from deal_hw.parameters import ParameterSpace
 
 BALANCE_S = 6.0
 FALLEN_RAD = 0.3
 MAX_DRAWS = 200
 
 
-def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> CartpoleTruth:
+def draw_truth(
+    profile: str, seed: int, *, range_ratio: float = 5.0, space: ParameterSpace | None = None
+) -> CartpoleTruth:
     """Return the hidden truth of a seed: the first draw that the balancer balances.
 
     Args:
         profile: Name of the profile.
         seed: Seed of the draw.
         range_ratio: Ratio of the range around the nominal parameters.
+        space: The drawn parameters and their nominal values; without it K9.
 
     Raises:
         UnknownNameError: There is no such profile.
@@ -38,7 +42,9 @@ def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> Cartpole
         raise ConfigurationError(f"a seed is 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 0x7207])
     for refused in range(MAX_DRAWS):
-        truth = candidate_truth(profile, rng, seed=seed, range_ratio=range_ratio, refused=refused)
+        truth = candidate_truth(
+            profile, rng, seed=seed, range_ratio=range_ratio, refused=refused, space=space
+        )
         if oracle_balances(truth):
             return truth
     raise ConfigurationError(

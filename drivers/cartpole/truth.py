@@ -11,6 +11,7 @@ import numpy as np
 from deal_hw.drivers.cartpole.description import k9_space, parameter_space
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.reading import number, reading
 
 MOST_TICKS = 1000
@@ -97,10 +98,21 @@ def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Cart
 
 
 def candidate_truth(
-    profile: str, rng: np.random.Generator, *, seed: int, range_ratio: float, refused: int
+    profile: str,
+    rng: np.random.Generator,
+    *,
+    seed: int,
+    range_ratio: float,
+    refused: int,
+    space: ParameterSpace | None = None,
 ) -> CartpoleTruth:
-    """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency."""
-    space = k9_space().with_ratio(range_ratio).with_known(k9_space().known)
+    """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency.
+
+    ``space`` says which parameters are free, and around which values; without it K9. Parameters that it does
+    not have keep their nominal values.
+    """
+    chosen = space or k9_space()
+    space = chosen.with_ratio(range_ratio).with_known(chosen.known)
     values = space.unnormalize(rng.uniform(0.1, 0.9, len(space)))
     low, high = find_profile(profile).latency_ticks
     total = int(rng.integers(low, high + 1))
@@ -108,7 +120,11 @@ def candidate_truth(
     return CartpoleTruth(
         profile=profile,
         seed=seed,
-        parameters={**space.known, **dict(zip(space.names, map(float, values), strict=True))},
+        parameters={
+            **{p.name: p.nominal for p in parameter_space().parameters},
+            **space.known,
+            **dict(zip(space.names, map(float, values), strict=True)),
+        },
         actuation_ticks=total - sensing,
         sensing_ticks=sensing,
         refused=refused,

@@ -11,11 +11,16 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from deal_hw.bench import calibration
+from deal_hw.bench import calibration, tasks
 from deal_hw.bench.rows import write_rows
+from deal_hw.bench.scores import check_truth
 from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
+from deal_hw.drivers.cartpole.description import SPACES
+from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.workflows.shipped import shipped_policy
 
 FIELDS = {
@@ -155,6 +160,48 @@ def test_presets_of_the_paper_are_the_truth_there(task: str, space: str) -> None
     case = make_case(task, "ideal", 3, 5.0, space, centred=True)
     np.testing.assert_array_equal(case.theta, case.space.nominal)
     assert np.all((case.space.low < case.theta) & (case.theta < case.space.high))
+
+
+@pytest.mark.parametrize(("task", "space"), [("cartpole", "paper"), ("cartpole", "k11"), ("ant", "paper")])
+def test_a_truth_is_drawn_in_the_space_that_is_searched(task: str, space: str) -> None:
+    """All parameters are off their middle, and inside their range, whatever the parameter set."""
+    case = make_case(task, "ideal", 3, 5.0, space)
+    unit = case.space.normalize(case.theta)
+    assert np.all((unit > 0.1 - 1e-9) & (unit < 0.9 + 1e-9))
+    assert np.all(case.theta != case.space.nominal)
+
+
+def test_a_truth_outside_its_range_is_refused_in_every_calibration_bench(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A robot of K9 searched in the paper's ranges: no search can find it, so its error means nothing."""
+
+    def drawn(profile: str, seed: int, *, range_ratio: float, space: ParameterSpace) -> CartpoleTruth:
+        return draw_truth(profile, seed, range_ratio=range_ratio)
+
+    monkeypatch.setattr(tasks, "draw_truth", drawn)
+    for protocol, profile in (("fixed-range", "ideal"), ("mismatch", "realistic")):
+        (cell,) = calibration.make_cells(
+            protocol, ["cartpole"], profile, ["midpoint"], [5.0], [3], space="paper"
+        )
+        row = calibration.run_cell(cell, population=4, generations=1, threads=1)
+        assert "ConfigurationError: the true" in row["error"]
+        assert "outside its search range" in row["error"] and "--space" in row["error"]
+        assert "error_percent" not in row
+    monkeypatch.undo()
+    row = calibration.run_cell(cell, population=4, generations=1, threads=1)
+    assert row["error"] == "" and row["null_error_percent"] < 400
+
+
+def test_the_ends_of_a_range_belong_to_it() -> None:
+    """Rounding in the logarithm refuses nobody, a thousandth of the range does."""
+    space = SPACES["k9"]().with_ratio(5.0)
+    for end in (space.low, space.high):
+        check_truth(space, dict(zip(space.names, end * (1 + 1e-13), strict=True)))
+    low = dict(zip(space.names, space.low, strict=True)) | {"cart.mass": 0.05}
+    with pytest.raises(ConfigurationError, match=r"true cart.mass, 0.05 kg, .* 0.06 to 1.5, so no search"):
+        check_truth(space, low)
+    check_truth(space, {"another": 1e9})
 
 
 def test_a_preset_that_cannot_stand_is_said() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,16 @@ def test_cells_are_told_apart_by_what_they_measure(tmp_path: Path) -> None:
     trained, plain = (go2_loop.cells(**some, train=train) for train in (True, False))
     assert [cell for cell, _ in trained.runs] == [("sensor", 0, 10), ("sensor", 1, 10)]
     assert [cell for cell, _ in plain.runs] == [("sensor", 0, 0), ("sensor", 1, 0)]
+
+
+def test_a_truth_outside_its_range_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gains ten times too stiff: nothing is recorded, and the row says which parameter."""
+    truth = draw_truth("sensor", 4)
+    stiff = dataclasses.replace(truth, stiffness=tuple(10 * k for k in truth.stiffness))
+    monkeypatch.setattr(go2_loop, "draw_truth", lambda *_: stiff)
+    found = go2_loop.loop_row("sensor", 4, 0, train=False, folder=tmp_path, threads=1)
+    assert "lies outside its search range" in found["error"] and ".stiffness" in found["error"]
+    assert not list(tmp_path.iterdir())
 
 
 def test_steps_are_of_this_bench_alone() -> None:

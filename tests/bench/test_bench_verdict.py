@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import mujoco
@@ -67,6 +68,16 @@ def test_the_mass_fault_makes_the_last_link_half_as_heavy_again() -> None:
     assert model.body("fore").mass[0] == pytest.approx(0.3)
     assert truth.body("fore").mass[0] == pytest.approx(0.45)
     assert truth.body("upper").mass[0] == model.body("upper").mass[0]
+
+
+def test_a_truth_outside_its_range_is_an_error_and_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A damping a thousand times the model's: no colour, since no search could find it."""
+    robot = make_robot("pendulum", 1)
+    name = next(name for name in robot.truth if name.endswith(".damping"))
+    damped = dataclasses.replace(robot, truth=robot.truth | {name: 1e3 * robot.truth[name]})
+    monkeypatch.setattr(bench_verdict, "make_robot", lambda *_: damped)
+    row = run_cell("pendulum", "", 1, budget=Budget(population=4, generations=1), threads=1)
+    assert name in row["error"] and "outside its search range" in row["error"] and "colour" not in row
 
 
 def test_an_unknown_robot_is_refused() -> None:

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES, k9_space
 from deal_hw.drivers.cartpole.lqr import design_lqr, linearise
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.oracle import balances, draw_truth, oracle_balances
@@ -36,6 +36,27 @@ def test_candidates_lie_in_the_inner_part_of_the_range() -> None:
         assert all(t.parameters[known] == value for t in truths)
     totals = {t.actuation_ticks + t.sensing_ticks for t in truths}
     assert totals == set(range(5, 26))
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_a_truth_is_drawn_in_the_space_that_is_named(name: str) -> None:
+    """Free parameters lie in the inner part of the space's own range, known ones at their value."""
+    space = SPACES[name]()
+    rng = np.random.default_rng(0)
+    truths = [
+        candidate_truth("ideal", rng, seed=0, range_ratio=5.0, refused=0, space=space) for _ in range(100)
+    ]
+    for p in space:
+        ratios = np.log([t.parameters[p.name] / p.nominal for t in truths])
+        assert 0.6 * np.log(5) < np.max(np.abs(ratios)) <= 0.8 * np.log(5) + 1e-12
+    for known, value in space.known.items():
+        assert all(t.parameters[known] == value for t in truths)
+
+
+def test_without_a_space_a_truth_is_the_one_of_k9() -> None:
+    """Rows of earlier versions keep their robots."""
+    assert draw_truth("sensor", 3) == draw_truth("sensor", 3, space=k9_space())
+    assert draw_truth("sensor", 3) != draw_truth("sensor", 3, space=SPACES["paper"]())
 
 
 def test_the_ideal_profile_has_no_latency() -> None:
