@@ -44,6 +44,12 @@ FITNESSES: dict[str, str] = {
 }
 """Name -> ``module:class``, imported on use: only the critic needs torch. ``flat`` ignores the data."""
 
+USUAL_TRANSITIONS = 200
+"""Most transitions of a rollout: the DEAL paper's Table 4 for cart-pole, ant and humanoid."""
+
+TRANSITIONS = {"go2": 250, "allegro": 600}
+"""Robots with another number there. A demonstration of 5 s (12 s) has as many, at 50 Hz."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitnessSettings:
@@ -51,7 +57,8 @@ class FitnessSettings:
 
     Attributes:
         window_ticks: Window length of `trajectory` in control periods.
-        ticks: Most transitions of a rollout (the DEAL paper's Table 4: 200); `critic`, `energy`, `mmd`.
+        ticks: Most transitions of a rollout (`critic`, `energy`, `mmd`); None for the robot's own number in
+            `TRANSITIONS`.
         replay: Roll out with the recorded commands, not with the policy in closed loop (Algorithm 1, line 3).
         difference: Score (s, a, s' - s) instead of the paper's (s, a, s'). The information is the same. But s
             and s' differ by only a hundredth of their range, which a first layer hardly sees.
@@ -68,7 +75,7 @@ class FitnessSettings:
     """
 
     window_ticks: int = 10
-    ticks: int = 200
+    ticks: int | None = None
     replay: bool = False
     difference: bool = False
     standardise: bool = True
@@ -78,14 +85,19 @@ class FitnessSettings:
 
     def __post_init__(self) -> None:
         for name in ("window_ticks", "ticks"):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {value}")
         if self.replay_generations is not None and self.replay_generations < 1:
             raise ConfigurationError(
                 f"replay_generations must be at least 1 or None, got {self.replay_generations}"
             )
         if self.bandwidth is not None and not self.bandwidth > 0:
             raise ConfigurationError(f"the bandwidth must be above 0 or None, got {self.bandwidth:g}")
+
+    def most_transitions(self, robot: str) -> int:
+        """Return the most transitions of a rollout of this robot."""
+        return self.ticks or TRANSITIONS.get(robot, USUAL_TRANSITIONS)
 
 
 class Fitness(Stateful, abc.ABC):
@@ -178,9 +190,8 @@ class RolloutView:
     def __init__(self, problem: Problem, settings: FitnessSettings) -> None:
         self._problem, self._settings = problem, settings
         history = 0 if settings.replay else policy_of(problem).history
-        self._ticks = [
-            control_ticks(problem, index, settings.ticks, history) for index in range(len(problem.episodes))
-        ]
+        most = settings.most_transitions(problem.robot.description.name)
+        self._ticks = [control_ticks(problem, index, most, history) for index in range(len(problem.episodes))]
         raw = np.concatenate(
             [
                 demonstration(problem, index, ticks, difference=settings.difference)

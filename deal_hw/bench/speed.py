@@ -142,7 +142,8 @@ def bare_step_s(problem: Problem, population: int) -> tuple[float, float]:
     from deal_hw.sim.engine.servo import slew
 
     episode = problem.episodes[0]
-    ticks = control_ticks(problem, 0, FitnessSettings().ticks, policy_of(problem).history)
+    most = FitnessSettings().most_transitions(problem.robot.description.name)
+    ticks = control_ticks(problem, 0, most, policy_of(problem).history)
     theta = problem.space.sample(np.random.default_rng(0), population)
     action = rollout_population(problem, Members(theta, np.zeros(population)), 0, ticks)[2]
     batch = problem.batch(population)

@@ -9,6 +9,7 @@ import pytest
 from fakes.recorded_commands import RecordedCommands
 from fakes.simulated_episode import simulated_episode
 
+from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings
@@ -16,6 +17,7 @@ from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.fitness import (
     FITNESSES,
     FitnessSettings,
+    RolloutView,
     energy_distance,
     make_fitness,
     squared_mmd,
@@ -139,10 +141,25 @@ def test_deal_paper_takes_another_fitness(problem: Problem, name: str) -> None:
     assert np.median(errors) < 0.15
 
 
+@pytest.mark.parametrize(
+    ("task", "seconds", "expected"),
+    [("go2", 6.0, 250), ("allegro", 13.0, 600), ("allegro", 4.0, 200), ("ant", 6.0, 200)],
+)
+def test_a_rollout_has_the_transitions_of_the_papers_table_4(
+    task: str, seconds: float, expected: int
+) -> None:
+    """250 of the Go2, 600 of the hand, 200 of the others; a shorter recording gives all that it has."""
+    d = make_case(task, "ideal", 3, 3.0, by_policy=True, seconds=seconds)
+    problem = Problem(d.robot, d.space, [d.fit], threads=1, policy=d.policy)
+    view = RolloutView(problem, FitnessSettings())
+    assert len(view.real) == pytest.approx(expected, abs=1)
+    assert len(RolloutView(problem, FitnessSettings(ticks=30)).real) == 30
+
+
 def test_bad_names_and_settings_are_refused(problem: Problem) -> None:
     """Each error says what is known or allowed."""
     with pytest.raises(UnknownNameError, match="unknown fitness 'crtic'; known: critic, trajectory"):
         make_fitness("crtic", problem, np.random.default_rng(0))
-    for name, value in (("window_ticks", 0), ("replay_generations", 0), ("bandwidth", -1.0)):
+    for name, value in (("window_ticks", 0), ("ticks", 0), ("replay_generations", 0), ("bandwidth", -1.0)):
         with pytest.raises(ConfigurationError, match=name):
             FitnessSettings(**{name: value})  # type: ignore[arg-type]
