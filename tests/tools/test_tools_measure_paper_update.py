@@ -1,0 +1,43 @@
+"""The paper's update without data: its place in the range is that of the bench's no-data rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from measure_paper_update import UPDATES, measure, printed_rows
+
+from deal_hw.bench import calibration
+
+
+@pytest.mark.parametrize(
+    ("update", "method"), [("literal", "deal-paper-literal-flat"), ("deal-paper", "deal-paper-flat")]
+)
+def test_a_row_is_the_benchs_row_without_data(update: str, method: str) -> None:
+    """The same seed, ratio and number of parameters give the same error, without a robot."""
+    (cell,) = calibration.make_cells(
+        "paper", ["cartpole"], "ideal", [method], [10.0], [3], demonstration="policy"
+    )
+    row = calibration.run_cell(cell, population=None, generations=50, threads=1)
+    found = measure(update, 9, 10.0, 3)
+    assert found["error_percent"] == pytest.approx(row["error_percent"], rel=1e-6)
+
+
+def test_the_noise_decides_where_the_update_ends() -> None:
+    """Without noise it ends far up the range, with all of it near the lower end, where the truth is."""
+    errors = {
+        name: np.mean([measure(name, 11, 10.0, seed)["error_percent"] for seed in range(3)])
+        for name in UPDATES
+    }
+    assert errors["literal"] < 100 < 300 < errors["deal-paper"]
+    assert errors["literal, eta 0"] > 3 * errors["literal"]
+
+
+def test_the_papers_deal_has_one_place_at_all_ratios() -> None:
+    """Nine errors of 81 to 263 % are one place in the ranges, within 0.007; the truth's place halves."""
+    rows = printed_rows()
+    places = [row["place"] for row in rows if row["update"] == "DEAL"]
+    assert len(rows) == 45 and len(places) == 9
+    assert 0.172 < min(places) and max(places) < 0.180
+    for row in rows:
+        factor = 1 / row["range_ratio"] + row["place"] * (row["range_ratio"] - 1 / row["range_ratio"])
+        assert 100 * (factor - 1) == pytest.approx(row["error_percent"])
