@@ -88,7 +88,8 @@ def main() -> int:
         print(
             f"{group['task']}, ratio {group['range_ratio']:g}, {group['method']}: correlation {correlation} "
             f"over {group['places']} places of {group['robots']} robots, error "
-            f"{group['error_percent']:.3g} %, held-out {group['heldout_over_nominal']:.2g} of nominal (medians)"
+            f"{group['error_percent']:.3g} %, held-out {group['heldout_over_nominal']:.2g} of nominal "
+            "(medians)"
         )
     return 0
 
