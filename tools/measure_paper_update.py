@@ -5,7 +5,7 @@
 
 Every member has the same fitness, so p_i is 1 / N and delta is 1 (eq. 9 with a mean output of 0). What is
 left of Algorithm 1 is its start, its schedules and its noise: no robot is simulated. In the paper's protocol
-the range of each parameter is [p / xi, xi p] around its true value p, so the truth is at 1 / (xi + 1) of each
+the range of each parameter is [p / r, r p] around its true value p, so the truth is at 1 / (r + 1) of each
 range, and the error of eq. 11 follows from the final places in the ranges alone. A row has this error, and
 the mean place of the estimate: 0 is the lower end of the range, 0.5 its middle.
 
@@ -87,7 +87,7 @@ PRINTED = {
         (3.75, 6.32, 9.16),
     ),
 }
-"""The paper's errors at xi = 10, 15 and 20, by table and in the order of `METHODS`; 1 is 100 %."""
+"""The paper's errors at range ratio 10, 15 and 20, by table and in the order of `METHODS`; 1 is 100 %."""
 
 
 def printed_rows() -> list[dict[str, Any]]:

@@ -321,7 +321,7 @@ def test_a_literal_twin_differs_from_the_literal_in_what_its_name_says(variant: 
 def test_without_data_the_papers_words_end_in_the_lower_part_of_each_range() -> None:
     """The box [0, 1] is pulled to its lower corner: 12 seeds, no recording read.
 
-    In `bench paper` the truth is at (1 - 1/xi) / (xi - 1/xi) = 1 / (xi + 1) of each range, which is near that
+    In `bench paper` the truth is at (1 - 1/r) / (r - 1/r) = 1 / (r + 1) of each range of ratio r, near that
     corner. So a small error there does not show that the recording was read.
     """
     problem = small_problem()
