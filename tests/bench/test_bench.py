@@ -180,7 +180,11 @@ def test_a_truth_outside_its_range_is_refused_in_every_calibration_bench(
         return draw_truth(profile, seed, range_ratio=range_ratio)
 
     monkeypatch.setattr(tasks, "draw_truth", drawn)
-    for protocol, profile in (("fixed-range", "ideal"), ("mismatch", "realistic")):
+    benches: tuple[tuple[calibration.Protocol, str], ...] = (
+        ("fixed-range", "ideal"),
+        ("mismatch", "realistic"),
+    )
+    for protocol, profile in benches:
         (cell,) = calibration.make_cells(
             protocol, ["cartpole"], profile, ["midpoint"], [5.0], [3], space="paper"
         )

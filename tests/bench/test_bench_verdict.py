@@ -74,7 +74,7 @@ def test_a_truth_outside_its_range_is_an_error_and_no_verdict(monkeypatch: pytes
     """A damping a thousand times the model's: no colour, since no search could find it."""
     robot = make_robot("pendulum", 1)
     name = next(name for name in robot.truth if name.endswith(".damping"))
-    damped = dataclasses.replace(robot, truth=robot.truth | {name: 1e3 * robot.truth[name]})
+    damped = dataclasses.replace(robot, truth={**robot.truth, name: 1e3 * robot.truth[name]})
     monkeypatch.setattr(bench_verdict, "make_robot", lambda *_: damped)
     row = run_cell("pendulum", "", 1, budget=Budget(population=4, generations=1), threads=1)
     assert name in row["error"] and "outside its search range" in row["error"] and "colour" not in row
