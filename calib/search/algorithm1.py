@@ -218,3 +218,13 @@ def literal_without_normalisation() -> DealPaper:
 def literal_flat() -> DealPaper:
     """Return `deal-paper-literal` with a constant fitness: what its update does without data."""
     return _literal("deal-paper-literal-flat", fitness="flat")
+
+
+def by_energy() -> DealPaper:
+    """Return `deal-paper-energy`: minus the energy distance as fitness, without a critic."""
+    return DealPaper(PaperSettings(fitness="energy"), name="deal-paper-energy")
+
+
+def by_kernel() -> DealPaper:
+    """Return `deal-paper-mmd`: minus the squared maximum mean discrepancy as fitness, without a critic."""
+    return DealPaper(PaperSettings(fitness="mmd"), name="deal-paper-mmd")

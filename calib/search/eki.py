@@ -1,7 +1,7 @@
 """Ensemble Kalman inversion: a population moves by the regression of its coordinates on its residuals.
 
 :class:`EnsembleKalman` knows no simulator: ``ask`` returns an ensemble, and ``tell`` takes its whitened
-residuals. :class:`KalmanStepper` moves it in logits of a search range, for `eki` and `deal`. Perturbed
+residuals. :class:`LogitStepper` moves it in logits of a search range. Perturbed
 observations and the tempered update follow Iglesias, Law and Stuart (2013). The misfit controller is from
 Iglesias and Yang (2021), the discrepancy rule for the regularisation from Iglesias (2016). For a linear model
 with a Gaussian prior and large N, the ensemble samples the exact posterior once the tempering reaches 1.
@@ -143,10 +143,28 @@ def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray,
     return inflation
 
 
-class KalmanStepper(Stepper):
-    """A run of ensemble Kalman inversion in logits, in stages of windows; a brief run has the first stage.
+class LogitStepper(Stepper):
+    """A run of ensemble Kalman inversion in logits; it needs the setting ``step_clip`` [logits]."""
 
-    It needs the settings ``step_clip`` and ``widen`` [logits], ``noisy_ticks`` and ``clean_ticks``.
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
+        self.kalman = self.new_ensemble()
+
+    def new_ensemble(self) -> EnsembleKalman:
+        """Return an ensemble drawn over the whole range."""
+        unit = self.coordinates.sample(self.rng, self.log.budget.population)
+        return EnsembleKalman(logit(unit), self.rng, step_clip=self.settings.step_clip)
+
+    def population(self, z: FloatArray) -> tuple[Members, Members]:
+        """Return the members at logits z, (N, C), and the member at their mean."""
+        middle = logistic(z.mean(axis=0, keepdims=True))
+        return self.coordinates.members(logistic(z)), self.coordinates.members(middle)
+
+
+class KalmanStepper(LogitStepper):
+    """The same in stages of windows; a brief run has the first stage.
+
+    It needs the settings ``widen`` [logits], ``noisy_ticks`` and ``clean_ticks``, too.
     """
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
@@ -154,7 +172,6 @@ class KalmanStepper(Stepper):
         self._noisy, self._brief = is_noisy(self.problem), log.budget.brief
         lengths = self.settings.noisy_ticks if self._noisy else self.settings.clean_ticks
         self._lengths = lengths[:1] if self._brief else lengths
-        self.kalman = self.new_ensemble()
 
     def _enter_stage(self, stage: int) -> None:
         """Begin a stage; each but the first widens the ensemble."""
@@ -166,16 +183,6 @@ class KalmanStepper(Stepper):
         """Begin the saved state's stage, and continue there."""
         self._enter_stage(state["_stage"])
         super().load(state)
-
-    def new_ensemble(self) -> EnsembleKalman:
-        """Return an ensemble drawn over the whole range."""
-        unit = self.coordinates.sample(self.rng, self.log.budget.population)
-        return EnsembleKalman(logit(unit), self.rng, step_clip=self.settings.step_clip)
-
-    def population(self, z: FloatArray) -> tuple[Members, Members]:
-        """Return the members at logits z, (N, C), and the member at their mean."""
-        middle = logistic(z.mean(axis=0, keepdims=True))
-        return self.coordinates.members(logistic(z)), self.coordinates.members(middle)
 
 
 def logit(unit: FloatArray, edge: float = 1e-9) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.distance import cdist, pdist
 
-from deal_hw.calib.data.innovations import Members, Whitening, cut, linearise, whitened_residual
+from deal_hw.calib.data.innovations import Members, Whitening, cut, is_noisy, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.resume import Stateful
@@ -204,6 +204,31 @@ class RolloutView:
             self._scale = TransitionScale.of(raw.astype(np.float64))
         self.real: Samples = self._scale.apply(raw)
         """The recording's transitions, (n, inputs)."""
+        self._noise = self._sensed_noise() if is_noisy(problem) else None
+
+    @property
+    def outputs(self) -> int:
+        """Width of s', the last entries of a transition."""
+        return 2 * self._problem.coordinates
+
+    def _sensed_noise(self) -> FloatArray:
+        """Return the noise of smoothed states in a transition, standardised, (inputs,)."""
+        C = self._problem.coordinates
+        rows = [s.std[t.sample] for s, t in zip(self._problem.starts, self._ticks, strict=True)]
+        # Smoothed states count with twice their noise, for kinks that are no polynomials.
+        std = 0.5 * np.sqrt(np.mean(np.concatenate(rows) ** 2, axis=0))
+        std[~np.isfinite(std)] = 0.0
+        noise = np.zeros(self.real.shape[1])
+        noise[: 2 * C] = std
+        noise[-2 * C :] = std * (np.sqrt(2.0) if self._settings.difference else 1.0)
+        return np.asarray(noise / self._scale.std)
+
+    def as_sensed(self, rollouts: Samples, rng: np.random.Generator) -> Samples:
+        """Return simulators' transitions with the noise of smoothed measurements, (N, n, inputs)."""
+        if self._noise is None:
+            return rollouts
+        draws = rng.standard_normal(rollouts.shape, dtype=np.float32)
+        return rollouts + draws * self._noise.astype(np.float32)
 
     def rollouts(self, members: Members) -> tuple[Samples, npt.NDArray[np.bool_]]:
         """Return each member's transitions, (N, n, inputs), and which members did not diverge, (N,)."""

@@ -247,6 +247,56 @@ class TestDealPaperWithoutNormalisation(MethodSuite):
         return case_of("deal-paper-pn", Budget(population=10, generations=2), None)
 
 
+class TestDealUnaligned(MethodSuite):
+    """`deal-unaligned`: within 1 %; single runs end at 0.02 to 0.3 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-unaligned", Budget(population=30, generations=20), 0.01)
+
+
+class TestMmdUnaligned(MethodSuite):
+    """`mmd-unaligned`: within 0.5 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("mmd-unaligned", Budget(population=30, generations=20), 5e-3)
+
+
+class TestMomentsUnaligned(MethodSuite):
+    """`moments-unaligned`: within 0.5 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("moments-unaligned", Budget(population=30, generations=20), 5e-3)
+
+
+class TestDealPaperEnergy(MethodSuite):
+    """`deal-paper-energy`: nearer than the centre, no more; single runs end at 0.29 to 0.33."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-paper-energy", Budget(population=100, generations=25), 0.4)
+
+
+class TestDealPaperMmd(MethodSuite):
+    """`deal-paper-mmd`: nearer than the centre, no more; single runs end at 0.32 to 0.36."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-paper-mmd", Budget(population=100, generations=25), 0.4)
+
+
 class TestRandom(MethodSuite):
     """`random`: the best of 600 draws in two dimensions is within 25 %."""
 

@@ -122,8 +122,9 @@ class CalibrateSettings(Checked):
     cma, gauss-newton, least-squares, least-squares-random, least-squares-multistart, ekf, ekf-one-pass,
     mujoco-sysid, random, midpoint, midpoint-linear, and variants of the DEAL paper's Algorithm 1:
     deal-paper-literal, deal-paper-literal-fn, deal-paper-literal-pn, deal-paper-literal-flat, deal-paper-fn,
-    deal-paper-pn, deal-paper-flat, deal-paper-replay; and parts of deal: deal-critic, deal-untrained,
-    deal-no-critic."""
+    deal-paper-pn, deal-paper-flat, deal-paper-replay, deal-paper-energy, deal-paper-mmd; parts of deal:
+    deal-critic, deal-untrained, deal-no-critic; and searches that compare distributions of transitions in
+    closed loop: deal-unaligned, mmd-unaligned, moments-unaligned."""
 
     search: Literal["deal", "eki", "deal-paper"] | None = None
     """The search of default and output-error, by default deal. deal: a critic tells recording and simulators
