@@ -128,7 +128,11 @@ class _Deal(KalmanStepper):
         words = f"misfit {step.misfit:.3g}, spread {step.spread:.3g}"
         if self.settings.with_critic:
             values["wasserstein"] = gap
-            words = f"adversarial, critic's distance {gap:.3g}, {words}"
+            sound = np.isfinite(gap)
+            critic = (
+                f"critic's distance {gap:.3g}" if sound else "the critic diverged, its last weights go on"
+            )
+            words = f"adversarial, {critic}, {words}"
         self.log.note(words, members, values)
         self._skip_empty_stages()
 

@@ -31,7 +31,7 @@ from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
-from deal_hw.calibration import Budget
+from deal_hw.calibration import Budget, Progress
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
@@ -424,7 +424,9 @@ def test_a_critic_that_diverges_is_said_and_the_search_goes_on() -> None:
     wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
     problem, truth = small_problem(), two_parameters()[1]
     budget = Budget(population=30, generations=20)
-    result = Deal(DealSettings(critic=wild)).run(problem, budget, np.random.default_rng(0))
+    told: list[Progress] = []
+    result = Deal(DealSettings(critic=wild)).run(problem, budget, np.random.default_rng(0), told.append)
+    assert all("the critic diverged, its last weights go on" in one.message for one in told)
     generations = len(result.trace)
     assert f"diverged in {generations} of {generations} generations" in result.alarms[0].seen
     assert "--search eki" in result.alarms[0].do
