@@ -38,7 +38,7 @@ from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calib.validation.time_steps import LatencyScan
-from deal_hw.calibration import Budget, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -206,7 +206,7 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None
     inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
     assert inside.sum() >= 7
     assert result.alarms == ()
-    assert set(stages) == {"search", "refinement", "latency"}
+    assert set(stages) == {BEFORE_SEARCH, "search", "refinement", "latency"}
     assert result.provenance["latency_scan"]["ticks"]
 
 

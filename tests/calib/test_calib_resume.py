@@ -130,8 +130,8 @@ def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
 
     whole = method.run(make_problem(), budget, np.random.default_rng(4), note)
     assert whole.provenance["restarts"] == 2
-    # Callbacks up to the first refinement's first stage; and, as the first search's result is offered again
-    # and the refinement is repeated, up to the second generation of the second search.
+    # Callbacks up to the first refinement's first stage; and, as the search is announced, the first search's
+    # result is offered again and the refinement is repeated, up to the second generation of the second one.
     refining = stages.index("refinement") + 1
     searching = stages[refining:].index("search") + 1
     with pytest.raises(StoppedError):
@@ -139,7 +139,7 @@ def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
     saved = SearchCheckpoint(path, "a").load()
     assert saved is not None and len(saved["searches"]) == 1
     with pytest.raises(StoppedError):
-        run(method, make_problem(), budget, SearchCheckpoint(path, "a"), searching + 3)
+        run(method, make_problem(), budget, SearchCheckpoint(path, "a"), searching + 4)
     saved = SearchCheckpoint(path, "a").load()
     assert saved is not None and len(saved["searches"]) == 2
     resumed = run(method, make_problem(), budget, SearchCheckpoint(path, "a"), 0)

@@ -133,6 +133,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "residual_std": ("0.01",),
     "reveal_to": ("reveal.json",),
     "robot": ("arm.yaml",),
+    "search": ("eki",),
     "save": ("b.rrd",),
     "spike_ratio": ("50",),
     "screenshot": ("b.png",),
