@@ -104,7 +104,10 @@ CLOSED_LOOP_METHODS = frozenset(
 PAPER_POPULATION = 200
 """Number of simulators in the DEAL paper's Table 4."""
 
-WHOLE_METHODS = frozenset({"output-error", "local", "gait", "mujoco-sysid"})
+UNALIGNED_METHODS = frozenset({"deal-unaligned", "mmd-unaligned", "moments-unaligned"})
+"""Searches that compare distributions. A refinement would align what they do not."""
+
+WHOLE_METHODS = UNALIGNED_METHODS | {"output-error", "local", "gait", "mujoco-sysid"}
 """Methods with their own refinement, or that represent another tool. They are never refined."""
 
 

@@ -1,4 +1,4 @@
-"""Searches that compare distributions of transitions (s, a, s'), and align nothing.
+"""Searches that compare distributions of transitions (s, a, s') of closed-loop rollouts.
 
 Where the motion diverges from any prediction within a few steps (contacts, falls), residuals of windows mean
 nothing. Here each simulator runs the recordings' policy in closed loop, and statistics of its transitions are

@@ -20,6 +20,7 @@ from deal_hw.calib.pipeline.methods import (
     NO_DATA_METHODS,
     SEARCHES,
     SEARCHING,
+    UNALIGNED_METHODS,
     check_method,
     make_method,
     usual_population,
@@ -392,7 +393,9 @@ def test_every_name_in_the_table_makes_a_method(name: str) -> None:
     method = make_method(name)
     assert method.name == (DEFAULT_SEARCH if name == "default" else name)
     whole = make_method(name, refine=True)
-    assert isinstance(whole, CalibrationPipeline) == (name not in NO_DATA_METHODS | {"mujoco-sysid"})
+    assert isinstance(whole, CalibrationPipeline) == (
+        name not in NO_DATA_METHODS | UNALIGNED_METHODS | {"mujoco-sysid"}
+    )
     assert whole.name == name
 
 
