@@ -46,6 +46,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.bench.rows import FORMER_BENCHES, FORMER_FIELDS
+from deal_hw.calib.pipeline.methods import NO_DATA_METHODS, divided
 from deal_hw.ranges import option
 
 FIELDS: Mapping[str, str] = {"polish": "refined", **FORMER_FIELDS}
@@ -56,9 +57,6 @@ METHODS = {"weki": "eki", "near": "local", "open-loop": "output-error", "centre"
 
 WHOLE = frozenset({"default", "local", "output-error"})
 """Methods, by their new names, that choose the refinement themselves."""
-
-NULL = frozenset({"midpoint", "midpoint-linear", "nominal", "deal-paper-flat", "deal-paper-literal-flat"})
-"""Methods, by their new names, that ignore the data and are never refined."""
 
 KEY = (
     "bench",
@@ -208,13 +206,14 @@ def read_cells(path: Path, methods: Mapping[str, str]) -> Cells:
 
 def whole(method: str) -> bool:
     """Return whether a method, also with its search's name, chooses the refinement itself."""
-    return method.partition("+")[0] in WHOLE
+    return divided(method)[0] in WHOLE
 
 
 def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
     """Return the name of a row's cell, as texts in the order of `KEY`; "" if one does not apply."""
     bench, method = str(row["bench"]), str(row["method"])
     method = methods.get(method, method)
+    optional = not whole(method) and method not in NO_DATA_METHODS
     known = {
         **{name: str(row.get(name, "")) for name in KEY},
         "bench": FORMER_BENCHES.get(bench, bench),
@@ -222,7 +221,7 @@ def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
         "demonstration_s": f"{float(row.get('demonstration_s', 4.0)):g}" if "task" in row else "",
         "range_ratio": f"{float(row['range_ratio']):g}" if row.get("range_ratio") is not None else "",
         "method": method,
-        "refined": "refined" if row.get("refined") and not whole(method) and method not in NULL else "",
+        "refined": "refined" if row.get("refined") and optional else "",
     }
     return tuple(known[name] for name in KEY)
 

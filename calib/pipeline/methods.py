@@ -81,7 +81,10 @@ NO_DATA_METHODS = frozenset(
 )
 """Baselines that must not read the data. They are never refined."""
 
-CLOSED_LOOP_METHODS = frozenset(
+UNALIGNED_METHODS = frozenset({"deal-unaligned", "mmd-unaligned", "moments-unaligned"})
+"""Searches that compare distributions. A refinement would align what they do not."""
+
+CLOSED_LOOP_METHODS = UNALIGNED_METHODS | frozenset(
     {
         "deal-paper",
         "deal-paper-literal",
@@ -91,9 +94,6 @@ CLOSED_LOOP_METHODS = frozenset(
         "deal-paper-pn",
         "deal-paper-energy",
         "deal-paper-mmd",
-        "deal-unaligned",
-        "mmd-unaligned",
-        "moments-unaligned",
         "easi",
         "easi-log",
         "bo-critic",
@@ -104,11 +104,9 @@ CLOSED_LOOP_METHODS = frozenset(
 PAPER_POPULATION = 200
 """Number of simulators in the DEAL paper's Table 4."""
 
-UNALIGNED_METHODS = frozenset({"deal-unaligned", "mmd-unaligned", "moments-unaligned"})
-"""Searches that compare distributions. A refinement would align what they do not."""
-
 WHOLE_METHODS = UNALIGNED_METHODS | {"output-error", "local", "gait", "mujoco-sysid"}
-"""Methods with their own refinement, or that represent another tool. They are never refined."""
+"""Methods with their own refinement, that align nothing, or that represent another tool. They are never
+refined."""
 
 
 def divided(name: str) -> tuple[str, str]:

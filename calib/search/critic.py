@@ -50,6 +50,10 @@ class CriticSettings:
     penalty: float = 10.0
 
 
+FEATURE_CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
+"""The critic whose features are regressed on: smaller and faster than the paper's."""
+
+
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Use ``count`` threads inside one operation; on a busy machine more than one can be 30 times slower."""

@@ -34,14 +34,12 @@ from deal_hw.calib.data.innovations import (
 )
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples
-from deal_hw.calib.search.eki import KalmanStepper
+from deal_hw.calib.search.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic, Samples
+from deal_hw.calib.search.eki import KalmanStepper, spread_of
 from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
-
-_CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +64,7 @@ class DealSettings:
         trained: Whether the critic is trained; off leaves the features of its random first weights.
     """
 
-    critic: CriticSettings = field(default_factory=lambda: _CRITIC)
+    critic: CriticSettings = field(default_factory=lambda: FEATURE_CRITIC)
     generations: int = 50
     clean_ticks: tuple[int, ...] = (10,)
     noisy_ticks: tuple[int, ...] = (5, 20)
@@ -320,10 +318,8 @@ class _CleanView(_View):
         data, imitation = self._join(real, scale), self._join(fake, scale)
         gap = self._train(data, imitation[good])
         target, found = self._critic.statistics(data[None])[0], self._critic.statistics(imitation)
-        std = found[good].std(axis=0)
-        # Units that are never active carry no information and would divide by zero.
-        alive = std > 1e-6 * max(float(std.max()), 1e-30)
-        return target[alive] / std[alive], found[:, alive] / std[alive], gap
+        alive, std = spread_of(found[good])
+        return target[alive] / std, found[:, alive] / std, gap
 
     def _whitened(self, difference: FloatArray) -> FloatArray:
         std = np.concatenate([data.std[:, self._at].reshape(len(data.std), -1) for data in self._windows])

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.data.innovations import Members, cut, explained, is_noisy, whitened_residual
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
@@ -141,6 +142,16 @@ def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray,
             break
         inflation *= 2.0
     return inflation
+
+
+def spread_of(statistics: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+    """Return which statistics differ between members, (F,), and the standard deviations of those.
+
+    Statistics, (N, F), that are equal for all members carry no information and would divide by zero.
+    """
+    std = statistics.std(axis=0)
+    alive = std > 1e-6 * max(float(std.max()), 1e-30)
+    return alive, std[alive]
 
 
 class LogitStepper(Stepper):

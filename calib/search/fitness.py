@@ -7,6 +7,7 @@ are comparable for all but the critic, which keeps learning.
 from __future__ import annotations
 
 import abc
+import functools
 import importlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -204,15 +205,15 @@ class RolloutView:
             self._scale = TransitionScale.of(raw.astype(np.float64))
         self.real: Samples = self._scale.apply(raw)
         """The recording's transitions, (n, inputs)."""
-        self._noise = self._sensed_noise() if is_noisy(problem) else None
 
     @property
     def outputs(self) -> int:
         """Width of s', the last entries of a transition."""
         return 2 * self._problem.coordinates
 
-    def _sensed_noise(self) -> FloatArray:
-        """Return the noise of smoothed states in a transition, standardised, (inputs,)."""
+    @functools.cached_property
+    def _noise(self) -> FloatArray:
+        """The noise of smoothed states in a transition, standardised, (inputs,)."""
         C = self._problem.coordinates
         rows = [s.std[t.sample] for s, t in zip(self._problem.starts, self._ticks, strict=True)]
         # Smoothed states count with twice their noise, for kinks that are no polynomials.
@@ -225,7 +226,7 @@ class RolloutView:
 
     def as_sensed(self, rollouts: Samples, rng: np.random.Generator) -> Samples:
         """Return simulators' transitions with the noise of smoothed measurements, (N, n, inputs)."""
-        if self._noise is None:
+        if not is_noisy(self._problem):
             return rollouts
         draws = rng.standard_normal(rollouts.shape, dtype=np.float32)
         return rollouts + draws * self._noise.astype(np.float32)

@@ -27,14 +27,12 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic
-from deal_hw.calib.search.eki import LogitStepper
+from deal_hw.calib.search.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic
+from deal_hw.calib.search.eki import LogitStepper, spread_of
 from deal_hw.calib.search.fitness import FitnessSettings, RolloutView, Samples
 from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
-
-_CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +51,7 @@ class UnalignedSettings:
     """
 
     statistics: Literal["critic", "kernel", "moments"] = "critic"
-    critic: CriticSettings = field(default_factory=lambda: _CRITIC)
+    critic: CriticSettings = field(default_factory=lambda: FEATURE_CRITIC)
     features: int = 256
     innovations: bool = True
     generations: int = 25
@@ -63,10 +61,12 @@ class UnalignedSettings:
 
 
 class _Statistics(Stateful, abc.ABC):
-    """Turns samples into one vector; ``values`` are for the trace."""
+    """Turns samples into one vector; ``outputs`` is the width of s', ``values`` are for the trace."""
 
-    def __init__(self, width: int, settings: UnalignedSettings, rng: np.random.Generator) -> None:
-        self.settings, self.values = settings, dict[str, float]()
+    def __init__(
+        self, width: int, outputs: int, settings: UnalignedSettings, rng: np.random.Generator
+    ) -> None:
+        self.outputs, self.settings, self.values = outputs, settings, dict[str, float]()
         self._prepare(width, rng)
 
     @abc.abstractmethod
@@ -120,7 +120,6 @@ class _Moments(_Statistics):
 
     def _prepare(self, width: int, rng: np.random.Generator) -> None:
         self._pairs = np.triu_indices(width)
-        self.outputs = 1
 
     def compare(self, real: Samples, fake: Samples) -> tuple[FloatArray, FloatArray]:
         """See :meth:`_Statistics.compare`."""
@@ -159,9 +158,8 @@ class _Unaligned(LogitStepper):
         self._view = RolloutView(log.problem, FitnessSettings(difference=True))
         super().__init__(log, rng, search)
         settings = self.settings
-        self._statistics = _KINDS[settings.statistics](self._view.real.shape[1], settings, rng)
-        if isinstance(self._statistics, _Moments):
-            self._statistics.outputs = self._view.outputs
+        width, outputs = self._view.real.shape[1], self._view.outputs
+        self._statistics = _KINDS[settings.statistics](width, outputs, settings, rng)
         self._most = min(settings.generations, log.budget.generations)
         self._spread = float("inf")
 
@@ -177,11 +175,9 @@ class _Unaligned(LogitStepper):
         residual = np.full((len(fake), 1), np.nan)
         if usable.sum() > 1:
             target, found = self._statistics.compare(*self._samples(fake[usable]))
-            std = found.std(axis=0)
-            # Statistics that are equal for all members carry no information and would divide by zero.
-            alive = std > 1e-6 * max(float(std.max()), 1e-30)
-            residual = np.full((len(fake), int(alive.sum())), np.nan)
-            residual[usable] = (target - found)[:, alive] / std[alive]
+            alive, std = spread_of(found)
+            residual = np.full((len(fake), len(std)), np.nan)
+            residual[usable] = (target - found)[:, alive] / std
         step = self.kalman.tell(residual, keep=self.settings.keep)
         self._spread = step.spread
         self.log.note(
