@@ -37,6 +37,7 @@ from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.bench import parse_seeds
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
+from deal_hw.drivers.cartpole.avr_device import AvrDevice
 from deal_hw.drivers.cartpole.can_emulator import can_device
 from deal_hw.drivers.cartpole.can_link import CanLink
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -62,8 +63,7 @@ from deal_hw.workflows.running.settings import LinkOptions
 from deal_hw.workflows.shipped import required_policy
 
 FIRMWARE = "firmware"
-VIRTUAL = ("serial", "can", "odrive", "dynamixel")
-"""Wires in virtual time."""
+WIRES = ("serial", "can", "odrive", "dynamixel", FIRMWARE)
 TRIES = 3
 """A recording is made again where a pause of this computer made the safety filter end it too early."""
 NOT_THERE = {"odrive": ("servo.speed_limit",)}
@@ -141,6 +141,8 @@ def _virtual(transport: str, truth: CartpoleTruth) -> VirtualCartpole:
     match transport:
         case "serial":
             return VirtualCartpole(truth)
+        case "firmware":
+            return VirtualCartpole(truth, AvrDevice(truth))
         case "can":
             return VirtualCartpole(truth, can_device(truth), partial(CartpoleRobot, link=CanLink))
         case "odrive":
@@ -151,7 +153,7 @@ def _virtual(transport: str, truth: CartpoleTruth) -> VirtualCartpole:
             return VirtualCartpole(
                 truth, DynamixelDevice(truth, servos), partial(DynamixelCartpole, settings=servos)
             )
-    raise UnknownNameError("wire in virtual time", transport, VIRTUAL)
+    raise UnknownNameError("wire", transport, WIRES)
 
 
 def _errors(
@@ -248,16 +250,14 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> int:
     """Measure the rows and print them as a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--transports", nargs="+", default=None, help="all by default")
-    parser.add_argument("--virtual", action="store_true", help="in virtual time; not the wire `firmware`")
+    parser.add_argument("--transports", nargs="+", choices=WIRES, default=WIRES, help="all by default")
+    parser.add_argument("--virtual", action="store_true", help="in virtual time")
     parser.add_argument("--profile", default="sensor")
     parser.add_argument("--seeds", type=parse_seeds, default=(1, 2, 3), help="such as 1,2,3 or 0-9")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--table", type=Path, default=None, help="print the table of a result")
     given = parser.parse_args()
-    if given.transports is None:
-        given.transports = list(VIRTUAL if given.virtual else (*VIRTUAL, FIRMWARE))
     if given.table is not None:
         kept = json.loads(given.table.read_text(encoding="utf-8"))["rows"]
         print(table(kept), coverage_table(kept), sep="\n\n")
