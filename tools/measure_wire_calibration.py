@@ -54,12 +54,14 @@ from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import DealHwError, InsufficientDataError, UnknownNameError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
+from deal_hw.workflows.calibration.dataset import without_speed_limits
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.settings import CARTPOLE_RANGE_RATIO
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.settings import LinkOptions
+from deal_hw.workflows.say import silent
 from deal_hw.workflows.shipped import required_policy
 
 FIRMWARE = "firmware"
@@ -121,9 +123,10 @@ def measure_virtual(transport: str, profile: str, seed: int) -> dict[str, Any]:
         )
         runs = [demonstrate(virtual, replace(plan, motion=motion))[0] for motion in ("rich", "chirp")]
         fitted, held_out = (fill_gaps(align(run.trajectory, DESCRIPTION)) for run in runs)
+        space = without_speed_limits(k9_space(), DESCRIPTION, [run.trajectory for run in runs], silent)
         found = calibrate_episodes(
             load_model(DESCRIPTION),
-            k9_space(),
+            space,
             [fitted],
             [held_out],
             method="default",
