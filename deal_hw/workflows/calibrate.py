@@ -236,7 +236,9 @@ def calibrate(
         refine: Follow the search by multiple shooting on prediction error.
         population: Members of the search; the method's usual number by default.
         generations: Most generations of the search.
-        policy: The policy that moved the robot, for methods that run it (``deal-paper``).
+        policy: The policy that moved the robot (.onnx). With a model it gives the commands of recordings
+            without any, and checks the clock of recorded ones; with a dataset it is for methods that run it
+            (``deal-paper``).
         seed: Seed of all random numbers.
         threads: Simulation threads; all processors by default.
         progress: Called with each :class:`~deal_hw.calibration.Progress`.

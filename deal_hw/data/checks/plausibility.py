@@ -274,6 +274,7 @@ def _commands(table: Table, efforts: bool) -> CheckResult:
     if not table.command_s.size:
         text = (
             "no commanded positions, so nothing can be predicted; name them as `target` in the column map. "
+            "If a policy moved the robot, calibrate --policy FILE.onnx computes its commands. "
             "If the joints swing freely with their servos off, remove the actuators from a copy of the MJCF"
         )
         return _verdict("commands", Severity.FAIL, text)

@@ -126,7 +126,8 @@ def to_trajectories(
     """
     if not table.command_s.size:
         raise DatasetError(
-            f"{table.name}: no commands; name the commanded positions as `target` in the column map"
+            f"{table.name}: no commands; name the commanded positions as `target` in the column map, or "
+            "give the policy that moved the robot (calibrate --policy FILE.onnx)"
         )
     clock, rows = _clock(table)
     period = period_of(table) if period_s is None else period_s

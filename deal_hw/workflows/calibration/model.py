@@ -16,6 +16,7 @@ from deal_hw.workflows.calibration.checks import (
     sensitive_parameters,
     warn_of_gravity,
 )
+from deal_hw.workflows.calibration.policy_commands import with_policy_commands
 from deal_hw.workflows.calibration.recordings import (
     Source,
     aligned,
@@ -120,6 +121,9 @@ def prepare_model(
         read_tables(sources, columns, facts, say, name, said)
         for name, sources in (("data", data), ("holdout", holdout))
     )
+    if settings.policy is not None:
+        policy = Path(settings.policy)
+        fitted, held = (with_policy_commands(tables, policy, facts, say) for tables in (fitted, held))
     fitted, held = (at_rest_without_commands(tables, facts, say) for tables in (fitted, held))
     refuse_copies([*fitted, *held])
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)

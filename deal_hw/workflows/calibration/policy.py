@@ -18,20 +18,21 @@ if TYPE_CHECKING:
     from deal_hw.policies.demonstration import PopulationDemonstration
 
 
-def check_policy(method: str, *, given: bool, model: bool) -> None:
+def check_policy(method: str, *, given: bool, model: bool, files: bool = False) -> None:
     """Check that a method suits the source of the recordings.
 
     Args:
         method: Name of the method.
         given: Whether a policy was named.
         model: Whether the robot is described by the user's own MJCF, named or in the dataset.
+        files: Whether recordings are files; for these a policy gives commands or checks their clock.
 
     Raises:
         ConfigurationError: A policy would have no effect, or the method needs one that is unknown.
     """
     search = search_of(method)
     if search not in CLOSED_LOOP_METHODS:
-        refuse(["--policy"] if given else [], f"{search} runs no policy")
+        refuse(["--policy"] if given and not files else [], f"{search} runs no policy")
     elif model:
         raise ConfigurationError(
             f"{search} runs the policy that moved the robot, which is unknown for --model and for "

@@ -132,8 +132,9 @@ class CalibrateSettings(Checked):
     deal-paper: the DEAL paper's Algorithm 1. With --no-refine the search alone."""
 
     policy: File | None = None
-    """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
-    simulator; by default the copy in the dataset."""
+    """The policy (.onnx) that moved the robot. With --model it gives the commands of recordings without any,
+    and checks the clock of recorded ones. With a dataset: for deal-paper and other methods that run it in
+    every simulator; by default the copy in the dataset."""
 
     space: str = ""
     """Named parameter set of a robot with a driver, such as k9 or k11; by default the first.
@@ -241,7 +242,8 @@ class CalibrateSettings(Checked):
                 given(self, CalibrateSettings(), ("search",)), f"--method {self.method} has no search inside"
             )
         own = self.recordings.model is not None or carries_robot(self.dataset)
-        check_policy(self.named(), given=self.policy is not None, model=own)
+        files = self.recordings.model is not None
+        check_policy(self.named(), given=self.policy is not None, model=own, files=files)
 
     def named(self, pipeline: str = "") -> str:
         """Return the name of a pipeline, by default the one that is asked for, with its search."""

@@ -1,0 +1,266 @@
+"""Commands that a recording lacks, or that have another clock, from the policy that moved the robot.
+
+Fits need to know which command acted when. A policy's commands follow from the states that it saw. So a
+recording of states alone can be aligned where the policy is known, and a wrong clock of commands shows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
+from deal_hw.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from deal_hw.data.importing.table import Table
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.policy import PolicySpec
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
+
+AGREES: Final = 0.9
+"""Share of the variance of recorded commands that the policy must give for them to be its own."""
+LONGEST_SHIFT_S: Final = 2.0
+"""Largest distance between the clocks of states and commands that is looked for [s]."""
+USUAL_DELAY_S: Final = 0.1
+"""Longest time from a state to the policy's command at which their clocks count as one [s]."""
+WHOLE: Final = 0.02
+"""Largest distance of the ratio of two rates to a whole number."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ticks:
+    """The policy's commands in a recording's states, with one of its samples in each control period.
+
+    Attributes:
+        first: Which samples: those whose number in the recording leaves this remainder.
+        row: Row of each sample, (N,).
+        command: (N, A).
+    """
+
+    first: int
+    row: IntArray
+    command: FloatArray
+
+
+def with_policy_commands(
+    tables: Sequence[Table], file: Path, facts: JointFacts, say: Callable[[str], None]
+) -> list[Table]:
+    """Return recordings with the commands of a policy, or with their own on the states' clock.
+
+    Args:
+        tables: Recordings of a robot with a fixed base.
+        file: The policy that moved it, with its spec (.onnx).
+        facts: The joints of its model.
+        say: Called with a sentence on each recording.
+
+    Raises:
+        ConfigurationError: The policy is not for these joints, needs more than the recordings have, or runs
+            at a rate at which they have no samples.
+        DatasetError: Recorded commands are not those of the policy.
+        PolicyError: The file cannot be run.
+    """
+    from deal_hw.data.importing.grid import period_of
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    policy = OnnxPolicy(file)
+    found = []
+    for recorded in tables:
+        table, period_s = _as_policy(recorded, policy.spec), period_of(recorded)
+        every = _samples_a_tick(policy.spec, period_s)
+        choices = list(_choices(table, policy, every, period_s, facts))
+        if table.command_s.size:
+            found.append(_checked(table, choices, period_s, file.name, say))
+        else:
+            found.append(_given(table, choices, policy.spec, file.name, say))
+    return found
+
+
+def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
+    ratio = 1.0 / (spec.control_rate_hz * period_s)
+    if spec.command_range or spec.observes_base or spec.clock_hz:
+        raise ConfigurationError(
+            f"--policy with --model: the policy for {spec.robot!r} observes a base, a clock or a requested "
+            "velocity, which recordings of joints do not hold; record its commands, or leave --policy out"
+        )
+    if abs(ratio - round(ratio)) > WHOLE or round(ratio) < 1:
+        raise ConfigurationError(
+            f"--policy: it ran at {spec.control_rate_hz:g} Hz, and the recordings have {1 / period_s:.4g} "
+            "samples a second, which is no whole multiple. The state at each command is needed; record at "
+            f"{spec.control_rate_hz:g} Hz or a multiple of it"
+        )
+    return round(ratio)
+
+
+def _as_policy(table: Table, spec: PolicySpec) -> Table:
+    """Return the recording with its joints in the policy's order.
+
+    Raises:
+        PolicyMismatchError: They are other joints.
+    """
+    if set(table.joint_names) != set(spec.joint_names):
+        raise PolicyMismatchError(
+            f"{table.name} has the joints {', '.join(table.joint_names)}, the policy "
+            f"{', '.join(spec.joint_names)}; give the policy that moved this robot"
+        )
+    order = [table.joint_names.index(name) for name in spec.joint_names]
+    arrays = {
+        name: values[:, order]
+        for name in ("position", "velocity", "effort")
+        if (values := getattr(table, name)) is not None
+    }
+    units = tuple(table.units[i] for i in order)
+    actuated = tuple(name for name in spec.joint_names if name in table.actuated)
+    if actuated and set(actuated) != set(spec.actuated):
+        raise PolicyMismatchError(
+            f"{table.name} has commands of {', '.join(actuated)}, the policy of {', '.join(spec.actuated)}; "
+            "give the policy that moved this robot, or name the other commands as `target` in the column map"
+        )
+    columns = [table.actuated.index(name) for name in actuated]
+    return dataclasses.replace(
+        table,
+        joint_names=spec.joint_names,
+        units=units,
+        actuated=actuated,
+        target=table.target[:, columns],
+        **arrays,
+    )
+
+
+def _choices(
+    table: Table, policy: OnnxPolicy, every: int, period_s: float, facts: JointFacts
+) -> Iterator[_Ticks]:
+    """Yield the policy's commands for each of the samples of a period at which it may have run."""
+    from deal_hw.policy import ObservationBuilder
+
+    spec = policy.spec
+    centre, scale = _commands_of(spec, facts)
+    number = np.round((table.time_s - table.time_s[0]) / period_s).astype(np.int64)
+    velocity = table.velocity if table.velocity is not None else _differences(table, every)
+    sound = np.isfinite(table.position).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    for first in range(every):
+        rows = np.flatnonzero(sound & (number % every == first))
+        builder = ObservationBuilder(spec)
+        command = np.empty((len(rows), len(spec.actuated)))
+        for k, row in enumerate(rows):
+            observation = builder.build(table.position[row], velocity[row])
+            action = np.clip(policy.act_batch(observation[None])[0], -1.0, 1.0)
+            builder.record_action(action)
+            command[k] = centre + scale * action
+        # Before, its memory holds states that were not recorded.
+        yield _Ticks(first, rows[spec.history :], command[spec.history :])
+
+
+def _commands_of(spec: PolicySpec, facts: JointFacts) -> tuple[FloatArray, FloatArray]:
+    """Return the command at action 0 and the change of it to action 1, (A,) each, as recordings hold them."""
+    scale = np.array(spec.action_scale)
+    joints = [facts.names.index(name) for name in spec.actuated]
+    if not facts.servo[joints].any():
+        return np.zeros(len(joints)), scale * facts.full_effort[joints]
+    places = [spec.joint_names.index(name) for name in spec.actuated]
+    return np.array(spec.default_position)[places], scale
+
+
+def _differences(table: Table, every: int) -> FloatArray:
+    """Return velocities from differences to the sample one control period earlier: a policy sees no later."""
+    earlier = np.maximum(np.arange(len(table.time_s)) - every, 0)
+    seconds = np.maximum(table.time_s - table.time_s[earlier], 1e-9)
+    return np.asarray((table.position - table.position[earlier]) / seconds[:, None])
+
+
+def _checked(
+    table: Table, choices: Sequence[_Ticks], period_s: float, name: str, say: Callable[[str], None]
+) -> Table:
+    """Return a recording whose own commands have the clock of its states."""
+    span = round(min(LONGEST_SHIFT_S, (table.time_s[-1] - table.time_s[0]) / 4) / period_s)
+    delays_s = period_s * np.arange(-span, span + 1)
+    scores = [(_agreement(table, ticks, d), float(d)) for ticks in choices for d in delays_s]
+    # A command holds for a period, so several delays agree alike: the command begins at the first.
+    share, late_s = max(scores, key=lambda score: (round(score[0], 3), -score[1]))
+    if share < AGREES:
+        raise DatasetError(
+            f"{table.name}: the recorded commands are not those of {name} in the recorded states: at the "
+            f"best shift in time ({1e3 * late_s:.0f} ms) it gives {max(share, 0.0):.0%} of their variance. "
+            "Another policy moved the robot, or states and commands have no common clock. Name the right "
+            "policy; or take the commands out of the column map, and those of the policy are used"
+        )
+    said = f"{table.name}: {name} gives {share:.0%} of the variance of the recorded commands"
+    if -period_s <= late_s <= USUAL_DELAY_S:
+        say(f"{said}, {1e3 * late_s:.0f} ms after its states: both have one clock")
+        return table
+    say(
+        f"{said}, but {abs(late_s):.3g} s {'after' if late_s > 0 else 'before'} its states: their clocks are "
+        "apart. The commands are moved by that time, and the latency then counts from the policy's state"
+    )
+    return dataclasses.replace(table, command_s=table.command_s - late_s)
+
+
+def _agreement(table: Table, ticks: _Ticks, late_s: float) -> float:
+    """Return the share of the recorded commands' variance that the policy's give, so much later."""
+    at = table.time_s[ticks.row] + late_s
+    inside = (at >= table.command_s[0]) & (at <= table.command_s[-1])
+    if np.count_nonzero(inside) < max(len(at) / 4, 4):
+        return -np.inf
+    recorded = table.target_at(at[inside] + 1e-6)
+    spread = float(np.sum((recorded - recorded.mean(axis=0)) ** 2))
+    if spread == 0:
+        return -np.inf
+    return 1.0 - float(np.sum((recorded - ticks.command[inside]) ** 2)) / spread
+
+
+def _given(
+    table: Table, choices: Sequence[_Ticks], spec: PolicySpec, name: str, say: Callable[[str], None]
+) -> Table:
+    """Return a recording without commands with those of the policy."""
+    if min(len(ticks.row) for ticks in choices) < 2:
+        raise DatasetError(
+            f"{table.name}: {len(table.time_s)} samples are fewer than the policy remembers "
+            f"({spec.history} control periods); record longer"
+        )
+    best = choices[0]
+    which = ""
+    if len(choices) > 1:
+        every = len(choices)
+        best = min(choices, key=lambda ticks: _unexplained(table, ticks, every))
+        which = f", from sample {best.first} and every {every} later (those commands explain the motion best)"
+    say(
+        f"{table.name}: no commands, so they are those of {name} in the recorded states, {len(best.row)} at "
+        f"{spec.control_rate_hz:g} Hz{which}"
+    )
+    return dataclasses.replace(
+        table, actuated=spec.actuated, command_s=table.time_s[best.row], target=best.command
+    )
+
+
+def _unexplained(table: Table, ticks: _Ticks, every: int) -> float:
+    """Return the share of the accelerations that the commands leave, at the best delay.
+
+    The change of speed over a control period is regressed on positions and speeds, and on the commands at
+    both ends of the period. Only the policy's own states give commands that say more than the states do.
+    """
+    q, T = table.position, len(table.position)
+    rows = np.arange(every, T - 2 * every)
+    change = q[rows + 2 * every] - 2 * q[rows + every] + q[rows]
+    state = np.concatenate([np.ones((len(rows), 1)), q[rows], q[rows] - q[rows - every]], axis=1)
+    without = _left(state, change)
+    found = [1.0]
+    for late in range(round(USUAL_DELAY_S / np.median(np.diff(table.time_s)))):
+        number = np.searchsorted(ticks.row + late, np.arange(T), side="right") - 1
+        known = (number[rows] >= 0) & np.isfinite(change).all(axis=1)
+        acting = ticks.command[np.maximum(number, 0)]
+        both = np.concatenate([state, acting[rows], acting[rows + every]], axis=1)
+        left = _left(both[known], change[known]) / np.count_nonzero(known)
+        found.append(float(np.mean(left / np.maximum(without / len(rows), 1e-300))))
+    return min(found)
+
+
+def _left(inputs: FloatArray, outputs: FloatArray) -> FloatArray:
+    """Return the sum of squares that a linear regression leaves, for each output."""
+    sound = np.isfinite(inputs).all(axis=1) & np.isfinite(outputs).all(axis=1)
+    x, y = inputs[sound], outputs[sound]
+    return np.asarray(np.sum((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2, axis=0))

@@ -1,0 +1,170 @@
+"""Commands from the policy that moved the robot: none recorded, another clock, another policy."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.data.importing.table import Table
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
+from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
+from deal_hw.workflows.calibration.policy_commands import with_policy_commands
+from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.emulation.virtual import VirtualCartpole
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
+from deal_hw.workflows.shipped import required_policy
+
+STATES_A_TICK = 4
+"""State samples of the cart-pole in one of its control periods."""
+
+
+@pytest.fixture(scope="module")
+def policy() -> Path:
+    """The policy that moves the robot."""
+    return required_policy("cartpole")
+
+
+@pytest.fixture(scope="module")
+def facts() -> JointFacts:
+    """Joints of the cart-pole's model."""
+    return joint_facts(DESCRIPTION.mjcf)
+
+
+@pytest.fixture(scope="module")
+def table(policy: Path) -> Table:
+    """Five seconds of balancing with noise and a latency, as a file of states and commands would be read."""
+    plan = RunPlan(robot="cartpole", motion="balance", seconds=5.0, policy=str(policy))
+    robot = VirtualCartpole(draw_truth("sensor", 1, range_ratio=2.0))
+    run = robot.run(make_behaviour(plan, DESCRIPTION), plan.seconds).trajectory
+    rows = np.flatnonzero(run.command_sequence >= 0)
+    # A host that sends a command notes its own time; the robot's first states come before it.
+    received_s = run.device_s[rows] - run.command_age_s[rows]
+    _, first = np.unique(run.command_sequence[rows], return_index=True)
+    begin = run.device_s[rows[0]]
+    return Table(
+        joint_names=("cart", "pole"),
+        actuated=("cart",),
+        units=("m", "rad"),
+        time_s=run.device_s[rows] - begin,
+        position=run.position[rows],
+        velocity=run.velocity[rows],
+        effort=None,
+        command_s=received_s[first] - begin,
+        target=run.position_target[np.searchsorted(run.sent_sequence, run.command_sequence[rows][first])],
+        orientation=None,
+        gyro=None,
+        source={"file": "rec.csv", "part": ""},
+    )
+
+
+def without_commands(table: Table) -> Table:
+    """The same states alone."""
+    return dataclasses.replace(table, actuated=(), command_s=np.empty(0), target=np.empty((0, 0)))
+
+
+def test_states_alone_get_the_commands_that_were_sent(table: Table, policy: Path, facts: JointFacts) -> None:
+    """The sample of each period that the policy saw is found, and its commands are those of the run."""
+    said: list[str] = []
+    (found,) = with_policy_commands([without_commands(table)], policy, facts, said.append)
+    assert found.actuated == ("cart",)
+    assert np.allclose(np.diff(found.command_s), 1 / DESCRIPTION.control_rate_hz, atol=1e-6)
+    # The robot reports a command some milliseconds after the state that it answers.
+    late = table.target_at(found.command_s + 1.5 / DESCRIPTION.state_rate_hz)
+    spread = np.sum((late - late.mean()) ** 2)
+    assert np.sum((late - found.target) ** 2) < 0.02 * spread
+    assert f"every {STATES_A_TICK} later" in said[0] and "50 Hz" in said[0]
+
+
+def test_differences_stand_in_for_velocities(table: Table, policy: Path, facts: JointFacts) -> None:
+    """Without recorded velocities they are those over one control period, as this robot reports them."""
+    bare = dataclasses.replace(without_commands(table), velocity=None)
+    (found,) = with_policy_commands([bare], policy, facts, lambda _: None)
+    (known,) = with_policy_commands([without_commands(table)], policy, facts, lambda _: None)
+    assert np.corrcoef(found.target[:, 0], known.target[:, 0])[0, 1] > 0.95
+
+
+def test_commands_on_the_states_clock_stay(table: Table, policy: Path, facts: JointFacts) -> None:
+    """They are the policy's, soon after the states that it saw; nothing is changed."""
+    said: list[str] = []
+    (found,) = with_policy_commands([table], policy, facts, said.append)
+    np.testing.assert_array_equal(found.command_s, table.command_s)
+    assert "both have one clock" in said[0]
+
+
+@pytest.mark.parametrize("apart_s", [-0.8, 0.6])
+def test_another_clock_is_found_and_undone(
+    table: Table, policy: Path, facts: JointFacts, apart_s: float
+) -> None:
+    """A recording whose commands come from another clock is aligned, and the distance is said."""
+    said: list[str] = []
+    off = dataclasses.replace(table, command_s=table.command_s + apart_s)
+    (found,) = with_policy_commands([off], policy, facts, said.append)
+    moved_s = off.command_s - found.command_s
+    assert np.ptp(moved_s) < 1e-12
+    # The policy's own delay, at most a control period, goes with it.
+    assert abs(float(moved_s[0]) - apart_s) <= 1 / DESCRIPTION.control_rate_hz
+    assert "clocks are apart" in said[0]
+
+
+def test_commands_of_another_policy_are_refused(table: Table, policy: Path, facts: JointFacts) -> None:
+    """Commands that no shift in time explains: said before any fit, with what to do."""
+    wrong = dataclasses.replace(table, target=table.target[::-1])
+    with pytest.raises(DatasetError, match=r"rec.csv: the recorded commands are not those of .*column map"):
+        with_policy_commands([wrong], policy, facts, lambda _: None)
+
+
+def test_commands_that_never_change_are_refused(table: Table, policy: Path, facts: JointFacts) -> None:
+    """They cannot be the policy's."""
+    still = dataclasses.replace(table, target=np.zeros_like(table.target))
+    with pytest.raises(DatasetError, match="not those of"):
+        with_policy_commands([still], policy, facts, lambda _: None)
+
+
+def test_joints_in_another_order_are_sorted(table: Table, policy: Path, facts: JointFacts) -> None:
+    """The recording follows the policy's order."""
+    turned = dataclasses.replace(
+        table,
+        joint_names=("pole", "cart"),
+        units=("rad", "m"),
+        position=table.position[:, ::-1],
+        velocity=None if table.velocity is None else table.velocity[:, ::-1],
+    )
+    (found,) = with_policy_commands([turned], policy, facts, lambda _: None)
+    assert found.joint_names == ("cart", "pole") and found.units == ("m", "rad")
+    np.testing.assert_array_equal(found.position, table.position)
+
+
+def test_a_policy_that_does_not_fit_is_refused(table: Table, policy: Path, facts: JointFacts) -> None:
+    """Other joints, a rate without a sample for each command, a policy of a walking robot, a short file."""
+    other = dataclasses.replace(table, joint_names=("cart", "arm"))
+    with pytest.raises(PolicyMismatchError, match="joints cart, arm"):
+        with_policy_commands([other], policy, facts, lambda _: None)
+    slow = table.rows(np.arange(len(table.time_s)) % 5 == 0)
+    with pytest.raises(ConfigurationError, match="no whole multiple"):
+        with_policy_commands([slow], policy, facts, lambda _: None)
+    with pytest.raises(PolicyMismatchError, match="FL_hip"):
+        with_policy_commands([table], required_policy("go2"), facts, lambda _: None)
+    short = without_commands(table).rows(np.arange(len(table.time_s)) < 8)
+    with pytest.raises(DatasetError, match="record longer"):
+        with_policy_commands([short], policy, facts, lambda _: None)
+
+
+def test_a_file_of_states_is_prepared_with_its_policy(table: Table, policy: Path, tmp_path: Path) -> None:
+    """`calibrate --model --data states.csv --policy`: the episodes have the policy's commands."""
+    assert table.velocity is not None
+    file = tmp_path / "states.csv"
+    columns = np.column_stack([table.time_s, table.position, table.velocity])
+    np.savetxt(file, columns, delimiter=",", header="time,cart.pos,pole.pos,cart.vel,pole.vel", comments="")
+    settings = CalibrateSettings(recordings=Recordings(model=DESCRIPTION.mjcf, data=(file,)))
+    with pytest.raises(DatasetError, match="--policy"):
+        prepare(settings)
+    said: list[str] = []
+    work = prepare(dataclasses.replace(settings, policy=str(policy)), say=said.append)
+    assert any("no commands, so they are those of" in line for line in said)
+    assert sum(len(np.unique(e.target)) for e in work.episodes) > 50
