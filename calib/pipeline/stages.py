@@ -53,6 +53,7 @@ from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import STEP, averaged, check_step, halved, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
+    EXPLAINED_CHI2,
     Alarm,
     Budget,
     CalibrationMethod,
@@ -202,6 +203,9 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         }
         if run.left_out:
             provenance["checks_left_out"] = dict(run.left_out)
+        # A fit that explains the recordings needs no sound critic before it.
+        doubtful = searched.provenance.get("critic_diverged") and found.chi2 > EXPLAINED_CHI2
+        of_search = searched.alarms[:1] if doubtful else ()
         return dataclasses.replace(
             searched,
             method=self.name,
@@ -213,7 +217,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             latency_s=found.latency_s,
             latency_interval_s=known.latency_interval_s,
             chi2=found.chi2,
-            alarms=known.alarms,
+            alarms=(*known.alarms, *of_search),
             biased=known.biased,
             steps=problem.steps - steps + attempts.earlier_steps,
             seconds=time.perf_counter() - began + attempts.earlier_seconds,

@@ -19,6 +19,10 @@ WORSE = 1.02
 """Ratio to the nominal model's held-out error above which a result is worse [-]: less is chance where the
 nominal model was right."""
 
+NEAR_NOISE = 2.0
+"""Ratio to the sensor's noise up to which a held-out error counts as explained [-]: predictions from
+smoothed states have up to twice its error from their starts."""
+
 GIVEN = "motion that it was not given"
 
 
@@ -54,6 +58,8 @@ def trust(result: CalibrationResult) -> Trust:
     if "shared_error" in result.provenance:
         first = result.alarms[0]
         return Trust("red", first.seen, first.means, f"Do not use it. {first.do}")
+    if result.provenance.get("compares") == "distributions" and (known := _of_distributions(result)):
+        return known
     record = ""
     if nominal is None or calibrated is None:
         record = "Record one more motion and name it with --holdout."
@@ -128,6 +134,29 @@ def trust(result: CalibrationResult) -> Trust:
             "amber", f"{gain} {noise}", "No recording shows whether the model holds on other motion.", record
         )
     return Trust("green", f"{gain} {noise}", "The remaining error is the sensor's noise.", "Use it.")
+
+
+def _of_distributions(result: CalibrationResult) -> Trust | None:
+    """Return the verdict on values that only distributions of motion gave; None where they predict as noise.
+
+    Such a search tests no prediction, and many values give nearly equal distributions.
+    """
+    error = result.heldout_nrmse.get("calibrated")
+    noise = (result.provenance.get("heldout_rmse") or {}).get("noise", {}).get("nrmse")
+    if error is None:
+        seen = "The search compared distributions of motion, and no held-out recording tests its values."
+    elif noise is not None and error <= NEAR_NOISE * noise:
+        return None
+    else:
+        floor = "" if noise is None else f", {error / noise:.1f} times that of the sensor's noise"
+        seen = f"On held-out motion the model errs by {calibration.percent(error)} of the range{floor}."
+    return Trust(
+        "red",
+        seen,
+        "Many values give nearly the same distributions, so these are not the robot's.",
+        "Do not deploy a policy with it. Calibrate by the default, which compares predictions; where "
+        "commands are missing, --policy gives them.",
+    )
 
 
 def _first_cause(result: CalibrationResult) -> str:

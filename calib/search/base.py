@@ -148,6 +148,15 @@ class SearchLog:
             "Refine it, search again (another --seed, more --generations, wider ranges), or check the model.",
         )
 
+    def critic_diverged(self, times: int) -> list[Alarm]:
+        """Return the alarm of a critic whose training was undone so many times; none for 0."""
+        if not times:
+            return []
+        seen = f"The critic's training diverged in {times} of {len(self.trace)} generations."
+        means = "Its last sound weights were used there, and they tell less about the simulators."
+        do = "Search again with another --seed, or with --search eki, which has no critic."
+        return [Alarm(seen, means, do)]
+
     def result(
         self,
         centre: Members,

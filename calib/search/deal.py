@@ -37,7 +37,7 @@ from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import KalmanStepper, spread_of
 from deal_hw.calib.search.resume import Stateful
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -137,15 +137,8 @@ class _Deal(KalmanStepper):
     def result(self) -> CalibrationResult:
         members, centre = self.population(self.kalman.ask())
         chi2 = explained(self.problem, centre, self._lengths[-1])
-        alarms = []
-        if diverged := self._diverged + self._view.diverged:
-            alarms.append(
-                Alarm(
-                    f"The critic's training diverged in {diverged} of {len(self.log.trace)} generations.",
-                    "Its last sound weights were used there, and they tell less about the simulators.",
-                    "Search again with another --seed, or with --search eki, which has no critic.",
-                )
-            )
+        diverged = self._diverged + self._view.diverged
+        alarms = self.log.critic_diverged(diverged)
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
         if self._noisy and not chi2 <= self.settings.alarm_chi2:
             alarms.append(self.log.unexplained(chi2))
@@ -157,6 +150,7 @@ class _Deal(KalmanStepper):
             extra={
                 "interval": "ensemble spread, uncalibrated",
                 "view": "control periods" if self._noisy else "windows",
+                "critic_diverged": diverged,
             },
         )
 

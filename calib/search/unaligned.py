@@ -61,12 +61,16 @@ class UnalignedSettings:
 
 
 class _Statistics(Stateful, abc.ABC):
-    """Turns samples into one vector; ``outputs`` is the width of s', ``values`` are for the trace."""
+    """Turns samples into one vector; ``outputs`` is the width of s', ``values`` are for the trace.
+
+    ``diverged`` counts trainings that were undone.
+    """
 
     def __init__(
         self, width: int, outputs: int, settings: UnalignedSettings, rng: np.random.Generator
     ) -> None:
         self.outputs, self.settings, self.values = outputs, settings, dict[str, float]()
+        self.diverged = 0
         self._prepare(width, rng)
 
     @abc.abstractmethod
@@ -92,7 +96,8 @@ class _CriticMeans(_Statistics):
     def compare(self, real: Samples, fake: Samples) -> tuple[FloatArray, FloatArray]:
         """See :meth:`_Statistics.compare`."""
         gap = self._critic.train(real, fake.reshape(-1, fake.shape[-1]))
-        self.values = {"wasserstein": gap, "diverged": float(self._critic.diverged)}
+        self.diverged = self._critic.diverged
+        self.values = {"wasserstein": gap, "diverged": float(self.diverged)}
         return self._critic.statistics(real[None])[0], self._critic.statistics(fake)
 
 
@@ -180,8 +185,11 @@ class _Unaligned(LogitStepper):
             residual[usable] = (target - found)[:, alive] / std
         step = self.kalman.tell(residual, keep=self.settings.keep)
         self._spread = step.spread
+        words = f"misfit {step.misfit:.3g}, spread {step.spread:.3g}"
+        if not np.isfinite(self._statistics.values.get("wasserstein", 0.0)):
+            words = f"the critic diverged, its last weights go on, {words}"
         self.log.note(
-            f"misfit {step.misfit:.3g}, spread {step.spread:.3g}",
+            words,
             members,
             {
                 "misfit": step.misfit,
@@ -213,7 +221,12 @@ class _Unaligned(LogitStepper):
 
     def result(self) -> CalibrationResult:
         members, centre = self.population(self.kalman.ask())
-        return self.log.result(centre, members, extra={"interval": "ensemble spread, uncalibrated"})
+        return self.log.result(
+            centre,
+            members,
+            alarms=self.log.critic_diverged(self._statistics.diverged),
+            extra={"interval": "ensemble spread, uncalibrated", "compares": "distributions"},
+        )
 
 
 def _line(samples: npt.NDArray[Any], coefficients: FloatArray, outputs: int) -> FloatArray:

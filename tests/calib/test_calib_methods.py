@@ -32,7 +32,9 @@ from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
-from deal_hw.calibration import Budget, Progress
+from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
+from deal_hw.calib.validation.checks import Validation
+from deal_hw.calibration import EXPLAINED_CHI2, Budget, Progress
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
@@ -434,6 +436,31 @@ def test_a_critic_that_diverges_is_said_and_the_search_goes_on() -> None:
     assert f"diverged in {generations} of {generations} generations" in result.alarms[0].seen
     assert "--search eki" in result.alarms[0].do
     assert np.abs(np.log(result.estimate / truth)).max() < 0.01
+
+
+def test_a_diverged_critic_is_an_alarm_of_the_refined_result_where_noise_explains_none() -> None:
+    """With nominal values in place of the robot's own a residual stays, and the search before it matters."""
+    wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
+    space = recorded("ideal", 1).space.with_free(FREE)
+    problem = dataclasses.replace(small_problem(), space=space, known_std=np.full(4, 1e-3))
+    settings = Validation(local_first=False, cross_validation=False, split_half=False, diagnosis=False)
+    method = CalibrationPipeline(Deal(DealSettings(critic=wild)), "default", settings)
+    result = method.run(problem, Budget(population=10, generations=3), np.random.default_rng(0))
+    assert result.chi2 > EXPLAINED_CHI2 and result.provenance["critic_diverged"] > 0
+    assert "critic's training diverged" in result.alarms[-1].seen
+
+
+def test_a_diverged_critic_of_distributions_is_in_the_result() -> None:
+    """The alarm counts the generations; the search ends with finite values all the same."""
+    wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
+    told: list[Progress] = []
+    search = Unaligned(UnalignedSettings(critic=wild))
+    result = search.run(
+        small_problem(), Budget(population=10, generations=3), np.random.default_rng(0), told.append
+    )
+    assert all(one.message.startswith("the critic diverged, its last weights go on") for one in told)
+    assert "diverged in 3 of 3 generations" in result.alarms[0].seen
+    assert np.isfinite(result.estimate).all() and result.provenance["compares"] == "distributions"
 
 
 def test_deal_without_anything_to_fit_is_refused() -> None:

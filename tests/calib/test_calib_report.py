@@ -321,6 +321,27 @@ def test_verdict_asks_held_out_motion_first(changes: dict[str, Any], colour: str
     assert found.colour == colour and words in found.sentence
 
 
+@pytest.mark.parametrize(
+    ("noise", "heldout", "colour", "words"),
+    [
+        (0.001, HELD, "red", "6.0 times that of the sensor's noise. Many values"),
+        (0.004, HELD, "amber", "does not test"),
+        (None, HELD, "red", "0.6 % of the range. Many values"),
+        (0.001, {}, "red", "no held-out recording tests its values"),
+    ],
+)
+def test_values_from_distributions_are_red_unless_they_predict_as_noise(
+    noise: float | None, heldout: dict[str, float], colour: str, words: str
+) -> None:
+    """An error of 0.006 of the range is 6 times a noise of 0.001: not worth deploying."""
+    provenance: dict[str, Any] = {"compares": "distributions", "heldout_rmse": {}}
+    if noise is not None:
+        provenance["heldout_rmse"] = {"noise": {"nrmse": noise}}
+    calibrated = {**heldout, "calibrated": 0.006} if heldout else {}
+    found = trust(result(space(), heldout_nrmse=calibrated, chi2=float("nan"), provenance=provenance))
+    assert found.colour == colour and words in found.sentence
+
+
 def test_bars_lie_where_the_search_scale_puts_them() -> None:
     """Log range from 1 to 100: 10 is the middle; 5 to 20 begins at ln 5 / ln 100 = 34.9 %, 30.1 % wide."""
     row = parameter_rows(result(space(1)))[0]
