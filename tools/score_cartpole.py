@@ -22,7 +22,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 import mujoco
 import numpy as np
@@ -31,6 +31,7 @@ import deal_hw
 from deal_hw.bench.rows import describe_call
 from deal_hw.types import FloatArray, IntArray
 
+Search: TypeAlias = Literal["deal", "eki", "deal-paper"]
 PERIOD_S = 0.02
 WINDOWS_S = (0.2, 1.0)
 AROUND = 2
@@ -138,8 +139,10 @@ def scores(
     }
 
 
-def fold(folder: Path, files: list[Path], left_out: Path, seed: int) -> dict[str, Any]:
-    """Calibrate on all recordings but one, and predict that one."""
+def fold(
+    folder: Path, files: list[Path], left_out: Path, seed: int, search: Search | None = None
+) -> dict[str, Any]:
+    """Calibrate on all recordings but one, with the default's search or another, and predict that one."""
     nominal = mujoco.MjModel.from_xml_path(str(folder / "cartpole.xml"))
     full_n = float(nominal.actuator_gear[0, 0] * nominal.actuator_gainprm[0, 0])
     began, cpu = time.monotonic(), time.process_time()
@@ -148,6 +151,7 @@ def fold(folder: Path, files: list[Path], left_out: Path, seed: int) -> dict[str
         data=[path for path in files if path != left_out],
         holdout=[left_out],
         columns=folder / "columns.yaml",
+        search=search,
         seed=seed,
         threads=1,
         say=lambda text: print(f"  {text}", flush=True),
@@ -164,6 +168,7 @@ def fold(folder: Path, files: list[Path], left_out: Path, seed: int) -> dict[str
         "nothing_moves": scores(None, full_n, 0.0, recording),
         "latency_s": found.result.latency_s,
         "parameters": {row["parameter"]: row["estimate"] for row in found.rows()},
+        "search": found.result.provenance.get("search"),
         "colour": found.colour,
         "alarms": [alarm.means for alarm in found.result.alarms],
         "seconds": round(seconds, 1),
@@ -188,6 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("folder", type=Path, help="of tools/convert_cartpole.py")
     parser.add_argument("--leave-out", nargs="*", default=[], help="names of recordings; default: each one")
+    parser.add_argument("--search", choices=get_args(Search), help="search of the calibration")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="write the rows to this file (JSON)")
     options = parser.parse_args(arguments)
@@ -207,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     for path in files:
         if options.leave_out and path.stem not in options.leave_out:
             continue
-        row = fold(options.folder, files, path, options.seed)
+        row = fold(options.folder, files, path, options.seed, options.search)
         result["rows"].append(row)
         print(json.dumps({k: row[k] for k in ("left_out", "calibrated", "processor_seconds")}), flush=True)
         result["median"] = medians(result["rows"])
