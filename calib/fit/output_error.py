@@ -188,6 +188,16 @@ def prediction_rmse(problem: Problem, members: Sequence[Member], seconds: float)
     return np.asarray(np.sqrt(np.where(np.isfinite(squares), squares, np.inf) / np.maximum(count, 1)))
 
 
+def standing_rmse(problem: Problem, seconds: float) -> FloatArray:
+    """Return the same errors, (M,), of a robot whose state stays as it is at the start of each window."""
+    squares, count = np.zeros(len(problem.channels)), np.zeros(len(problem.channels))
+    for data in longest_windows(problem, seconds):
+        start = np.concatenate([data.start_position, data.start_velocity], axis=1)[:, None, problem.channels]
+        squares += np.sum(np.where(data.reported, start - data.measured, 0.0) ** 2, axis=(0, 1))
+        count += np.sum(data.reported, axis=(0, 1))
+    return np.asarray(np.sqrt(squares / np.maximum(count, 1)))
+
+
 def _errors(data: WindowData, residual: FloatArray) -> FloatArray:
     """Return prediction minus measurement, (W, H, M), from whitened residuals; 0 for missing samples."""
     return np.asarray(np.nan_to_num(residual) * np.where(data.reported, data.std, 0.0))

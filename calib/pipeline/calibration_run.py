@@ -138,13 +138,15 @@ class CalibrationRun:
         if self.progress is not None:
             self.progress(Progress(stage, done, total, message, **candidate))
 
-    def say_search(self) -> None:
+    def say_search(self, why: str = "") -> None:
         """Report that the search begins, of which kind, and why; nothing where it stands in for none."""
         name = self.attempts.search.name
         if name == "nominal":
             return
-        kind = "an adversarial search" if name.startswith("deal") else "a search"
-        why = "" if self.local is None else "the local fit leaves more than noise, so "
+        with_critic = name.startswith("deal") and name not in ("deal-no-critic", "deal-untrained")
+        kind = "an adversarial search" if with_critic else "a search"
+        if self.local is not None:
+            why = "the local fit leaves more than noise, so "
         self.say(BEFORE_SEARCH, f"{why}{kind} follows ({name})")
 
     def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:

@@ -34,11 +34,19 @@ from deal_hw.calib.fit.intervals import (
     with_rows,
 )
 from deal_hw.calib.fit.null_space import confounded
-from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
+from deal_hw.calib.fit.output_error import (
+    SHORT,
+    OutputErrorFit,
+    Recipe,
+    fit_output_error,
+    prediction_rmse,
+    standing_rmse,
+)
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
+from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import (
     HALVES,
@@ -72,6 +80,8 @@ class OutputErrorSettings:
     Attributes:
         windows_s: Windows of the fits [s]; each fit starts where the one before ended. Model error biases
             each window length differently.
+        search_always: Search whatever the fits explain; otherwise only where their predictions over
+            ``compared_s`` are no better than a robot whose state stays as it is.
         search_s: Length of data for the search, spread evenly over the recordings [s]. The search only has to
             find the neighbourhood.
         stretch_s: Recordings are divided into stretches of this length for the search [s].
@@ -91,6 +101,7 @@ class OutputErrorSettings:
     """
 
     windows_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
+    search_always: bool = True
     search_s: float = 12.0
     stretch_s: float = 2.5
     folds: int = 3
@@ -154,8 +165,7 @@ class OutputErrorFits(Fits):
         problem = first.plain.problem
         # The fits continue from the search's estimate, so it only has to find the neighbourhood.
         run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
-        run.say_search()
-        searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
+        searched = self._searched(run, problem, first, windows)
         run.offer("search", searched)
         # Drawn after the search, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
@@ -222,6 +232,22 @@ class OutputErrorFits(Fits):
         return FitOutcome(
             searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
         )
+
+    def _searched(
+        self, run: CalibrationRun, problem: Problem, first: OutputErrorFit, windows: Sequence[OutputErrorFit]
+    ) -> CalibrationResult:
+        """Return the search's result, or the model's own values where none is needed."""
+        settings, reduced = self.settings, self._reduced(problem, first)
+        if not settings.search_always:
+            fits = [fit.member for fit in (first, *windows)]
+            error = np.mean(np.log(prediction_rmse(problem, fits, settings.compared_s)), axis=1)
+            if np.min(error) < np.mean(np.log(standing_rmse(problem, settings.compared_s))):
+                return nominal().run(reduced, run.budget, run.rng)
+        why = (
+            "" if settings.search_always else "the fits predict no better than a robot that stands still, so "
+        )
+        run.say_search(why)
+        return run.attempts.run(reduced, 0, run.budget, run.progress)
 
     def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
         """Return the search's problem: part of the recordings, and the first fit's residuals as scale."""
@@ -362,6 +388,7 @@ GAIT = OutputErrorSettings(
     stretch_s=1.5,
     half_iterations=2,
     hold_first=True,
+    search_always=False,
     common_std=((FORCES, 0.05), (("geom_friction",), 0.065)),
 )
 """Half a step of the gait, and a quarter. In shorter windows, errors of the start states dominate. In longer
@@ -373,10 +400,11 @@ tuning seeds 0 to 4), also with fits from the true start states."""
 def gait() -> CalibrationPipeline:
     """Return `gait`: short, robust fits of a walking robot, from the nominal values.
 
-    Start states are smoothed, not fitted: fitted ones would explain each landing of a foot.
+    Start states are smoothed, not fitted: fitted ones would explain each landing of a foot. Where these fits
+    explain nothing, the adversarial search looks for another start.
     """
     settings = Validation(local_first=False, cross_validation=False)
-    return CalibrationPipeline(nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
+    return CalibrationPipeline(Deal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
 
 def _scaled_together(known: Uncertainty, kinds: Container[str], std: float) -> Uncertainty:

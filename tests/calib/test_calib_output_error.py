@@ -15,7 +15,14 @@ from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiS
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.null_space import confounded
-from deal_hw.calib.fit.output_error import SHORT, Recipe, fit_output_error, prediction_rmse
+from deal_hw.calib.fit.output_error import (
+    SHORT,
+    Recipe,
+    fit_output_error,
+    prediction_rmse,
+    standing_rmse,
+)
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.output_error_fits import (
     OutputErrorFits,
     OutputErrorSettings,
@@ -23,10 +30,10 @@ from deal_hw.calib.pipeline.output_error_fits import (
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.search.resume import Restarts, SearchCheckpoint
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
-from deal_hw.calibration import Budget, CalibrationResult, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.prepare import prepare
@@ -212,6 +219,47 @@ def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_star
         "search"
     }
     assert found.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
+
+
+def test_a_robot_that_stands_still_is_what_fits_that_explain_nothing_are_compared_with(
+    problem: Problem,
+) -> None:
+    """By hand: windows of four samples at a constant speed of 1 rad/s have errors of 1 to 4 periods."""
+    first = problem.episodes[0]
+    T = len(first.sample)
+    moving = dataclasses.replace(problem, episodes=[first])
+    moving.episodes = [dataclasses.replace(first, position=np.arange(T)[:, None] * first.period_s)]
+    moving.starts = [
+        dataclasses.replace(moving.starts[0], position=moving.episodes[0].position, velocity=np.ones((T, 1)))
+    ]
+    found = standing_rmse(moving, 4 * first.period_s)
+    assert found == pytest.approx(first.period_s * np.sqrt(np.mean(np.arange(1, 5) ** 2)), rel=1e-6)
+
+
+@pytest.mark.parametrize("explains", [True, False])
+def test_a_walks_search_runs_only_where_its_fits_explain_nothing(problem: Problem, explains: bool) -> None:
+    """An arm whose sensor turns the other way: each fit predicts worse than a robot that stands still."""
+    settings = OutputErrorSettings(windows_s=(0.4,), search_always=False)
+    if not explains:
+        turned = [dataclasses.replace(e, position=-e.position) for e in problem.episodes]
+        problem = dataclasses.replace(problem, episodes=turned)
+    fit = fit_output_error(problem, TRUTH, LATE_S, Recipe(seconds=0.4, iterations=0))
+    told: list[str] = []
+    rng = np.random.default_rng(0)
+    run = CalibrationRun(
+        problem=problem,
+        budget=BUDGET,
+        rng=rng,
+        attempts=Restarts(Eki(), rng, None),
+        settings=Validation(local_first=False, cross_validation=False),
+        progress=lambda p: told.append(p.message) if p.stage == BEFORE_SEARCH else None,
+    )
+    found = OutputErrorFits(settings, (fit, fit)).best(run)
+    assert found.searched.method == ("nominal" if explains else "eki")
+    assert (
+        any("no better than a robot that stands still, so a search follows" in text for text in told)
+        != explains
+    )
 
 
 def test_halves_of_a_right_model_agree(problem: Problem, result: CalibrationResult) -> None:
