@@ -201,6 +201,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             **found.facts,
             "physics_steps": {"fits": run.fit_steps, **run.checks},
         }
+        if run.problem.robot.step_s < problem.robot.step_s:
+            provenance["fit_step_s"] = run.problem.robot.step_s
         if run.left_out:
             provenance["checks_left_out"] = dict(run.left_out)
         # A fit that explains the recordings needs no sound critic before it.

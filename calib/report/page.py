@@ -22,7 +22,7 @@ from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import Parameter
-from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel, at_step
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 from deal_hw.sim.mjcf.exports import write_exports
 
@@ -267,20 +267,9 @@ def write_result(
                 write_report(waiting / REPORT, report)
                 names.append(REPORT)
             names += write_exports(waiting, robot, result, judged)
-            source = f"method {result.method}, distribution {result.distribution().digest()}"
             try:
                 require_other(folder / MODEL, robot.description.mjcf)
-                written = write_calibrated_mjcf(
-                    robot,
-                    result.space,
-                    result.estimate,
-                    waiting / MODEL,
-                    result.latency_s,
-                    source,
-                    result.without_value,
-                    found.colour,
-                    result.biased,
-                )
+                written = write_model(robot, result, waiting / MODEL)
                 names += [file.name for file in written]
             except ConfigurationError as err:
                 # An error in the model must not cost the numbers.
@@ -290,6 +279,22 @@ def write_result(
     if unwritable is not None:
         raise unwritable
     return {name: folder / name for name in names}
+
+
+def write_model(robot: RobotModel, result: CalibrationResult, path: Path) -> tuple[Path, ...]:
+    """Write the calibrated MJCF, with the physics step of the fit; see :func:`write_calibrated_mjcf`."""
+    step_s = result.provenance.get("fit_step_s")
+    return write_calibrated_mjcf(
+        robot if step_s is None else at_step(robot, step_s),
+        result.space,
+        result.estimate,
+        path,
+        result.latency_s,
+        f"method {result.method}, distribution {result.distribution().digest()}",
+        result.without_value,
+        trust(result).colour,
+        result.biased,
+    )
 
 
 def _trace(result: CalibrationResult) -> dict[str, Any]:

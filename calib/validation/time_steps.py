@@ -10,7 +10,6 @@ must also agree with the finer step: data that were simulated with the model's o
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
+from deal_hw.sim.engine.model import at_step
 from deal_hw.types import FloatArray
 
 
@@ -277,9 +277,7 @@ def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
 
 def halved(problem: Problem) -> Problem:
     """Return the problem with half the physics step; recordings, noise and smoothed states are shared."""
-    model = copy.copy(problem.robot.model)
-    model.opt.timestep /= 2.0
-    return problem.with_robot(dataclasses.replace(problem.robot, model=model))
+    return problem.with_robot(at_step(problem.robot, problem.robot.step_s / 2.0))
 
 
 def _shifted(rows: WindowRows, change: FloatArray) -> WindowRows:

@@ -104,22 +104,12 @@ class Calibration:
         Raises:
             ConfigurationError: It is the model's own file, or a value cannot be written.
         """
-        from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
+        from deal_hw.calib.report.page import write_model
+        from deal_hw.sim.mjcf.calibrated import require_other
 
-        path, robot, result = Path(path), self.inputs.robot, self.result
+        path, robot = Path(path), self.inputs.robot
         require_other(path, robot.description.mjcf)
-        source = f"method {result.method}, distribution {self.distribution.digest()}"
-        write_calibrated_mjcf(
-            robot,
-            result.space,
-            result.estimate,
-            path,
-            result.latency_s,
-            source,
-            result.without_value,
-            self.colour,
-            result.biased,
-        )
+        write_model(robot, self.result, path)
         return path
 
     def save(self, folder: Path | str) -> dict[str, Path]:

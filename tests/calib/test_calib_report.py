@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from fakes.simulated_episode import simulated_episode
@@ -557,6 +558,19 @@ def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tm
     assert f"method truth, distribution {digest}" in files["calibrated.xml"].read_text()
     assert read_result(tmp_path / "a").method == "truth"
     assert "report.html" not in write_result(tmp_path / "b", robot, gathered.result)
+
+
+def test_the_model_has_the_physics_step_of_the_fit(gathered: ReportInputs, tmp_path: Path) -> None:
+    """Values that were fitted with half the step hold with that step."""
+    robot = load_model(DESCRIPTION)
+    half = robot.step_s / 2
+    finer = dataclasses.replace(
+        gathered.result, provenance={**gathered.result.provenance, "fit_step_s": half}
+    )
+    for result, step_s in ((gathered.result, robot.step_s), (finer, half)):
+        write_result(tmp_path / "a", robot, result)
+        written = mujoco.MjModel.from_xml_path(str(tmp_path / "a" / "calibrated.xml"))
+        assert written.opt.timestep == pytest.approx(step_s)
 
 
 def test_numbers_survive_a_model_that_cannot_be_written(gathered: ReportInputs, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from dataclasses import dataclass
 
 import mujoco
@@ -127,6 +128,13 @@ def actuator_of(model: mujoco.MjModel, joint: str) -> int:
         f"actuators {', '.join(names[i] or f'number {i}' for i in found)} all drive joint {joint!r}; "
         "keep the one that takes the recorded commands"
     )
+
+
+def at_step(robot: RobotModel, step_s: float) -> RobotModel:
+    """Return the robot with another physics step [s]."""
+    model = copy.copy(robot.model)
+    model.opt.timestep = step_s
+    return dataclasses.replace(robot, model=model)
 
 
 def model_with(robot: RobotModel, space: ParameterSpace, theta: FloatArray) -> mujoco.MjModel:
