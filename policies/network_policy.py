@@ -44,6 +44,28 @@ class NetworkPolicy:
         return np.asarray(action.numpy(), dtype=np.float64)
 
 
+class Feedback(torch.nn.Linear):
+    """A fixed linear feedback of the observation; its gain has shape (A, O)."""
+
+    def __init__(self, gain: FloatArray) -> None:
+        super().__init__(gain.shape[1], gain.shape[0], bias=False)
+        with torch.no_grad():
+            self.weight.copy_(torch.as_tensor(gain))
+        self.requires_grad_(False)
+
+
+class FeedbackNetwork(torch.nn.Module):
+    """The sum of a network and of a feedback, clipped to [-1, 1]."""
+
+    def __init__(self, network: torch.nn.Module, feedback: Feedback) -> None:
+        super().__init__()
+        self.network, self.feedback = network, feedback
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return the actions, (B, A), for observations, (B, O)."""
+        return torch.nn.functional.hardtanh(self.network(observation) + self.feedback(observation))
+
+
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread inside the context.

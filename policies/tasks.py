@@ -32,6 +32,12 @@ _LEGGED_SAC: Final = {
     "averaged": 0.05,
     "steps": 240_000,
 }
+_STRIDE_PPO: Final = {
+    "hidden": (128, 128),
+    "exploration": 0.3,
+    "divergence": 0.015,
+    "steps": 30_000_000,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +118,14 @@ TASKS: Final = {
         udr_ratio=1.75,
         udr_latency_s=(0.0, 0.012),
     ),
-    "humanoid": _simulated("run_env:HumanoidEnv", motors=21, udr_ratio=1.75),
+    "humanoid": TrainingTask(
+        environment="deal_hw.policies.humanoid_env:HumanoidEnv",
+        trainer="ppo",
+        members={"ppo": 128, "sac": 64},
+        settings={"ppo": _STRIDE_PPO, "sac": {**_LEGGED_SAC, "target_entropy": -21.0}},
+        udr_ratio=1.75,
+        udr_latency_s=(0.0, 0.02),
+    ),
 }
 
 
