@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from deal_hw.description import RobotDescription
 from deal_hw.parameters import ParameterDistribution
@@ -78,7 +79,7 @@ def turn_spec(
 class HandEnv(LocomotionEnv):
     """Turn the cube to a target orientation on the hand; an episode ends when it falls off.
 
-    A target is a rotation about the vertical, drawn uniformly at the start. With the angle e from the target,
+    A target is the orientation at the start, turned about the vertical by an angle that is drawn uniformly. With the angle e from the target,
     from the true state, the reward of a tick is::
 
         progress_weight (e_before - e) + aligned_weight exp(-(e / tolerance_rad)²) + holding_reward
@@ -126,11 +127,12 @@ class HandEnv(LocomotionEnv):
         return self._builder.target
 
     def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
-        """Draw the targets of the restarted members, relative to their cubes' orientations."""
+        """Draw the targets of the restarted members: from their cubes' orientations about the vertical."""
         largest, position = self.task.largest_turn_rad, self.loop.position[where]
-        # A cube that settled is turned by less than a hundredth of a radian.
-        self._builder.target[where] = 0.0
-        self._builder.target[where, _UP] = rng.uniform(-largest, largest, int(where.sum()))
+        turn = np.zeros((len(position), 3))
+        turn[:, _UP] = rng.uniform(-largest, largest, len(turn))
+        wanted = Rotation.from_rotvec(turn) * Rotation.from_rotvec(position[:, 3:6])
+        self._builder.target[where] = wanted.as_rotvec()
         self._error[where] = self._angle(position, self.wanted[where])
         self._start[where] = position[:, :2]
 

@@ -32,6 +32,12 @@ _LEGGED_SAC: Final = {
     "averaged": 0.05,
     "steps": 240_000,
 }
+_TURN_PPO: Final = {
+    "exploration": 0.5,
+    "divergence": 0.015,
+    "reward_scale": 0.05,
+    "steps": 60_000_000,
+}
 _STRIDE_PPO: Final = {
     "hidden": (128, 128),
     "exploration": 0.3,
@@ -100,7 +106,14 @@ def _simulated(environment: str, motors: int, udr_ratio: float) -> TrainingTask:
 
 
 TASKS: Final = {
-    "allegro": _simulated("hand_env:HandEnv", motors=16, udr_ratio=1.75),
+    "allegro": TrainingTask(
+        environment="deal_hw.policies.hand_env:HandEnv",
+        trainer="ppo",
+        members={"ppo": 256, "sac": 64},
+        settings={"ppo": _TURN_PPO, "sac": {**_LEGGED_SAC, "target_entropy": -16.0}},
+        udr_ratio=1.75,
+        udr_latency_s=(0.0, 0.02),
+    ),
     "ant": _simulated("run_env:RunEnv", motors=8, udr_ratio=5.0),
     "cartpole": TrainingTask(
         environment="deal_hw.policies.cartpole_env:CartPoleEnv",

@@ -251,7 +251,7 @@ def test_clocks_and_ranges_that_cannot_be_are_refused(fields: dict[str, Any], wo
     assert not {"clock_hz", "command_range"} & json.loads(feedback_spec(DRIVER).to_json()).keys()
 
 
-BASE = ("gravity", "heading", "angular_velocity", "linear_velocity", "height", "command")
+BASE = ("gravity", "heading", "angular_velocity", "linear_velocity", "height", "place", "command")
 
 plain = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),

@@ -20,7 +20,8 @@ from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
 from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.run_env import HumanoidEnv, RunEnv, RunTask, run_spec
+from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask, stride_spec
+from deal_hw.policies.run_env import RunEnv, RunTask, run_spec
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray, JointCommand
 
@@ -39,8 +40,7 @@ def make(robot: str, count: int = 4, **task: Any) -> LocomotionEnv:
     if robot == "ant":
         return RunEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
     if robot == "humanoid":
-        task = {"top_height_m": 2.0, "least_height_m": 0.9, **task}
-        return HumanoidEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
+        return HumanoidEnv(robot_description(robot), udr(robot), count, task=StrideTask(**task))
     return Go2Env(GO2, udr(robot), count, task=WalkTask(**task))
 
 
