@@ -48,8 +48,8 @@ BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", 
 """Observed quantities of a floating base, in the base's frame: the directions of gravity and of the world's x
 axis (unit vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
 WORLD_QUANTITIES = ("place", "target_rotation")
-"""Observed quantities of a floating base, in the world: its position [m], and the rotation vector that turns it
-to the target orientation [rad]. No sensor of a robot reports the place."""
+"""Observed quantities of a floating base, in the world: its position [m], which no sensor of a robot
+reports, and the rotation vector that turns it to the target orientation [rad]."""
 BASE_SIZE = 6
 
 VERDICT: Final = "calibration_verdict"

@@ -79,8 +79,8 @@ def turn_spec(
 class HandEnv(LocomotionEnv):
     """Turn the cube to a target orientation on the hand; an episode ends when it falls off.
 
-    A target is the orientation at the start, turned about the vertical by an angle that is drawn uniformly. With the angle e from the target,
-    from the true state, the reward of a tick is::
+    A target is the orientation at the start, turned about the vertical by an angle that is drawn uniformly.
+    With the angle e from the target, from the true state, the reward of a tick is::
 
         progress_weight (e_before - e) + aligned_weight exp(-(e / tolerance_rad)²) + holding_reward
         - shift_weight (dx² + dy²) - control_weight |a|² - action_weight |a - a_before|²

@@ -114,7 +114,7 @@ class StrideTask:
 def stride_spec(
     description: RobotDescription, trained_under: str = "", task: StrideTask | None = None
 ) -> PolicySpec:
-    """Return the layout of observation and action: the state without the place, clock, and the last action."""
+    """Return the layout of observation and action: state without the place, clock, last action."""
     task = task or StrideTask()
     terms = [ObservationTerm("height", "z", 2.0), *vector_terms("gravity", 1.0)]
     terms += [*vector_terms("heading", 1.0), *vector_terms("linear_velocity", 0.5)]
@@ -216,16 +216,14 @@ class HumanoidEnv(LocomotionEnv):
 
     def mirror(self) -> tuple[Mirror, Mirror]:
         """Return the reflections in the vertical plane ahead: left and right change places."""
-        terms = self.layout.observation
-        model = load_model(self.description).model
-        signs = _joint_signs(model)
+        signs, terms = _joint_signs(load_model(self.description).model), self.layout.observation
         found: list[tuple[int, float]] = []
-        for term in terms:
+        for k, term in enumerate(terms):
             if term.joint in signs:
                 other = dataclasses.replace(term, joint=_other_side(term.joint))
                 found.append((terms.index(other), signs[term.joint]))
             else:
-                found.append((terms.index(term), -1.0 if term.joint in _REVERSED.get(term.quantity, "") else 1.0))
+                found.append((k, -1.0 if term.joint in _REVERSED.get(term.quantity, ()) else 1.0))
         actuated = self.layout.actuated
         actions = [(actuated.index(_other_side(name)), signs[name]) for name in actuated]
         return _mirror(found), _mirror(actions)

@@ -143,7 +143,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         return np.zeros((self.num_envs, 0))
 
     def feedback(self) -> FloatArray:
-        """Return a fixed linear part of the policy, (A, O), which PPO adds to its network; zero by default."""
+        """Return a fixed linear part of the policy, (A, O), that PPO adds to its network; zero by default."""
         return np.zeros((len(self.layout.actuated), len(self.layout.observation)))
 
     def mirror(self) -> tuple[Mirror, Mirror] | None:

@@ -13,9 +13,9 @@ the record of its training and of its results on other robots. Task, trainer and
 command with `--resume` goes on from the checkpoint, also after a crash. The curve of the return against steps
 and processor hours is kept beside the checkpoint (.curve.json) and copied into the record.
 
-allegro_udr, ant_udr and humanoid_udr are early checkpoints, made in minutes on one core: good enough to excite
-a robot for calibration (the paper's Table 5 studies such ones), not good at their task. Those of hand and
-humanoid are of former tasks, which this tool no longer trains. They are kept because stored rows of the
+allegro_udr, ant_udr and humanoid_udr are early checkpoints, made in minutes on one core: good enough to
+excite a robot for calibration (the paper's Table 5 studies such ones), not good at their task. Those of hand
+and humanoid are of former tasks, which this tool no longer trains. They are kept because stored rows of the
 benches were made with them.
 """
 

@@ -10,7 +10,14 @@ import numpy as np
 from deal_hw.control.velocity import FixedVelocity, VelocitySource
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
-from deal_hw.policy import BASE_QUANTITIES, WORLD_QUANTITIES, ObservationBuilder, Policy, PolicySpec, rotation_vector
+from deal_hw.policy import (
+    BASE_QUANTITIES,
+    WORLD_QUANTITIES,
+    ObservationBuilder,
+    Policy,
+    PolicySpec,
+    rotation_vector,
+)
 from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
 
 

@@ -18,9 +18,9 @@ from deal_hw.drivers import parameter_spaces, recorded_description, robot_descri
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
+from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask
 from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask, stride_spec
 from deal_hw.policies.run_env import RunEnv, RunTask, run_spec
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray, JointCommand
