@@ -65,8 +65,8 @@ class StrideTask:
         swing_m: Height of the foot in the middle of a step.
         alive_reward: Reward of a tick without a fall.
         speed_weight: Reward of the wanted speed; falls linearly to 0 at rest.
-        gait_weight: Reward of feet at the height that the clock wants, mean over the feet; zero at an error
-            of ``swing_m``.
+        gait_weight: Reward of feet at the height that the clock wants, mean over the feet; feet that stay on
+            the floor earn nothing on average.
         drift_weight: Cost of the squared speed to the side [s²/m²].
         heading_weight: Cost of 1 minus the cosine of the heading.
         tilt_weight: Cost of the squared horizontal part of gravity's direction.
@@ -80,6 +80,7 @@ class StrideTask:
         least_height_m: Torso height below which it has fallen.
         largest_tilt: Cosine of the torso's tilt below which it has fallen.
         start_noise_rad: Largest deviation of joints at the start.
+        start_speed_m_s: Highest forward speed at the start; half of the episodes start at rest.
         spring_factor: Factor on the policy's springs (``SPRING_NM_RAD``).
     """
 
@@ -89,7 +90,7 @@ class StrideTask:
     swing_share: float = 0.5
     swing_m: float = 0.1
     alive_reward: float = 1.0
-    speed_weight: float = 2.0
+    speed_weight: float = 3.0
     gait_weight: float = 2.0
     drift_weight: float = 1.0
     heading_weight: float = 2.0
@@ -103,6 +104,7 @@ class StrideTask:
     least_height_m: float = 0.9
     largest_tilt: float = 0.7
     start_noise_rad: float = 0.05
+    start_speed_m_s: float = 1.0
     spring_factor: float = 1.0
 
     def __post_init__(self) -> None:
@@ -159,14 +161,15 @@ class HumanoidEnv(LocomotionEnv):
     The reward of a tick, from the true state after it, with angular velocities in the torso's frame, is::
 
         alive_reward + speed_weight max(-1, 1 - |vx - speed| / speed)
-        + gait_weight mean over feet of max(-1, 1 - |h - wanted h| / swing_m)
+        + gait_weight max(-1, 1 - pi / swing_m mean over feet of |h - wanted h|)
         - drift_weight vy² - heading_weight (1 - cos heading) - tilt_weight (gx² + gy²)
         - bounce_weight vz² - roll_weight (wx² + wy²) - pose_weight |q_calm|²
         - control_weight |a|² - action_weight |a - a_before|²
 
     and -fall_cost in the tick in which the torso tilts or sinks too far, which ends the episode. q_calm are
     the joints of trunk and arms and those that spread or turn the legs. The wanted height of a foot is half a
-    sine in its swing and zero else. Without a clock, the humanoid learns to stand long before it steps.
+    sine in its swing and zero else. A start with some speed asks for steps: who has learnt to stand still loses
+    much by a fall, and hardly tries to step.
 
     Args:
         description: The humanoid.
@@ -232,6 +235,12 @@ class HumanoidEnv(LocomotionEnv):
         """Draw the clocks' phases of the restarted members: either foot may begin."""
         self._builder.clock[where] = 0.5 * rng.integers(2, size=int(where.sum()))
 
+    def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+        """Draw standing robots, half of them with a forward speed."""
+        position, velocity = super().start_state(rng, count)
+        velocity[:, 0] = np.maximum(rng.uniform(-1.0, 1.0, count), 0.0) * self.task.start_speed_m_s
+        return position, velocity
+
     def forward_speed(self) -> FloatArray:
         """Return the speeds along the world's x axis, (N,) [m/s]."""
         return self.loop.velocity[:, 0]
@@ -257,7 +266,7 @@ class HumanoidEnv(LocomotionEnv):
         task, seen = self.task, base(position, velocity)
         speed = 1.0 - np.abs(velocity[:, 0] - task.speed_m_s) / task.speed_m_s
         lag = np.abs(self.foot_heights() - self.wanted_heights()).mean(axis=1)
-        gait = np.maximum(1.0 - lag / task.swing_m, -1.0)
+        gait = np.maximum(1.0 - np.pi * lag / task.swing_m, -1.0)
         reward = task.alive_reward + task.speed_weight * np.maximum(speed, -1.0) + task.gait_weight * gait
         reward -= task.drift_weight * np.square(velocity[:, 1])
         reward -= task.heading_weight * (1.0 - seen[:, HEADING][:, 0])

@@ -39,7 +39,7 @@ _TURN_PPO: Final = {
     "steps": 60_000_000,
 }
 _STRIDE_PPO: Final = {
-    "hidden": (128, 128),
+    "hidden": (256, 128),
     "exploration": 0.3,
     "divergence": 0.015,
     "steps": 30_000_000,

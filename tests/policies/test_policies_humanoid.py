@@ -39,18 +39,18 @@ def test_reward_by_hand() -> None:
     """Speed, drift, heading, tilt, motion, pose and effort; feet are tested below."""
     env = make(3, gait_weight=0.0)
     position, velocity = upright(3)
-    # Ahead at the wanted speed, and to the side at 0.5 m/s: 1 + 2 - 1 * 0.25.
+    # Ahead at the wanted speed, and to the side at 0.5 m/s: 1 + 3 - 1 * 0.25.
     velocity[0, :2] = 1.0, 0.5
     # At rest, turned by 60 degrees, a calm joint 0.5 rad off, one action of 0.5 after -0.5:
     # 1 + 0 - 2 * 0.5 - 0.2 * 0.25 - 0.02 * 0.25 - 0.01.
     position[1, 5], position[1, 6] = math.pi / 3, 0.5
-    # Backwards at 3 m/s counts as the least, -2; tilted by 30 degrees about x, rising at 0.4 m/s, rolling at
-    # 2 rad/s: 1 - 2 - 2 * 0.25 - 0.5 * 0.16 - 0.05 * 4.
+    # Backwards at 3 m/s counts as the least, -3; tilted by 30 degrees about x, rising at 0.4 m/s, rolling at
+    # 2 rad/s: 1 - 3 - 2 * 0.25 - 0.5 * 0.16 - 0.05 * 4.
     position[2, 3] = math.pi / 6
     velocity[2, [0, 2, 3]] = -3.0, 0.4, 2.0
     action, before = np.zeros((3, 21)), np.zeros((3, 21))
     action[1, 4], before[1, 4] = 0.5, -0.5
-    wanted = [2.75, -0.065, -1.78]
+    wanted = [3.75, -0.065, -2.78]
     np.testing.assert_allclose(env.reward(position, velocity, action, before), wanted, atol=1e-12)
 
 
@@ -64,9 +64,33 @@ def test_feet_are_paid_for_following_the_clock() -> None:
     np.testing.assert_allclose(env.wanted_heights(), [[0.1, 0.0], [0.0, 0.1]], atol=1e-12)
     position, velocity = upright(2)
     lag = np.abs(env.foot_heights() - env.wanted_heights()).mean(axis=1)
-    wanted = 1.0 + 2.0 * (1.0 - lag / 0.1)
+    wanted = 1.0 + 2.0 * (1.0 - math.pi * lag / 0.1)
     nothing = np.zeros((2, 21))
     np.testing.assert_allclose(env.reward(position, velocity, nothing, nothing), wanted, atol=1e-12)
+
+
+def test_standing_still_earns_nothing_by_the_feet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A whole step of a foot, held in place: on average the share of the feet is zero."""
+    env = make(2)
+    env.reset(seed=0)
+    env.step(np.zeros((2, 21)))
+    position, velocity = upright(2)
+    nothing = np.zeros((2, 21))
+    monkeypatch.setattr(env, "foot_heights", lambda: np.zeros((2, 2)))
+    earned = []
+    for phase in np.linspace(0.0, 1.0, 1000, endpoint=False):
+        env._builder.clock[:] = phase
+        earned.append(env.reward(position, velocity, nothing, nothing) - 1.0)
+    np.testing.assert_allclose(np.mean(earned, axis=0), 0.0, atol=0.01)
+
+
+def test_half_of_the_episodes_start_with_a_speed() -> None:
+    """Forward, at most 1 m/s; nothing else moves."""
+    env = make(400)
+    env.reset(seed=0)
+    velocity = env.loop.velocity
+    assert 0.4 < (velocity[:, 0] > 0).mean() < 0.6 and 0.9 < velocity[:, 0].max() <= 1.0
+    assert not velocity[:, 1:].any()
 
 
 def test_it_ends_when_it_tilts_or_sinks() -> None:
