@@ -31,7 +31,7 @@ class TurnTask:
         largest_turn_rad: Largest rotation of a target about the vertical, to either side.
         tolerance_rad: Rotation from the target within which the cube counts as aligned.
         progress_weight: Reward of each radian by which the cube comes closer to the target [1/rad].
-        aligned_weight: Reward of a tick with the cube at the target; at ``tolerance_rad`` it is 1/e of it.
+        aligned_weight: Reward of a tick with the cube at the target; at ``tolerance_rad`` it is half of it.
         holding_reward: Reward of a tick with the cube on the hand.
         shift_weight: Cost of the squared distance of the cube from its place at the start, in the palm's
             plane [1/m²].
@@ -82,7 +82,7 @@ class HandEnv(LocomotionEnv):
     A target is the orientation at the start, turned about the vertical by an angle that is drawn uniformly.
     With the angle e from the target, from the true state, the reward of a tick is::
 
-        progress_weight (e_before - e) + aligned_weight exp(-(e / tolerance_rad)²) + holding_reward
+        progress_weight (e_before - e) + aligned_weight / (1 + e / tolerance_rad) + holding_reward
         - shift_weight (dx² + dy²) - control_weight |a|² - action_weight |a - a_before|²
 
     and -drop_cost in the tick in which the cube falls off. The paper's task is to align an object with a
@@ -163,7 +163,7 @@ class HandEnv(LocomotionEnv):
         task = self.task
         error = self._angle(position, self.wanted)
         reward = task.progress_weight * (self._error - error) + task.holding_reward
-        reward += task.aligned_weight * np.exp(-np.square(error / task.tolerance_rad))
+        reward += task.aligned_weight / (1.0 + error / task.tolerance_rad)
         reward -= task.shift_weight * np.square(position[:, :2] - self._start).sum(axis=1)
         reward -= task.control_weight * np.square(action).sum(axis=1)
         reward -= task.action_weight * np.square(action - before).sum(axis=1)

@@ -168,8 +168,8 @@ class HumanoidEnv(LocomotionEnv):
 
     and -fall_cost in the tick in which the torso tilts or sinks too far, which ends the episode. q_calm are
     the joints of trunk and arms and those that spread or turn the legs. The wanted height of a foot is half a
-    sine in its swing and zero else. A start with some speed asks for steps: who has learnt to stand still loses
-    much by a fall, and hardly tries to step.
+    sine in its swing and zero else. A start with some speed asks for steps: a humanoid that has learnt to
+    stand still loses much by a fall, and hardly tries to step.
 
     Args:
         description: The humanoid.

@@ -33,7 +33,7 @@ _LEGGED_SAC: Final = {
     "steps": 240_000,
 }
 _TURN_PPO: Final = {
-    "exploration": 0.5,
+    "exploration": 0.3,
     "divergence": 0.015,
     "reward_scale": 0.05,
     "steps": 60_000_000,

@@ -41,9 +41,9 @@ def test_reward_by_hand(env: HandEnv) -> None:
     action = nothing.copy()
     action[1] = 0.5
     wanted = [
-        20 * 0.1 + math.exp(-((0.9 / 0.4) ** 2)) + 0.1,
-        math.exp(-1.0) + 0.1 - 50 * 0.01 - 2 * 0.005 * 16 * 0.25,
-        -20 * 0.2 + math.exp(-((0.7 / 0.4) ** 2)) + 0.1,
+        20 * 0.1 + 1 / (1 + 0.9 / 0.4) + 0.1,
+        0.5 + 0.1 - 50 * 0.01 - 2 * 0.005 * 16 * 0.25,
+        -20 * 0.2 + 1 / (1 + 0.7 / 0.4) + 0.1,
     ]
     np.testing.assert_allclose(env.reward(position, velocity, action, nothing), wanted, atol=1e-9)
 
