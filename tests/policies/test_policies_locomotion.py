@@ -364,3 +364,39 @@ def test_a_short_training_makes_a_policy_that_acts(
     assert record["training"]["config"]["steps"] == steps
     assert record["evaluation"]["robots"] == record["at_rest"]["robots"] == 4
     assert path.stat().st_size < 200_000
+
+
+def test_a_stopped_training_goes_on_with_its_curve(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped after two points, then resumed: one curve to the last step, and the time of both parts."""
+    path, checkpoint = tmp_path / "walk.onnx", tmp_path / "run" / "walk.safetensors"
+    options = {"seed": 1, "steps": 4 * 24 * 4, "members": 4, "judged": 2, "checkpoint": checkpoint}
+    with monkeypatch.context() as patch:
+        patch.setattr(tool.Curve, "over", lambda self: len(self.points) >= 2)
+        tool.train("humanoid", path, **options)
+    first = json.loads(path.with_suffix(".json").read_text())
+    assert [point["steps"] for point in first["curve"]] == [96, 192]
+    # As after a crash: the record is missing, and the curve holds a point that is later than the checkpoint.
+    path.with_suffix(".json").unlink()
+    curve = checkpoint.with_suffix(".curve.json")
+    points = json.loads(curve.read_text())
+    points.append({**points[-1], "steps": 288, "cpu_hours": 1.0})
+    curve.write_text(json.dumps(points))
+    tool.train("humanoid", path, resume=True, **options)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert [point["steps"] for point in record["curve"]] == [96, 192, 288, 384]
+    assert record["reached"]["steps"] == 384 and record["resumed"]
+    assert 3600 < record["cpu_seconds"] < 2 * 3600
+    assert {"mean_return", "time_up", "speed_m_s", "gait"} <= record["curve"][-1].keys()
+    shipped = path.with_suffix(".safetensors")
+    assert shipped.stat().st_size < checkpoint.stat().st_size
+
+
+def test_a_training_ends_with_its_processor_hours(tool: ModuleType, tmp_path: Path) -> None:
+    """An hour spent before counts: with a limit of one hour, nothing is left."""
+    curve = tmp_path / "walk.curve.json"
+    curve.write_text(json.dumps([{"steps": 10, "cpu_hours": 1.0, "mean_return": None}]))
+    assert not tool.Curve(curve, resume=False, hours=1.0).over()
+    assert tool.Curve(curve, resume=True, hours=1.0).over()
+    assert not tool.Curve(curve, resume=True, hours=2.0).over()
