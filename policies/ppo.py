@@ -279,10 +279,8 @@ def _symmetry(env: ServoVectorEnv) -> dict[str, Any] | None:
         (list(mirror.source), torch.tensor(mirror.sign, dtype=torch.float32)) for mirror in mirrors
     )
 
-    def augment(
-        env: Any, obs: TensorDict | None, actions: torch.Tensor | None
-    ) -> tuple[TensorDict | None, torch.Tensor | None]:
-        """Return each batch followed by its reflection."""
+    def augment(env: Any, obs: Any, actions: torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
+        """Return each batch followed by its reflection; rsl-rl gives one or both."""
         if obs is not None:
             other = obs.clone()
             other["observation"] = obs["observation"][:, seen] * seen_sign

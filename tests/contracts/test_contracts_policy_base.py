@@ -107,7 +107,8 @@ def test_rotations_to_a_target_by_hand() -> None:
     present = np.array([[0, 0, quarter], [0.1, 0.2, 0.3], [0, 0, 3.0]])
     wanted = np.array([[0, 0, -quarter / 2], [0.1, 0.2, 0.3], [0, 0, -3.0]])
     found = rotation_between(present, wanted)
-    np.testing.assert_allclose(found, [[0, 0, -1.5 * quarter], [0] * 3, [0, 0, 2 * np.pi - 6]], atol=1e-12)
+    by_hand = np.array([[0.0, 0.0, -1.5 * quarter], [0.0] * 3, [0.0, 0.0, 2 * np.pi - 6]])
+    np.testing.assert_allclose(found, by_hand, atol=1e-12)
     # In the world's frame: a base that heads along y rolls about the world's x axis.
     ahead_y = np.array([0.0, 0.0, quarter])
     rolled = Rotation.from_rotvec([0.2, 0, 0]) * Rotation.from_rotvec(ahead_y)

@@ -47,7 +47,10 @@ def make(robot: str, count: int = 4, **task: Any) -> LocomotionEnv:
 @pytest.fixture(scope="module", params=ROBOTS)
 def env(request: pytest.FixtureRequest) -> LocomotionEnv:
     """Return an environment of four robots with episodes of 0.4 s."""
-    options = {"go2": {"start_speed": 0.0}, "humanoid": {"start_speed_m_s": 0.0}}
+    options: dict[str, dict[str, Any]] = {
+        "go2": {"start_speed": 0.0},
+        "humanoid": {"start_speed_m_s": 0.0},
+    }
     return make(request.param, ticks=20, **options.get(request.param, {}))
 
 
