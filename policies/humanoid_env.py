@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.humanoid.model import FEET, JOINTS, joint_type
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.locomotion import (
@@ -28,9 +27,9 @@ from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import Mirror, check_task
 from deal_hw.policy import CLOCK_AXES, ObservationTerm, PolicySpec
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
+SIDES: Final = ("right", "left")
 STEPS: Final = (0.0, 0.5)
 """Phase of each foot's step, right and left [turns]."""
 CALM: Final = ("abdomen_y", "abdomen_z", "abdomen_x", "hip_x", "hip_z", "shoulder1", "shoulder2", "elbow")
@@ -136,6 +135,11 @@ _REVERSED: Final[Mapping[str, tuple[str, ...]]] = {
 """Axes of base quantities that change their sign in a reflection; the clock moves on by half a turn."""
 
 
+def _kind(joint: str) -> str:
+    """Return the name of a joint without its side."""
+    return joint.removeprefix("right_").removeprefix("left_")
+
+
 def _other_side(joint: str) -> str:
     for side, other in (("right_", "left_"), ("left_", "right_")):
         if joint.startswith(side):
@@ -143,11 +147,11 @@ def _other_side(joint: str) -> str:
     return joint
 
 
-def _joint_signs(model: Any) -> dict[str, float]:
+def _joint_signs(model: Any, joints: Sequence[str]) -> dict[str, float]:
     """Return the sign with which each joint's angle becomes that of its counterpart in a reflection."""
     # A rotation about (x, y, z) is reflected to one about (-x, y, -z).
-    axis = {name: model.jnt_axis[model.joint(name).id] for name in JOINTS}
-    return {name: float(np.sign(axis[_other_side(name)] @ (axis[name] * (-1, 1, -1)))) for name in JOINTS}
+    axis = {name: model.jnt_axis[model.joint(name).id] for name in joints}
+    return {name: float(np.sign(axis[_other_side(name)] @ (axis[name] * (-1, 1, -1)))) for name in joints}
 
 
 def _mirror(pairs: Sequence[tuple[int, float]]) -> Mirror:
@@ -203,10 +207,12 @@ class HumanoidEnv(LocomotionEnv):
             threads=threads,
         )
         model = load_model(description).model
-        self._capsules = [element_id(model, "geom", name) for name in FEET]
+        names = [model.geom(k).name for k in range(model.ngeom)]
+        # Each foot has two capsules.
+        self._capsules = [names.index(n) for side in SIDES for n in names if n.endswith(f"_{side}_foot")]
         self._radius = float(model.geom_size[self._capsules[0], 0])
         self._places = self.loop.batch.batch.bind("geom_xpos")
-        self._calm = [6 + i for i, name in enumerate(description.joint_names) if joint_type(name) in CALM]
+        self._calm = [6 + i for i, name in enumerate(description.joint_names) if _kind(name) in CALM]
 
     def feedback(self) -> FloatArray:
         """Return springs about the upright pose: a network then learns poses instead of torques."""
@@ -214,12 +220,13 @@ class HumanoidEnv(LocomotionEnv):
         for row, name in enumerate(self.layout.actuated):
             column = self.layout.observation.index(ObservationTerm("position", name, 1.0))
             gear = self.description.effort_limit[row]
-            found[row, column] = -self.task.spring_factor * SPRING_NM_RAD[joint_type(name)] / gear
+            found[row, column] = -self.task.spring_factor * SPRING_NM_RAD[_kind(name)] / gear
         return found
 
     def mirror(self) -> tuple[Mirror, Mirror]:
         """Return the reflections in the vertical plane ahead: left and right change places."""
-        signs, terms = _joint_signs(load_model(self.description).model), self.layout.observation
+        terms, description = self.layout.observation, self.description
+        signs = _joint_signs(load_model(description).model, description.joint_names)
         found: list[tuple[int, float]] = []
         for k, term in enumerate(terms):
             if term.joint in signs:
