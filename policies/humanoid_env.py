@@ -87,10 +87,10 @@ class StrideTask:
     speed_m_s: float = 1.0
     clock_hz: float = 1.25
     swing_share: float = 0.5
-    swing_m: float = 0.1
+    swing_m: float = 0.08
     alive_reward: float = 1.0
     speed_weight: float = 3.0
-    gait_weight: float = 2.0
+    gait_weight: float = 6.0
     drift_weight: float = 1.0
     heading_weight: float = 2.0
     tilt_weight: float = 2.0

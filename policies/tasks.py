@@ -36,7 +36,7 @@ _TURN_PPO: Final = {
     "exploration": 0.3,
     "divergence": 0.015,
     "reward_scale": 0.05,
-    "steps": 60_000_000,
+    "steps": 6_000_000,
 }
 _STRIDE_PPO: Final = {
     "hidden": (256, 128),

@@ -57,10 +57,10 @@ class View:
 VIEWS: Final = {
     "allegro": View(
         file="allegro_turn",
-        distance=0.38,
+        distance=0.36,
         azimuth=200.0,
         elevation=-50.0,
-        look_at=(0.03, 0.0, 0.03),
+        look_at=(0.02, 0.0, 0.065),
         follows=False,
     ),
     "ant": View(

@@ -29,6 +29,7 @@ import math
 import os
 import platform
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,24 +55,42 @@ JUDGE_SEED = 1_000_003
 class Curve:
     """The return against steps and processor time, and the limit of the time.
 
+    Attributes:
+        before: Points of the trainings whose checkpoint was the start, one after the other.
+        points: Points of this training. Their processor hours include those before.
+
     Args:
         path: A file that keeps the curve, so that a resumed training goes on with it; None: no file.
         resume: Go on with the curve in the file.
+        start: The file with the curve of the start; None: from scratch.
         hours: Processor hours after which the training ends, those of its former parts included.
     """
 
-    def __init__(self, path: Path | None = None, *, resume: bool = False, hours: float = math.inf) -> None:
+    def __init__(
+        self,
+        path: Path | None = None,
+        *,
+        resume: bool = False,
+        start: Path | None = None,
+        hours: float = math.inf,
+    ) -> None:
         self._path, self._hours = path, hours
+        self.before: list[dict[str, Any]] = []
         self.points: list[dict[str, Any]] = []
         if resume and path is not None and path.exists():
-            self.points = json.loads(path.read_text(encoding="utf-8"))
-        self._before = self.points[-1]["cpu_hours"] if self.points else 0.0
+            found = json.loads(path.read_text(encoding="utf-8"))
+            self.before, self.points = found["before"], found["points"]
+        elif start is not None and start.exists():
+            found = json.loads(start.read_text(encoding="utf-8"))
+            self.before = found["before"] + found["points"]
+        past = self.before + self.points
+        self._spent = past[-1]["cpu_hours"] if past else 0.0
         self._started = time.process_time()
 
     @property
     def cpu_hours(self) -> float:
         """Processor hours so far."""
-        return float(self._before + (time.process_time() - self._started) / 3600)
+        return float(self._spent + (time.process_time() - self._started) / 3600)
 
     def over(self) -> bool:
         """Return whether the time is used up."""
@@ -88,7 +107,8 @@ class Curve:
         self.points.append({**point, **status.measures})
         if self._path is not None:
             draft = self._path.with_name(f".{self._path.name}.draft")
-            draft.write_text(json.dumps(self.points, indent=1) + "\n", encoding="utf-8")
+            kept = {"before": self.before, "points": self.points}
+            draft.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
             os.replace(draft, self._path)
         shown = " ".join(f"{name}={value:.3f}" for name, value in status.measures.items())
         print(
@@ -112,11 +132,10 @@ def train(
     hours: float = math.inf,
 ) -> OnnxPolicy:
     """Train, judge and write a policy; return it, read back from its file."""
-    curve_file = None
     if checkpoint is not None:
         checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        curve_file = checkpoint.with_suffix(".curve.json")
-    curve = Curve(curve_file, resume=resume, hours=hours)
+    files = (None if file is None else file.with_suffix(".curve.json") for file in (checkpoint, start))
+    curve = Curve(next(files), resume=resume, start=next(files), hours=hours)
     policy = train_policy(
         robot,
         udr_distribution(robot),
@@ -132,11 +151,19 @@ def train(
     record["onnx_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     # The record of a training that crashed is missing, its curve is not.
     record["cpu_seconds"] = 3600 * curve.cpu_hours
-    record["curve"] = [{n: v if v is None else float(f"{v:.4g}") for n, v in p.items()} for p in curve.points]
+    record["curve_before"], record["curve"] = _short(curve.before), _short(curve.points)
     add_judgement(robot, policy, record, judged)
     if checkpoint is not None:
         ship_checkpoint(checkpoint, policy)
     return policy
+
+
+def _short(points: Sequence[Mapping[str, float | None]]) -> list[dict[str, float | None]]:
+    """Return the points of a curve with four digits; steps are exact."""
+    return [
+        {name: x if x is None or name == "steps" else float(f"{x:.4g}") for name, x in point.items()}
+        for point in points
+    ]
 
 
 def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:

@@ -55,16 +55,16 @@ def test_reward_by_hand() -> None:
 
 
 def test_feet_are_paid_for_following_the_clock() -> None:
-    """On the floor, the foot that should stand is right and the one in mid-swing is 0.1 m too low."""
+    """On the floor, the foot that should stand is right and the one in mid-swing is 0.08 m too low."""
     env = make(2)
     env.reset(seed=0)
     env.step(np.zeros((2, 21)))
     np.testing.assert_allclose(env.foot_heights(), 0.0, atol=0.02)
     env._builder.clock[:] = 0.25, 0.75
-    np.testing.assert_allclose(env.wanted_heights(), [[0.1, 0.0], [0.0, 0.1]], atol=1e-12)
+    np.testing.assert_allclose(env.wanted_heights(), [[0.08, 0.0], [0.0, 0.08]], atol=1e-12)
     position, velocity = upright(2)
     lag = np.abs(env.foot_heights() - env.wanted_heights()).mean(axis=1)
-    wanted = 1.0 + 2.0 * (1.0 - math.pi * lag / 0.1)
+    wanted = 1.0 + 6.0 * np.maximum(1.0 - math.pi * lag / 0.08, -1.0)
     nothing = np.zeros((2, 21))
     np.testing.assert_allclose(env.reward(position, velocity, nothing, nothing), wanted, atol=1e-12)
 

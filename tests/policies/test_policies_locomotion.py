@@ -383,9 +383,9 @@ def test_a_stopped_training_goes_on_with_its_curve(
     # As after a crash: the record is missing, and the curve holds a point that is later than the checkpoint.
     path.with_suffix(".json").unlink()
     curve = checkpoint.with_suffix(".curve.json")
-    points = json.loads(curve.read_text())
-    points.append({**points[-1], "steps": 288, "cpu_hours": 1.0})
-    curve.write_text(json.dumps(points))
+    kept = json.loads(curve.read_text())
+    kept["points"].append({**kept["points"][-1], "steps": 288, "cpu_hours": 1.0})
+    curve.write_text(json.dumps(kept))
     tool.train("humanoid", path, resume=True, **options)
     record = json.loads(path.with_suffix(".json").read_text())
     assert [point["steps"] for point in record["curve"]] == [96, 192, 288, 384]
@@ -399,7 +399,11 @@ def test_a_stopped_training_goes_on_with_its_curve(
 def test_a_training_ends_with_its_processor_hours(tool: ModuleType, tmp_path: Path) -> None:
     """An hour spent before counts: with a limit of one hour, nothing is left."""
     curve = tmp_path / "walk.curve.json"
-    curve.write_text(json.dumps([{"steps": 10, "cpu_hours": 1.0, "mean_return": None}]))
+    points = [{"steps": 10, "cpu_hours": 1.0, "mean_return": None}]
+    curve.write_text(json.dumps({"before": [], "points": points}))
     assert not tool.Curve(curve, resume=False, hours=1.0).over()
     assert tool.Curve(curve, resume=True, hours=1.0).over()
     assert not tool.Curve(curve, resume=True, hours=2.0).over()
+    # So do those of a training whose checkpoint is the start.
+    later = tool.Curve(tmp_path / "later.curve.json", start=curve, hours=1.0)
+    assert later.over() and later.before == points and not later.points
