@@ -42,7 +42,7 @@ _STRIDE_PPO: Final = {
     "hidden": (256, 128),
     "exploration": 0.3,
     "divergence": 0.015,
-    "steps": 30_000_000,
+    "steps": 5_000_000,
 }
 
 

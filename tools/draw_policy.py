@@ -68,10 +68,10 @@ VIEWS: Final = {
     ),
     "humanoid": View(
         file="humanoid_walk",
-        distance=3.6,
+        distance=2.5,
         azimuth=110.0,
         elevation=-8.0,
-        look_at=(0.0, 0.0, 0.85),
+        look_at=(0.0, 0.0, 0.8),
         follows=True,
     ),
 }
