@@ -44,14 +44,24 @@ class NetworkPolicy:
         return np.asarray(action.numpy(), dtype=np.float64)
 
 
-class Feedback(torch.nn.Linear):
-    """A fixed linear feedback of the observation; its gain has shape (A, O)."""
+class Feedback(torch.nn.Module):
+    """A fixed linear feedback of the observation.
+
+    No layer of torch, whose first weights would take draws from the generator that seeds a training.
+
+    Attributes:
+        weight: Its gain, (A, O).
+    """
+
+    weight: torch.Tensor
 
     def __init__(self, gain: FloatArray) -> None:
-        super().__init__(gain.shape[1], gain.shape[0], bias=False)
-        with torch.no_grad():
-            self.weight.copy_(torch.as_tensor(gain))
-        self.requires_grad_(False)
+        super().__init__()
+        self.register_buffer("weight", torch.as_tensor(gain, dtype=torch.float32))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return its part of the actions, (B, A), for observations, (B, O)."""
+        return observation @ self.weight.T
 
 
 class FeedbackNetwork(torch.nn.Module):
