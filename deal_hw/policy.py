@@ -35,6 +35,8 @@ Quantity = Literal[
     "angular_velocity",
     "linear_velocity",
     "height",
+    "place",
+    "target_rotation",
     "command",
     "clock",
 ]
@@ -45,6 +47,9 @@ CLOCK_AXES = ("sin", "cos")
 BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", "height")
 """Observed quantities of a floating base, in the base's frame: the directions of gravity and of the world's x
 axis (unit vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
+WORLD_QUANTITIES = ("place", "target_rotation")
+"""Observed quantities of a floating base, in the world: its position [m], which no sensor of a robot
+reports, and the rotation vector that turns it to the target orientation [rad]."""
 BASE_SIZE = 6
 
 VERDICT: Final = "calibration_verdict"
@@ -113,7 +118,7 @@ class ObservationTerm:
             return ("z",)
         if self.quantity == "clock":
             return CLOCK_AXES
-        return AXES if self.quantity in (*BASE_QUANTITIES, "command") else ()
+        return AXES if self.quantity in (*BASE_QUANTITIES, *WORLD_QUANTITIES, "command") else ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,7 +245,7 @@ class PolicySpec:
     @property
     def observes_base(self) -> bool:
         """Whether the observation needs the state of a floating base."""
-        return any(term.quantity in BASE_QUANTITIES for term in self.observation)
+        return any(term.quantity in BASE_QUANTITIES + WORLD_QUANTITIES for term in self.observation)
 
     @property
     def history(self) -> int:
@@ -342,6 +347,8 @@ class ObservationBuilder:
     Attributes:
         command: The requested velocity of the base: x, y [m/s] and yaw rate [rad/s], (..., 3); zero at first.
         clock: Phase of the clock at the next observation, (...,) [turns]; zero at first and after a reset.
+        target: The requested orientation of the base as a rotation vector around the identity, (..., 3)
+            [rad]; zero at first.
     """
 
     def __init__(self, spec: PolicySpec, batch_shape: tuple[int, ...] = ()) -> None:
@@ -353,7 +360,9 @@ class ObservationBuilder:
         self._velocity = np.zeros((depth, *batch_shape, J))
         self._action = np.zeros((depth + 1, *batch_shape, A))
         self._base = np.zeros((depth, *batch_shape, 4 * len(AXES) + 1))
+        self._world = np.zeros((depth, *batch_shape, 2 * len(AXES)))
         self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
+        self.target: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.clock: FloatArray = np.zeros(batch_shape)
         self._fresh = np.ones(batch_shape, dtype=bool)
         self._reads = _reads(spec)
@@ -400,9 +409,12 @@ class ObservationBuilder:
                     f"coordinates, got {position.shape[-1]}; this robot's states do not contain the base: "
                     "use another policy"
                 )
-            past.append(self._base)
+            past += [self._base, self._world]
             self._shift(self._base)
             self._base[0] = base_features(position[..., :BASE_SIZE], velocity[..., :BASE_SIZE])
+            self._shift(self._world)
+            self._world[0, ..., :3] = position[..., :3]
+            self._world[0, ..., 3:] = rotation_between(position[..., 3:BASE_SIZE], self.target)
         if self._fresh.any():
             # The history of a new member is filled with its present state, because it has no past.
             for memory in past:
@@ -438,6 +450,8 @@ class ObservationBuilder:
             case "clock":
                 angle = 2.0 * np.pi * self.clock
                 return np.stack([np.sin(angle), np.cos(angle)], axis=-1)[None]
+            case "place" | "target_rotation":
+                return self._world
             case "gravity" | "heading" | "angular_velocity" | "linear_velocity" | "height":
                 return self._base
 
@@ -473,7 +487,8 @@ def _reads(spec: PolicySpec) -> list[_Read]:
 def _column(spec: PolicySpec, term: ObservationTerm) -> int:
     if not term.axes:
         return (spec.actuated if term.quantity == "action" else spec.joint_names).index(term.joint)
-    first = len(AXES) * BASE_QUANTITIES.index(term.quantity) if term.quantity in BASE_QUANTITIES else 0
+    together = BASE_QUANTITIES if term.quantity in BASE_QUANTITIES else WORLD_QUANTITIES
+    first = len(AXES) * together.index(term.quantity) if term.quantity in together else 0
     return first + term.axes.index(term.joint)
 
 
@@ -496,6 +511,29 @@ def rotation_vector(quaternion: FloatArray) -> FloatArray:
     # Of a rotation's two quaternions, take the one with the smaller angle.
     angle = 2.0 * math.atan2(sine, abs(w))
     return np.asarray(v * (math.copysign(1.0, w) * (angle / sine if sine > 0 else 2.0)))
+
+
+def rotation_between(present: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return the rotation vectors in the world, (..., 3) [rad], that turn orientations to wanted ones.
+
+    Args:
+        present: Orientations as rotation vectors around the identity, (..., 3).
+        wanted: The same.
+    """
+    # The quaternion wanted * conjugate(present); of its two signs, the one with the smaller angle.
+    (w, v), (b, u) = _half_turn(wanted), _half_turn(present)
+    real = w * b + np.sum(v * u, axis=-1, keepdims=True)
+    imaginary = (b * v - w * u - np.cross(v, u)) * np.where(real < 0.0, -1.0, 1.0)
+    sine = np.linalg.norm(imaginary, axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(real))
+    return np.asarray(imaginary * np.where(sine > 0.0, angle / np.where(sine > 0.0, sine, 1.0), 2.0))
+
+
+def _half_turn(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the real, (..., 1), and the imaginary part, (..., 3), of the quaternion of a rotation vector."""
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    # numpy's sinc(x) is sin(pi x) / (pi x).
+    return np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * turn
 
 
 def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -24,6 +24,9 @@ ASSETS: Final = Path(__file__).parent / "assets"
 SHIPPED: Final = ("allegro", "ant", "cartpole", "go2", "humanoid")
 """Robots whose demonstration policy is shipped."""
 
+TARGET_RAD: Final = (0.0, 0.0, 1.0)
+"""Target orientation of a demonstration, for policies that observe one: a rotation vector [rad]."""
+
 
 class BatchPolicy(Protocol):
     """A policy that acts for many members at once."""
@@ -116,6 +119,7 @@ class PopulationDemonstration:
         self._builder = ObservationBuilder(spec, (count,))
         low, high = np.array(spec.command_range or ((-np.inf, np.inf),) * 3).T
         self._builder.command = np.repeat(np.clip(self.wanted, low, high)[None], count, axis=0)
+        self._builder.target = np.repeat(np.array(TARGET_RAD)[None], count, axis=0)
         early = number - len(command)
         self._builder.clock = np.full(count, early * spec.clock_hz / spec.control_rate_hz % 1.0)
         self._action = np.zeros((count, len(self._scale)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -103,6 +103,10 @@ class LocomotionEnv(ServoVectorEnv):
         """Return each member's commanded speed, (N,) [m/s]; None where faster is better."""
         return None
 
+    def outcomes(self) -> Mapping[str, FloatArray]:
+        """Return what a task reached in the last tick, (N,) each, also of members that it ended; by name."""
+        return {}
+
     def _settled(self, threads: int | None) -> FloatArray:
         # Fixed draws: the pool is part of the task and does not depend on the seed of a reset.
         space, robot = self.distribution.space, self.loop.batch.robot
@@ -170,13 +174,15 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
     Returns:
         Plain JSON values: undiscounted returns, share of fallen robots, share of time up, and the task's
         measures. For robots that did not fall: mean forward speed [m/s], and the mean distance of each
-        robot's mean speed from its mean commanded one.
+        robot's mean speed from its mean commanded one. ``outcomes`` are means of what the task reached at
+        the episodes' ends.
     """
     observation, _ = env.reset(seed=seed)
     count = env.num_envs
     going, total, lasted, way = np.ones(count, dtype=bool), np.zeros(count), np.zeros(count), np.zeros(count)
     fell: BoolArray = np.zeros(count, dtype=bool)
     wish: FloatArray | None = None if env.wanted_speed() is None else np.zeros(count)
+    ends: dict[str, FloatArray] = {}
     env.measures()
     for _ in range(env.ticks):
         speed, wanted = env.forward_speed(), env.wanted_speed()
@@ -187,7 +193,10 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         way += np.where(going, speed, 0.0)
         lasted += going
         fell |= going & terminated
-        going &= ~(terminated | truncated)
+        over = going & (terminated | truncated)
+        for name, values in env.outcomes().items():
+            ends.setdefault(name, np.full(count, np.nan))[over] = values[over]
+        going &= ~over
     up, mean = ~fell, way / lasted
     error = None if wish is None else np.abs(mean - wish / lasted)
     return {
@@ -202,4 +211,5 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         "forward_speed_m_s": float(mean[up].mean()) if up.any() else None,
         "speed_error_m_s": float(error[up].mean()) if up.any() and error is not None else None,
         "measures": env.measures(),
+        "outcomes": {name: float(np.nanmean(values)) for name, values in ends.items()},
     }

@@ -44,6 +44,38 @@ class NetworkPolicy:
         return np.asarray(action.numpy(), dtype=np.float64)
 
 
+class Feedback(torch.nn.Module):
+    """A fixed linear feedback of the observation.
+
+    No layer of torch, whose first weights would take draws from the generator that seeds a training.
+
+    Attributes:
+        weight: Its gain, (A, O).
+    """
+
+    weight: torch.Tensor
+
+    def __init__(self, gain: FloatArray) -> None:
+        super().__init__()
+        self.register_buffer("weight", torch.as_tensor(gain, dtype=torch.float32))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return its part of the actions, (B, A), for observations, (B, O)."""
+        return observation @ self.weight.T
+
+
+class FeedbackNetwork(torch.nn.Module):
+    """The sum of a network and of a feedback, clipped to [-1, 1]."""
+
+    def __init__(self, network: torch.nn.Module, feedback: Feedback) -> None:
+        super().__init__()
+        self.network, self.feedback = network, feedback
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return the actions, (B, A), for observations, (B, O)."""
+        return torch.nn.functional.hardtanh(self.network(observation) + self.feedback(observation))
+
+
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread inside the context.

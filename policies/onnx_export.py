@@ -13,6 +13,7 @@ import onnx
 import torch
 
 from deal_hw.errors import PolicyError
+from deal_hw.policies.network_policy import Feedback, FeedbackNetwork
 from deal_hw.policies.onnx_runtime import SPEC_KEY, OnnxPolicy
 from deal_hw.policy import PolicySpec
 
@@ -37,7 +38,8 @@ def export_network(
     could be deployed.
 
     Args:
-        network: Observations (B, O) in, actions (B, A) out: a Sequential of linear layers and activations.
+        network: Observations (B, O) in, actions (B, A) out: a Sequential of linear layers and activations,
+            or a FeedbackNetwork of one.
         spec: Its spec.
         path: The .onnx file; the record goes beside it with the suffix .json.
         record: Plain JSON values about the training.
@@ -71,14 +73,19 @@ def write_policy(model: onnx.ModelProto, spec: PolicySpec, path: Path) -> None:
 
 def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
     # Built by hand: torch's exporter takes seconds, needs onnxscript, and writes local paths into every node.
-    # A policy network is a chain of a few known layers.
+    # A policy network is a chain of a few known layers, with or without a feedback beside it.
     nodes: list[onnx.NodeProto] = []
     weights: list[onnx.TensorProto] = []
     width, value = observation, "observation"
     layers = _chain(network)
     for i, layer in enumerate(layers):
         result = "action" if i == len(layers) - 1 else f"value_{i}"
-        if isinstance(layer, torch.nn.Linear):
+        if isinstance(layer, Feedback):
+            gain = layer.weight.detach().cpu().numpy().astype(np.float32)
+            weights.append(onnx.numpy_helper.from_array(gain, "gain"))
+            nodes.append(onnx.helper.make_node("Gemm", ["observation", "gain"], ["feedback"], transB=1))
+            nodes.append(onnx.helper.make_node("Add", [value, "feedback"], [result]))
+        elif isinstance(layer, torch.nn.Linear):
             names = [f"weight_{i}", f"bias_{i}"]
             bias = torch.zeros(layer.out_features) if layer.bias is None else layer.bias
             weights += [
@@ -116,6 +123,8 @@ def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
 
 
 def _chain(network: torch.nn.Module) -> list[torch.nn.Module]:
+    if isinstance(network, FeedbackNetwork):
+        return [*_chain(network.network), network.feedback, torch.nn.Hardtanh()]
     if isinstance(network, torch.nn.Sequential):
         return [layer for part in network for layer in _chain(part)]
     return [network]

@@ -17,6 +17,8 @@ from tensordict import TensorDict
 
 from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from deal_hw.policies.network_policy import (
+    Feedback,
+    FeedbackNetwork,
     NetworkPolicy,
     check_config,
     diverged,
@@ -157,6 +159,7 @@ class _Learner:
         # Small first actions: learning starts at the default pose, not at a random one.
         with torch.no_grad():
             list(self._actor.mlp)[-1].weight.mul_(0.1)
+        self._feedback = Feedback(env.feedback())
         storage = RolloutStorage("rl", env.num_envs, config.rollout, example, [A])
         self._ppo = PPO(
             self._actor,
@@ -170,6 +173,7 @@ class _Learner:
             entropy_coef=config.entropy,
             learning_rate=config.learning_rate,
             desired_kl=config.divergence,
+            symmetry_cfg=_symmetry(env),
         )
         self.steps = self.updates = 0
         self._return = np.zeros(env.num_envs)
@@ -187,7 +191,7 @@ class _Learner:
         with torch.no_grad():
             for _ in range(config.rollout):
                 check()
-                action = ppo.act(self._seen)
+                action = ppo.act(self._seen) + self._feedback(self._seen["observation"])
                 seen, reward, terminated, truncated, _ = self._env.step(action.numpy().astype(np.float64))
                 over = terminated | truncated
                 self._return += reward
@@ -215,7 +219,9 @@ class _Learner:
 
     def network(self) -> torch.nn.Module:
         """Return the actor without exploration, as layers."""
-        return torch.nn.Sequential(*self._actor.mlp, torch.nn.Hardtanh())
+        if not self._feedback.weight.any():
+            return torch.nn.Sequential(*self._actor.mlp, torch.nn.Hardtanh())
+        return FeedbackNetwork(torch.nn.Sequential(*self._actor.mlp), self._feedback)
 
     def checkpoint(self) -> Checkpoint:
         """Return the state needed to continue."""
@@ -262,3 +268,25 @@ class _Learner:
     def _exploration(self) -> float:
         spread: Any = self._actor.distribution
         return float(spread.log_std_param.detach().exp().mean())
+
+
+def _symmetry(env: ServoVectorEnv) -> dict[str, Any] | None:
+    """Return rsl-rl's settings to learn from reflections, too; None for a robot without symmetry."""
+    mirrors = env.mirror()
+    if mirrors is None:
+        return None
+    (seen, seen_sign), (done, done_sign) = (
+        (list(mirror.source), torch.tensor(mirror.sign, dtype=torch.float32)) for mirror in mirrors
+    )
+
+    def augment(env: Any, obs: Any, actions: torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
+        """Return each batch followed by its reflection; rsl-rl gives one or both."""
+        if obs is not None:
+            other = obs.clone()
+            other["observation"] = obs["observation"][:, seen] * seen_sign
+            obs = torch.cat([obs, other])
+        if actions is not None:
+            actions = torch.cat([actions, actions[:, done] * done_sign])
+        return obs, actions
+
+    return {"env": env, "data_augmentation_func": augment, "use_data_augmentation": True}

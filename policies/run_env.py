@@ -1,4 +1,4 @@
-"""The running task of robots with torque motors: ant and humanoid."""
+"""The running task of a robot with torque motors, the ant."""
 
 from __future__ import annotations
 
@@ -125,13 +125,3 @@ class RunEnv(LocomotionEnv):
         height, task = seen[:, HEIGHT], self.task
         over = (height > task.top_height_m) | (height < task.least_height_m)
         return np.asarray((seen[:, GRAVITY][:, 2] > 0.0) | over)
-
-
-class HumanoidEnv(RunEnv):
-    """The running task of the humanoid. It starts standing, without settling, because it would fall.
-
-    Staying up is worth as much as a speed of one metre per second, and its 21 motors cost less.
-    """
-
-    settle_s = 0.0
-    usual_task = RunTask(healthy_reward=1.0, control_weight=0.02, top_height_m=2.0, least_height_m=0.9)

@@ -32,6 +32,18 @@ _LEGGED_SAC: Final = {
     "averaged": 0.05,
     "steps": 240_000,
 }
+_TURN_PPO: Final = {
+    "exploration": 0.3,
+    "divergence": 0.015,
+    "reward_scale": 0.05,
+    "steps": 6_000_000,
+}
+_STRIDE_PPO: Final = {
+    "hidden": (256, 128),
+    "exploration": 0.3,
+    "divergence": 0.015,
+    "steps": 5_000_000,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,14 +90,20 @@ class TrainingTask:
         return made, made.config(**settings)
 
 
-def _simulated(environment: str, motors: int, udr_ratio: float) -> TrainingTask:
-    """Return the task of a robot that exists in simulators only."""
+def _simulated(
+    environment: str,
+    motors: int,
+    udr_ratio: float,
+    ppo: Mapping[str, Any] | None = None,
+    members: int = 200,
+) -> TrainingTask:
+    """Return the task of a robot that exists in simulators only; PPO is usual if its settings are given."""
     return TrainingTask(
         environment=f"deal_hw.policies.{environment}",
-        trainer="sac",
-        members={"ppo": 200, "sac": 64},
+        trainer="ppo" if ppo else "sac",
+        members={"ppo": members, "sac": 64},
         settings={
-            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
+            "ppo": ppo or {"steps": 3_000_000, "reward_scale": 0.05},
             "sac": {**_LEGGED_SAC, "target_entropy": -float(motors)},
         },
         udr_ratio=udr_ratio,
@@ -94,7 +112,7 @@ def _simulated(environment: str, motors: int, udr_ratio: float) -> TrainingTask:
 
 
 TASKS: Final = {
-    "allegro": _simulated("hand_env:HandEnv", motors=16, udr_ratio=1.75),
+    "allegro": _simulated("hand_env:HandEnv", motors=16, udr_ratio=1.75, ppo=_TURN_PPO, members=256),
     "ant": _simulated("run_env:RunEnv", motors=8, udr_ratio=5.0),
     "cartpole": TrainingTask(
         environment="deal_hw.policies.cartpole_env:CartPoleEnv",
@@ -112,7 +130,9 @@ TASKS: Final = {
         udr_ratio=1.75,
         udr_latency_s=(0.0, 0.012),
     ),
-    "humanoid": _simulated("run_env:HumanoidEnv", motors=21, udr_ratio=1.75),
+    "humanoid": _simulated(
+        "humanoid_env:HumanoidEnv", motors=21, udr_ratio=1.75, ppo=_STRIDE_PPO, members=128
+    ),
 }
 
 

@@ -6,6 +6,7 @@ import abc
 import copy
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -32,6 +33,19 @@ def check_task(task: Any, *positive: str) -> None:
     for name in positive:
         if not getattr(task, name) > 0:
             raise ConfigurationError(f"{name} must be positive, got {getattr(task, name)!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class Mirror:
+    """A reflection of a vector: its entry k is ``sign[k]`` times the entry ``source[k]`` of the original.
+
+    Attributes:
+        source: Indices, (n,).
+        sign: 1 or -1, (n,).
+    """
+
+    source: tuple[int, ...]
+    sign: tuple[float, ...]
 
 
 class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
@@ -127,6 +141,17 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
     def privileged(self) -> FloatArray:
         """Return the critic's information beyond the observation, (N, P); nothing by default."""
         return np.zeros((self.num_envs, 0))
+
+    def feedback(self) -> FloatArray:
+        """Return a fixed linear part of the policy, (A, O), that PPO adds to its network; zero by default."""
+        return np.zeros((len(self.layout.actuated), len(self.layout.observation)))
+
+    def mirror(self) -> tuple[Mirror, Mirror] | None:
+        """Return the reflections of observation and action of a robot that is symmetric; None by default.
+
+        PPO learns from each transition and from its reflection.
+        """
+        return None
 
     def target(self, action: FloatArray) -> FloatArray:
         """Return the targets of actions, (N, A) each."""

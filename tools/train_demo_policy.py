@@ -1,14 +1,22 @@
 """Make the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
 
-    python tools/train_demo_policy.py allegro
+    python tools/train_demo_policy.py allegro --checkpoint runs/base/allegro.safetensors --hours 1
     python tools/train_demo_policy.py ant
-    python tools/train_demo_policy.py humanoid
+    python tools/train_demo_policy.py humanoid --checkpoint runs/base/humanoid.safetensors --hours 1
     python tools/train_demo_policy.py go2
 
-writes policies/assets/allegro_udr.onnx, ant_udr.onnx, humanoid_udr.onnx or go2_walk.onnx and, beside it, the
-record of its training and of its results on other robots. Task, trainer and settings are those of `deal-hw
-train ROBOT --udr`. All but the Go2's are early checkpoints, made in minutes on one core: good enough to
-excite a robot for calibration (the paper's Table 5 studies such ones), not good at their task.
+writes policies/assets/allegro_turn.onnx, ant_udr.onnx, humanoid_walk.onnx or go2_walk.onnx and, beside it,
+the record of its training and of its results on other robots. Task, trainer and settings are those of
+`deal-hw train ROBOT --udr`.
+
+`--hours` ends the training after so many processor hours, those of the stopped parts included. The same
+command with `--resume` goes on from the checkpoint, also after a crash. The curve of the return against steps
+and processor hours is kept beside the checkpoint (.curve.json) and copied into the record.
+
+allegro_udr, ant_udr and humanoid_udr are early checkpoints, made in minutes on one core: good enough to
+excite a robot for calibration (the paper's Table 5 studies such ones), not good at their task. Those of hand
+and humanoid are of former tasks, which this tool no longer trains. They are kept because stored rows of the
+benches were made with them.
 """
 
 from __future__ import annotations
@@ -18,8 +26,10 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import platform
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +44,78 @@ from deal_hw.training import TrainingFiles, TrainingStatus
 from deal_hw.workflows.train import train_policy, udr_distribution
 
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
-FILES = {"allegro": "allegro_udr", "ant": "ant_udr", "go2": "go2_walk", "humanoid": "humanoid_udr"}
+FILES = {"allegro": "allegro_turn", "ant": "ant_udr", "go2": "go2_walk", "humanoid": "humanoid_walk"}
+POINTS = 100
+"""Number of points of a curve over all steps of a training."""
 JUDGED = 256
 JUDGE_SEED = 1_000_003
 """Seed of the robots, commands and starts that judge the policy; training uses another one."""
+
+
+class Curve:
+    """The return against steps and processor time, and the limit of the time.
+
+    Attributes:
+        before: Points of the trainings whose checkpoint was the start, one after the other.
+        points: Points of this training. Their processor hours include those before.
+
+    Args:
+        path: A file that keeps the curve, so that a resumed training goes on with it; None: no file.
+        resume: Go on with the curve in the file.
+        start: The file with the curve of the start; None: from scratch.
+        hours: Processor hours after which the training ends, those of its former parts included.
+    """
+
+    def __init__(
+        self,
+        path: Path | None = None,
+        *,
+        resume: bool = False,
+        start: Path | None = None,
+        hours: float = math.inf,
+    ) -> None:
+        self._path, self._hours = path, hours
+        self.before: list[dict[str, Any]] = []
+        self.points: list[dict[str, Any]] = []
+        if resume and path is not None and path.exists():
+            found = json.loads(path.read_text(encoding="utf-8"))
+            self.before, self.points = found["before"], found["points"]
+        elif start is not None and start.exists():
+            found = json.loads(start.read_text(encoding="utf-8"))
+            self.before = found["before"] + found["points"]
+        past = self.before + self.points
+        self._spent = past[-1]["cpu_hours"] if past else 0.0
+        self._started = time.process_time()
+
+    @property
+    def cpu_hours(self) -> float:
+        """Processor hours so far."""
+        return float(self._spent + (time.process_time() - self._started) / 3600)
+
+    def over(self) -> bool:
+        """Return whether the time is used up."""
+        return self.cpu_hours >= self._hours
+
+    def note(self, status: TrainingStatus) -> None:
+        """Add a point if a hundredth of the steps is done since the last one, and show it."""
+        # A training that crashed goes on from its last checkpoint, before the last points.
+        self.points = [point for point in self.points if point["steps"] < status.steps]
+        last = self.points[-1]["steps"] if self.points else -math.inf
+        if status.steps - last < status.total / POINTS and status.steps < status.total:
+            return
+        point = {"steps": status.steps, "cpu_hours": self.cpu_hours, "mean_return": status.mean_return}
+        self.points.append({**point, **status.measures})
+        if self._path is not None:
+            draft = self._path.with_name(f".{self._path.name}.draft")
+            kept = {"before": self.before, "points": self.points}
+            draft.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+            os.replace(draft, self._path)
+        shown = " ".join(f"{name}={value:.3f}" for name, value in status.measures.items())
+        print(
+            f"{3600 * self.cpu_hours:6.0f} cpu-s {status.steps:9d}/{status.total} "
+            f"return {math.nan if status.mean_return is None else status.mean_return:8.1f} {shown}",
+            flush=True,
+        )
 
 
 def train(
@@ -48,20 +126,44 @@ def train(
     steps: int | None,
     members: int | None,
     judged: int,
-    files: TrainingFiles | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    start: Path | None = None,
+    hours: float = math.inf,
 ) -> OnnxPolicy:
     """Train, judge and write a policy; return it, read back from its file."""
-    distribution = udr_distribution(robot)
+    if checkpoint is not None:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    files = (None if file is None else file.with_suffix(".curve.json") for file in (checkpoint, start))
+    curve = Curve(next(files), resume=resume, start=next(files), hours=hours)
     policy = train_policy(
-        robot, distribution, path, seed=seed, steps=steps, members=members, progress=_progress(), files=files
+        robot,
+        udr_distribution(robot),
+        path,
+        seed=seed,
+        steps=steps,
+        members=members,
+        progress=curve.note,
+        files=TrainingFiles(checkpoint=checkpoint, resume=resume, start=start, stop=curve.over),
     )
     record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     record["machine"] = f"one thread of {platform.machine()}, shared, Python {platform.python_version()}"
     record["onnx_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    # The record of a training that crashed is missing, its curve is not.
+    record["cpu_seconds"] = 3600 * curve.cpu_hours
+    record["curve_before"], record["curve"] = _short(curve.before), _short(curve.points)
     add_judgement(robot, policy, record, judged)
-    if files is not None and files.checkpoint is not None:
-        ship_checkpoint(files.checkpoint, policy)
+    if checkpoint is not None:
+        ship_checkpoint(checkpoint, policy)
     return policy
+
+
+def _short(points: Sequence[Mapping[str, float | None]]) -> list[dict[str, float | None]]:
+    """Return the points of a curve with four digits; steps are exact."""
+    return [
+        {name: x if x is None or name == "steps" else float(f"{x:.4g}") for name, x in point.items()}
+        for point in points
+    ]
 
 
 def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:
@@ -93,24 +195,6 @@ class _Rest:
         return np.zeros((len(observations), len(self.spec.actuated)))
 
 
-def _progress() -> Any:
-    started, shown = time.process_time(), [0]
-
-    def show(status: TrainingStatus) -> None:
-        share = 100 * status.steps // status.total
-        if share == shown[0] and status.steps < status.total:
-            return
-        shown[0] = share
-        measures = " ".join(f"{name}={value:.3f}" for name, value in status.measures.items())
-        print(
-            f"{time.process_time() - started:6.0f} cpu-s {status.steps:9d}/{status.total} "
-            f"return {math.nan if status.mean_return is None else status.mean_return:8.1f} {measures}",
-            flush=True,
-        )
-
-    return show
-
-
 def main() -> None:
     """Train as the command line says."""
     parser = argparse.ArgumentParser(
@@ -127,6 +211,8 @@ def main() -> None:
         type=Path,
         help="a .safetensors file to keep while it trains; its networks are shipped beside the policy",
     )
+    parser.add_argument("--start", type=Path, help="a checkpoint whose networks are the start")
+    parser.add_argument("--hours", type=float, default=math.inf, help="processor hours; by default no limit")
     parser.add_argument("--resume", action="store_true", help="continue from --checkpoint")
     parser.add_argument("--judge", action="store_true", help="do not train: evaluate the existing file")
     args = parser.parse_args()
@@ -137,7 +223,6 @@ def main() -> None:
         if args.checkpoint is not None:
             ship_checkpoint(args.checkpoint, OnnxPolicy(path))
         return
-    files = TrainingFiles(checkpoint=args.checkpoint, resume=args.resume)
     train(
         args.robot,
         path,
@@ -145,7 +230,10 @@ def main() -> None:
         steps=args.steps,
         members=args.members,
         judged=args.judged,
-        files=files,
+        checkpoint=args.checkpoint,
+        resume=args.resume,
+        start=args.start,
+        hours=args.hours,
     )
 
 

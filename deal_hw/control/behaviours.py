@@ -10,7 +10,14 @@ import numpy as np
 from deal_hw.control.velocity import FixedVelocity, VelocitySource
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
-from deal_hw.policy import BASE_QUANTITIES, ObservationBuilder, Policy, PolicySpec, rotation_vector
+from deal_hw.policy import (
+    BASE_QUANTITIES,
+    WORLD_QUANTITIES,
+    ObservationBuilder,
+    Policy,
+    PolicySpec,
+    rotation_vector,
+)
 from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
 
 
@@ -83,9 +90,9 @@ class PolicyBehaviour:
         spec = policy.spec
         spec.check_fits(description)
         observed = {term.quantity for term in spec.observation}
-        unseen = sorted(observed & {"linear_velocity", "height"})
+        unseen = sorted(observed & {"linear_velocity", "height", *WORLD_QUANTITIES})
         if description.limits.legs is None and description.floating_base is None:
-            unseen = sorted(observed & set(BASE_QUANTITIES))
+            unseen = sorted(observed & {*BASE_QUANTITIES, *WORLD_QUANTITIES})
         if unseen:
             raise PolicyMismatchError(
                 f"the policy observes {' and '.join(unseen)} of the base, which no sensor of "

@@ -11,8 +11,12 @@ from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 
-SHIPPED: Final[Mapping[str, str]] = {"go2": "go2_walk"}
-"""Shipped policies not named ROBOT_udr. The Go2's policy of that name only excites it in benches."""
+SHIPPED: Final[Mapping[str, str]] = {
+    "allegro": "allegro_turn",
+    "go2": "go2_walk",
+    "humanoid": "humanoid_walk",
+}
+"""Shipped policies not named ROBOT_udr. These robots' policies of that name only excite them in benches."""
 
 
 def shipped_policy(robot: str) -> Path | None:

@@ -1,7 +1,8 @@
 """The humanoid's MJCF, prepared from the file of the installed dm_control; no copy of it is kept here.
 
 Changes: textures, sites, sensors and cameras are removed (textures make every copy of the model 12 MB). The
-values of the parameter preset are written. The feet alone define their contacts. Bodies touch the floor only.
+values of the parameter preset are written. The feet alone define their contacts, with friction. Bodies touch
+the floor only.
 """
 
 from __future__ import annotations
@@ -58,6 +59,8 @@ def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
     for name in FEET:
         foot = find(root, f".//geom[@name='{name}']")
         foot.set("priority", "1")
+        # The geom with the higher priority decides alone; the file's feet have 1, which is no friction.
+        foot.set("condim", "3")
         foot.set("friction", f"{values['contact.friction']!r} 0.005 0.0001")
         foot.set("solref", f"{0.02 / damping_ratio!r} {damping_ratio!r}")
     # The file drops it from 0.2 m above the floor.

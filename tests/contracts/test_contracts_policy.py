@@ -200,7 +200,8 @@ def test_specs_made_in_python_are_checked_too() -> None:
 @pytest.mark.parametrize("quantity", get_args(Quantity))
 def test_every_known_quantity_is_built(quantity: Quantity) -> None:
     """And all differ: two that read the same would be a quantity that is taken for another."""
-    element = {**dict.fromkeys(BASE, "z"), "clock": "cos"}
+    # Along z the place is the height.
+    element = {**dict.fromkeys(BASE, "z"), "clock": "cos", "place": "x", "target_rotation": "y"}
     spec = dataclasses.replace(
         feedback_spec(DRIVER),
         clock_hz=2.5,

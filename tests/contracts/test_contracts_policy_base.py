@@ -18,6 +18,7 @@ from deal_hw.policy import (
     PolicySpec,
     base_features,
     in_base_frame,
+    rotation_between,
     rotation_vector,
 )
 
@@ -98,6 +99,37 @@ def test_terms_of_the_base_are_picked_scaled_and_remembered() -> None:
     rolled[3] = np.pi / 6
     assert builder.build(rolled, velocity)[1] == 0.0
     assert builder.build(position, velocity)[1] == pytest.approx(-0.5)
+
+
+def test_rotations_to_a_target_by_hand() -> None:
+    """From a quarter turn left to a roll; none; and the shorter way round for turns of 3 and -3 rad."""
+    quarter = np.pi / 2
+    present = np.array([[0, 0, quarter], [0.1, 0.2, 0.3], [0, 0, 3.0]])
+    wanted = np.array([[0, 0, -quarter / 2], [0.1, 0.2, 0.3], [0, 0, -3.0]])
+    found = rotation_between(present, wanted)
+    by_hand = np.array([[0.0, 0.0, -1.5 * quarter], [0.0] * 3, [0.0, 0.0, 2 * np.pi - 6]])
+    np.testing.assert_allclose(found, by_hand, atol=1e-12)
+    # In the world's frame: a base that heads along y rolls about the world's x axis.
+    ahead_y = np.array([0.0, 0.0, quarter])
+    rolled = Rotation.from_rotvec([0.2, 0, 0]) * Rotation.from_rotvec(ahead_y)
+    np.testing.assert_allclose(rotation_between(ahead_y, rolled.as_rotvec()), [0.2, 0, 0], atol=1e-12)
+
+
+def test_place_and_target_are_observed() -> None:
+    """The place in the world, and the rotation that is left, a tick ago too."""
+    builder = ObservationBuilder(
+        spec(
+            ObservationTerm("place", "y", 2.0),
+            ObservationTerm("target_rotation", "z", 1.0),
+            ObservationTerm("target_rotation", "z", 1.0, 1),
+        )
+    )
+    builder.target = np.array([0.0, 0.0, 0.5])
+    position = np.zeros(6 + J)
+    position[1] = 0.1
+    np.testing.assert_allclose(builder.build(position, position * 0), [0.2, 0.5, 0.5], rtol=1e-6)
+    position[5] = 0.2
+    np.testing.assert_allclose(builder.build(position, position * 0), [0.2, 0.3, 0.5], rtol=1e-6)
 
 
 def test_terms_without_the_base_need_no_base() -> None:

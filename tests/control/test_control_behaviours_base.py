@@ -128,6 +128,7 @@ def test_on_the_robot_as_in_training() -> None:
     [
         (ObservationTerm("linear_velocity", "x", 1.0), "observes linear_velocity of the base"),
         (ObservationTerm("height", "z", 1.0), "observes height of the base"),
+        (ObservationTerm("place", "x", 1.0), "observes place of the base"),
     ],
 )
 def test_what_no_sensor_reports_is_refused(term: ObservationTerm, words: str) -> None:

@@ -282,6 +282,24 @@ def test_humanoid_touches_the_floor_alone_and_has_no_textures() -> None:
     assert model.body_mass.sum() == pytest.approx(40.84, abs=0.01)
 
 
+def test_humanoid_stands_on_feet_that_hold_it() -> None:
+    """Each contact of a foot has friction: pushed sideways at 0.1 m/s, a foot slides only on smooth feet."""
+    model = load_model(robot_description("humanoid")).model
+    moved = []
+    for friction in (1.0, 1e-3):
+        for name in humanoid_model.FEET:
+            model.geom(name).friction[0] = friction
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.qvel[1] = 0.1
+        foot = data.body("right_foot").id
+        for _ in range(20):
+            mujoco.mj_step(model, data)
+        assert {contact.dim for contact in data.contact} == {3}
+        moved.append(float(data.xpos[foot, 1]))
+    assert abs(moved[0] - moved[1]) > 2e-3
+
+
 def test_allegro_holds_its_cube() -> None:
     """Three seconds in the holding pose: the cube lies on the palm, and fingers touch nothing else."""
     model = load_model(robot_description("allegro")).model

@@ -27,11 +27,16 @@ from deal_hw.policies.demonstration import (
     limited_action,
 )
 from deal_hw.policies.go2_env import walk_spec
+from deal_hw.policies.locomotion import judge
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policies.tasks import training_task
 from deal_hw.policy import Observation, PolicySpec, in_base_frame
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
 from deal_hw.sim.recordings.target import TargetRecording, record_target
 from deal_hw.types import FloatArray
+from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.train import udr_distribution
 
 FLOATING = ("allegro", "ant", "go2", "humanoid")
 GO2 = robot_description("go2")
@@ -224,3 +229,22 @@ def test_a_checkpoint_tells_policies_and_wishes_apart(tmp_path: Path) -> None:
     start(again, 2)
     again(*resting(2))
     assert digest(again) == digest(made[0])
+
+
+@pytest.mark.parametrize("robot", ["allegro", "humanoid"])
+def test_shipped_policies_do_their_tasks(robot: str) -> None:
+    """16 robots of the distribution: the humanoid walks, and the hand turns most cubes to their targets."""
+    path = shipped_policy(robot)
+    assert path is not None
+    policy, record = OnnxPolicy(path), json.loads(path.with_suffix(".json").read_text())
+    assert record["spec_digest"] == policy.spec.digest()
+    assert record["onnx_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert record["curve"][-1]["steps"] == record["reached"]["steps"]
+    env = training_task(robot).make(robot_description(robot), udr_distribution(robot), 16)
+    found, still = judge(policy, env, 1), record["at_rest"]
+    if robot == "humanoid":
+        assert found["fall_rate"] < 0.5 < found["forward_speed_m_s"]
+        assert still["fall_rate"] > 0.9
+    else:
+        assert found["fall_rate"] < 0.2 and found["outcomes"]["aligned"] > 0.6
+        assert still["outcomes"]["aligned"] < 0.35

@@ -18,9 +18,10 @@ from deal_hw.drivers import parameter_spaces, recorded_description, robot_descri
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
+from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask
 from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.run_env import HumanoidEnv, RunEnv, RunTask, run_spec
+from deal_hw.policies.run_env import RunEnv, RunTask, run_spec
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray, JointCommand
 
@@ -39,16 +40,18 @@ def make(robot: str, count: int = 4, **task: Any) -> LocomotionEnv:
     if robot == "ant":
         return RunEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
     if robot == "humanoid":
-        task = {"top_height_m": 2.0, "least_height_m": 0.9, **task}
-        return HumanoidEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
+        return HumanoidEnv(robot_description(robot), udr(robot), count, task=StrideTask(**task))
     return Go2Env(GO2, udr(robot), count, task=WalkTask(**task))
 
 
 @pytest.fixture(scope="module", params=ROBOTS)
 def env(request: pytest.FixtureRequest) -> LocomotionEnv:
     """Return an environment of four robots with episodes of 0.4 s."""
-    options: dict[str, Any] = {"start_speed": 0.0} if request.param == "go2" else {}
-    return make(request.param, ticks=20, **options)
+    options: dict[str, dict[str, Any]] = {
+        "go2": {"start_speed": 0.0},
+        "humanoid": {"start_speed_m_s": 0.0},
+    }
+    return make(request.param, ticks=20, **options.get(request.param, {}))
 
 
 def state(count: int, joints: int) -> tuple[FloatArray, FloatArray]:
@@ -364,3 +367,43 @@ def test_a_short_training_makes_a_policy_that_acts(
     assert record["training"]["config"]["steps"] == steps
     assert record["evaluation"]["robots"] == record["at_rest"]["robots"] == 4
     assert path.stat().st_size < 200_000
+
+
+def test_a_stopped_training_goes_on_with_its_curve(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped after two points, then resumed: one curve to the last step, and the time of both parts."""
+    path, checkpoint = tmp_path / "walk.onnx", tmp_path / "run" / "walk.safetensors"
+    options = {"seed": 1, "steps": 4 * 24 * 4, "members": 4, "judged": 2, "checkpoint": checkpoint}
+    with monkeypatch.context() as patch:
+        patch.setattr(tool.Curve, "over", lambda self: len(self.points) >= 2)
+        tool.train("humanoid", path, **options)
+    first = json.loads(path.with_suffix(".json").read_text())
+    assert [point["steps"] for point in first["curve"]] == [96, 192]
+    # As after a crash: the record is missing, and the curve holds a point that is later than the checkpoint.
+    path.with_suffix(".json").unlink()
+    curve = checkpoint.with_suffix(".curve.json")
+    kept = json.loads(curve.read_text())
+    kept["points"].append({**kept["points"][-1], "steps": 288, "cpu_hours": 1.0})
+    curve.write_text(json.dumps(kept))
+    tool.train("humanoid", path, resume=True, **options)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert [point["steps"] for point in record["curve"]] == [96, 192, 288, 384]
+    assert record["reached"]["steps"] == 384 and record["resumed"]
+    assert 3600 < record["cpu_seconds"] < 2 * 3600
+    assert {"mean_return", "time_up", "speed_m_s", "gait"} <= record["curve"][-1].keys()
+    shipped = path.with_suffix(".safetensors")
+    assert shipped.stat().st_size < checkpoint.stat().st_size
+
+
+def test_a_training_ends_with_its_processor_hours(tool: ModuleType, tmp_path: Path) -> None:
+    """An hour spent before counts: with a limit of one hour, nothing is left."""
+    curve = tmp_path / "walk.curve.json"
+    points = [{"steps": 10, "cpu_hours": 1.0, "mean_return": None}]
+    curve.write_text(json.dumps({"before": [], "points": points}))
+    assert not tool.Curve(curve, resume=False, hours=1.0).over()
+    assert tool.Curve(curve, resume=True, hours=1.0).over()
+    assert not tool.Curve(curve, resume=True, hours=2.0).over()
+    # So do those of a training whose checkpoint is the start.
+    later = tool.Curve(tmp_path / "later.curve.json", start=curve, hours=1.0)
+    assert later.over() and later.before == points and not later.points
