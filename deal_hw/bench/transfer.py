@@ -59,7 +59,9 @@ STEPS: Final[Mapping[str, int]] = {
     "humanoid": 60_000,
     "allegro": 60_000,
 }
-"""Steps of a fine-tune, by task; chosen on seed 0."""
+"""Steps of a fine-tune, by task. On seed 0 the oracle's return on the cart-pole is 11 after 2000 steps, 157
+after 16 000 and 212 after 24 000; on the ant it rises from 284 to 479. The Go2 has those of `go2-loop`. Those
+of humanoid and hand are not tuned."""
 
 BASE_SEED: Final = {"cartpole": 1}
 """Training seed of a base policy that the bench trains itself, where it is not 0: that of the shipped one."""
@@ -347,11 +349,10 @@ def _estimate(
     """Return a method's part of the row, and the distribution of the training."""
     case = target.case
     if method in WITHOUT_DATA:
-        under = {
-            "udr": udr_distribution,
-            "nominal": nominal_distribution,
-            "oracle": lambda task: target.truth,
-        }[method](case.task)
+        if method == "oracle":
+            under = target.truth
+        else:
+            under = udr_distribution(case.task) if method == "udr" else nominal_distribution(case.task)
         row: Row = {
             "error_percent": error_percent(under.mean, case.theta),
             "log_error_x100": log_error_x100(under.mean, case.theta),

@@ -92,9 +92,12 @@ def test_every_row_is_a_fine_tune_of_one_policy_and_none_is_run_twice(
     kept = {path: path.read_bytes() for path in (tmp_path / "transfer_policies").glob("*oracle*.onnx")}
 
     trained: list[Path] = []
-    monkeypatch.setattr(
-        transfer, "train_policy", lambda *a, **k: trained.append(a[2]) or train_policy(*a, **k)
-    )
+
+    def noted(*args: Any, **more: Any) -> OnnxPolicy:
+        trained.append(args[2])
+        return train_policy(*args, **more)
+
+    monkeypatch.setattr(transfer, "train_policy", noted)
     assert bench(settings(base, out)) == 0
     assert [path.stem.rpartition("_")[2] for path in trained] == ["oracle"]
     (oracle,) = [row for row in json.loads(out.read_text())["rows"] if row["method"] == "oracle"]
@@ -122,9 +125,13 @@ def test_a_base_policy_is_trained_once_and_a_stopped_training_goes_on(
     assert path == tmp_path / "cartpole_udr.onnx" and path.with_suffix(".safetensors").exists()
     assert not made[0].resume and "once" in said[0]
     assert transfer.base_policy(one, said.append) == path and len(made) == 1
-    monkeypatch.setattr(
-        transfer, "train_policy", lambda *a, **k: made.append(k["files"]) or shutil.copy(base, path)
-    )
+
+    def resumed(*args: Any, **more: Any) -> OnnxPolicy:
+        made.append(more["files"])
+        shutil.copy(base, path)
+        return OnnxPolicy(path)
+
+    monkeypatch.setattr(transfer, "train_policy", resumed)
     path.unlink()
     assert transfer.base_policy(one) == path and made[1].resume
 
@@ -252,7 +259,9 @@ def test_the_figure_has_a_panel_for_each_task_and_the_speeds_of_the_go2(
     assert [title.partition(":")[0] for title in titles] == ["ant", "go2", "go2, seed 0", "go2, seed 0"]
     assert "mean, worst and best of 2 seeds" in titles[0]
     assert [text.get_text() for text in figures[0].axes[0].get_yticklabels()] == ["udr", "oracle"]
-    names = [text.get_text() for text in figures[0].axes[2].get_legend().get_texts()]
+    legend = figures[0].axes[2].get_legend()
+    assert legend is not None
+    names = [text.get_text() for text in legend.get_texts()]
     assert names == ["commanded", "udr"]
 
 
