@@ -205,18 +205,21 @@ def check_base(task: str, path: Path) -> None:
         ConfigurationError: It was trained under another distribution than the task's UDR, or its checkpoint
             is missing.
     """
-    trained, wanted = OnnxPolicy(path).spec.trained_under, udr_distribution(task)
-    if trained != wanted.digest():
+    if not _trained_under_udr(task, path):
         raise ConfigurationError(
-            f"{path} was trained under another distribution ({trained or 'unknown'}) than {task}'s uniform "
-            f"randomisation within a factor {training_task(task).udr_ratio:g} ({wanted.digest()}), in which "
-            f"the targets are drawn; train one by `deal-hw train {task} --udr`"
+            f"{path} was trained under another distribution than {task}'s uniform randomisation within a "
+            f"factor {training_task(task).udr_ratio:g}, in which the targets are drawn; train one by "
+            f"`deal-hw train {task} --udr`"
         )
     if not path.with_suffix(".safetensors").exists():
         raise ConfigurationError(
             f"{path.with_suffix('.safetensors')} is missing: a fine-tune starts from the checkpoint beside "
             f"the policy; `deal-hw train {task} --udr` writes both"
         )
+
+
+def _trained_under_udr(task: str, path: Path) -> bool:
+    return OnnxPolicy(path).spec.trained_under == udr_distribution(task).digest()
 
 
 def base_policy(setting: Setting, say: Say = lambda text: None) -> Path:
@@ -229,8 +232,7 @@ def base_policy(setting: Setting, say: Say = lambda text: None) -> Path:
     if setting.base is not None:
         return setting.base
     shipped = required_policy(task)
-    if shipped.with_suffix(".safetensors").exists():
-        check_base(task, shipped)
+    if shipped.with_suffix(".safetensors").exists() and _trained_under_udr(task, shipped):
         return shipped
     path = setting.folder / f"{task}_udr.onnx"
     if not path.exists():
