@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from deal_hw.bench import transfer, transfer_target
+from deal_hw.bench.rows import load_rows
 from deal_hw.bench.transfer_figure import draw_transfer
 from deal_hw.cli.bench import Bench, bench
 from deal_hw.drivers.cartpole.description import SPACES
@@ -23,6 +24,7 @@ from deal_hw.training import TrainingFiles
 from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import nominal_distribution, train_policy, udr_distribution
 
+MEASURED = Path(__file__).resolve().parents[2] / "docs" / "measured"
 STEPS = 1_500
 FIELDS = {
     "task",
@@ -263,6 +265,19 @@ def test_the_figure_has_a_panel_for_each_task_and_the_speeds_of_the_go2(
     assert legend is not None
     names = [text.get_text() for text in legend.get_texts()]
     assert names == ["commanded", "udr"]
+
+
+@pytest.mark.parametrize("path", sorted(MEASURED.glob("transfer_*.png")), ids=lambda path: str(path.stem))
+def test_published_figures_name_every_method(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the rows beside each: every axis has a name and a title, every method of its rows is at one."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: figures.append(figure))
+    rows = [one for one in load_rows(path.with_suffix(".json")) if not one["error"]]
+    draw_transfer(path, rows)
+    for axes in figures[0].axes:
+        assert axes.get_xlabel() and axes.get_title()
+    named = {text.get_text() for text in figures[0].axes[0].get_yticklabels()}
+    assert {row["method"] for row in rows} == named
 
 
 def test_a_row_in_words() -> None:
