@@ -15,6 +15,7 @@ from compare_rows import METHODS
 
 from deal_hw.bench.figures import draw
 from deal_hw.bench.rows import load_rows
+from deal_hw.bench.transfer_figure import draw_transfer
 
 
 def draw_again(path: Path) -> Path | None:
@@ -24,7 +25,7 @@ def draw_again(path: Path) -> Path | None:
     if not good:
         return None
     figure = path.with_suffix(".png")
-    draw(figure, good)
+    (draw_transfer if good[0].get("bench") == "transfer" else draw)(figure, good)
     return figure
 
 

@@ -38,6 +38,8 @@ from deal_hw.workflows.train import train_policy, udr_distribution
 
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
 WALKS: Final = 3
+STEPS: Final = 300_000
+"""Usual steps of a fine-tune."""
 NEXT_NOISE: Final = 100_000
 """Distance between the noise seeds of two walks."""
 KINDS: Final = ("stiffness", "damping")

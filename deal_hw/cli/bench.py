@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
 MOST_SEEDS = 10_000
 ROBOTS = Only(("fixed-range", "mismatch", "paper"))
-TASKS = Only((*ROBOTS.names, "speed"))
-METHODS = Only((*TASKS.names, "loop", "real"))
+DEMONSTRATED = Only((*ROBOTS.names, "transfer"))
+PARAMETER_SETS = Only((*ROBOTS.names, "speed"))
+TASKS = Only((*PARAMETER_SETS.names, "transfer"))
+RATIOS = Only((*PARAMETER_SETS.names, "loop", "real"))
+METHODS = Only((*RATIOS.names, "transfer"))
 SEARCHES = Only((*TASKS.names, "real", "verdict", "first-answer"))
 ROWS = Only((*SEARCHES.names, "loop", "go2-loop"))
 REAL = Only(("real",))
@@ -40,6 +43,7 @@ class Bench:
         Literal[
             "loop",
             "go2-loop",
+            "transfer",
             "fixed-range",
             "mismatch",
             "paper",
@@ -51,7 +55,9 @@ class Bench:
         ]
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
-    go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned. fixed-range: calibrate
+    go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned. transfer: in drawn
+    targets, one policy a task is fine-tuned under the estimate of each method, for equal steps; its return in
+    the target is compared, as in DEAL's Figure 4. fixed-range: calibrate
     drawn truths in a fixed range. mismatch: the same on robots with effects that no simulator here
     models. paper: DEAL's protocol, whose target is the nominal model. real: recordings of a real
     robot (--model, --data), compared by errors on held-out motion. verdict: robots in plain MuJoCo with and
@@ -92,7 +98,7 @@ class Bench:
     task: Annotated[str, TASKS] = "cartpole"
     """Tasks, comma separated: cartpole, ant, humanoid, go2, allegro."""
 
-    space: Annotated[str, TASKS] = ""
+    space: Annotated[str, PARAMETER_SETS] = ""
     """Parameter set of the task; its default where nothing is named."""
 
     profile: Annotated[
@@ -105,9 +111,10 @@ class Bench:
 
     methods: Annotated[str, METHODS] = ""
     """Methods, comma separated, as for `deal-hw calibrate`; by default the default with training, and
-    each search without refinement."""
+    each search without refinement. transfer also takes udr, nominal and oracle, which read no recording; by
+    default udr, nominal, easi, bo-critic, deal-paper, deal-paper-literal, default, oracle."""
 
-    range_ratio: Annotated[str, METHODS] = "5"
+    range_ratio: Annotated[str, RATIOS] = "5"
     """Ratios of the search range, comma separated; for loop, speed and real one."""
 
     refine_all: Annotated[bool, Only(("fixed-range", "mismatch", "paper", "real"))] = False
@@ -117,11 +124,14 @@ class Bench:
     """What moves the robots: exciting motions, or their shipped policies, which the methods of the paper
     need."""
 
-    demonstration_seconds: Annotated[float, Range(1, 600, "s"), ROBOTS] = 4.0
+    demonstration_seconds: Annotated[float, Range(1, 600, "s"), DEMONSTRATED] = 4.0
     """Length of the demonstration [s]."""
 
-    checkpoint: Annotated[tuple[Path, ...], ROBOTS] = ()
-    """Policies (.onnx) that demonstrate instead of the shipped one, with --demonstration policy."""
+    checkpoint: Annotated[tuple[Path, ...], DEMONSTRATED] = ()
+    """Policies (.onnx) that demonstrate instead of the shipped one, with --demonstration policy. transfer:
+    the base policies, one a task, as `deal-hw train TASK --udr` writes them, the .safetensors beside each.
+    For a task without one, the bench takes a shipped policy with its checkpoint, or it trains one under
+    uniform randomisation and keeps it."""
 
     population: Annotated[int | None, Range(2, 100_000), SEARCHES] = None
     """Members of a search; by default 100, for methods of the paper 200."""
@@ -132,8 +142,9 @@ class Bench:
     train: Annotated[bool, Only(("loop", "go2-loop"))] = True
     """Train and deploy policies with the default method."""
 
-    steps: Annotated[int, Range(1, 10**9), Only(("go2-loop",))] = 300_000
-    """Steps of each fine-tune."""
+    steps: Annotated[int | None, Range(1, 10**9), Only(("go2-loop", "transfer"))] = None
+    """Steps of each fine-tune; by default 300 000 for the Go2, 24 000 for the cart-pole, 60 000 for other
+    robots."""
 
     out: Path | None = None
     """File of the rows, by default BENCH.json; the CSV and the figure lie beside it."""
@@ -153,7 +164,7 @@ class Bench:
         parse_seeds(self.seeds)
         parse_ratios(self.range_ratio)
         refuse_others(self, "bench", self.bench)
-        if self.checkpoint and self.demonstration != "policy":
+        if self.checkpoint and self.demonstration != "policy" and self.bench != "transfer":
             raise ConfigurationError("--checkpoint names policies; add --demonstration policy")
         if self.bench in ("loop", "speed", "real") and "," in self.range_ratio:
             raise ConfigurationError(
@@ -333,12 +344,40 @@ def _go2_loop(config: Bench, out: Path) -> _Table:
     cells = go2_loop.cells(
         config.profile,
         parse_seeds(config.seeds),
-        config.steps,
+        config.steps or go2_loop.STEPS,
         train=config.train,
         folder=out.parent / f"{out.stem}_runs",
         threads=config.threads,
     )
     return _in_words(go2_loop, cells)
+
+
+def _transfer(config: Bench, out: Path) -> _Table:
+    from deal_hw.bench import transfer
+    from deal_hw.bench.transfer_figure import draw_transfer
+
+    def say(text: str) -> None:
+        if not config.quiet:
+            print(text, flush=True)
+
+    def draw(out: Path, rows: Sequence[Row]) -> None:
+        if good := [row for row in rows if not row["error"]]:
+            draw_transfer(out.with_suffix(".png"), good)
+
+    cells = transfer.cells(
+        _names(config.task),
+        _methods(config, transfer.METHODS),
+        parse_seeds(config.seeds),
+        steps=config.steps,
+        checkpoints=config.checkpoint,
+        folder=out.parent / f"{out.stem}_policies",
+        seconds=config.demonstration_seconds,
+        population=config.population,
+        generations=config.generations,
+        threads=config.threads,
+        say=say,
+    )
+    return _Table(cells=cells, line=transfer.line, summary=transfer.print_summary, draw=draw)
 
 
 def _calibration(config: Bench, out: Path) -> _Table:
@@ -403,6 +442,7 @@ def _verdict(config: Bench, out: Path) -> _Table:
 _TABLES: dict[str, Callable[[Bench, Path], _Table]] = {
     "loop": _loop,
     "go2-loop": _go2_loop,
+    "transfer": _transfer,
     "speed": _speed,
     "real": _real,
     "verdict": _verdict,

@@ -66,9 +66,9 @@ def test_a_truth_outside_its_range_is_refused(tmp_path: Path, monkeypatch: pytes
     assert not list(tmp_path.iterdir())
 
 
-def test_steps_are_of_this_bench_alone() -> None:
+def test_steps_are_of_benches_that_fine_tune() -> None:
     """Elsewhere the option would be ignored."""
-    with pytest.raises(ConfigurationError, match="only `bench go2-loop` can use that"):
+    with pytest.raises(ConfigurationError, match="only `bench go2-loop` and `bench transfer` can use that"):
         Bench(bench="fixed-range", steps=10)
 
 

@@ -72,6 +72,7 @@ LINES = (
     "demo go2 --on-stand",
     "bench loop",
     "bench go2-loop",
+    "bench transfer",
     "bench fixed-range --methods eki",
     "bench mismatch --methods eki",
     "bench paper --methods eki",
@@ -289,8 +290,8 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     patch("deal_hw.calib.design.excitation_search.search_excitation")
     monkeypatch.setattr("deal_hw.calib.design.experiment_design.Experiment", note("experiment", experiment))
     patch("deal_hw.cli.bridge.Go2Bridge")
-    for bench in ("loop.cells", "go2_loop.cells", "speed.cells", "first_answer.cells", "real.cells"):
-        monkeypatch.setattr(f"deal_hw.bench.{bench}", note(bench))
+    for bench in ("loop", "go2_loop", "transfer", "speed", "first_answer", "real"):
+        monkeypatch.setattr(f"deal_hw.bench.{bench}.cells", note(f"{bench}.cells"))
     monkeypatch.setattr("deal_hw.bench.calibration.cells", note("calibration"))
     monkeypatch.setattr("deal_hw.bench.verdict.table", note("verdict"))
     patch("deal_hw.bench.rows.run_cells")

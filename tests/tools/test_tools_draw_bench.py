@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from draw_bench import main
 
-ROWS = Path(__file__).resolve().parents[2] / "docs" / "measured" / "paper_cartpole_ideal.json"
+MEASURED = Path(__file__).resolve().parents[2] / "docs" / "measured"
+ROWS = MEASURED / "paper_cartpole_ideal.json"
+TRANSFER = MEASURED / "transfer_cartpole.json"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
@@ -34,3 +36,13 @@ def test_a_figure_is_drawn_beside_its_rows(
     )
     assert not failed.with_suffix(".png").exists()
     assert f"{failed}: every cell failed" in capsys.readouterr().out
+
+
+def test_rows_of_the_transfer_bench_have_a_figure_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Returns in the target instead of parameter errors."""
+    rows = tmp_path / "transfer.json"
+    rows.write_bytes(TRANSFER.read_bytes())
+    run(monkeypatch, rows)
+    assert rows.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
