@@ -73,7 +73,10 @@ torque than the model of its calibration allows."""
 SHORTEST_S: Final = 0.5
 """A shorter demonstration is none [s]."""
 
-KEY: Final = ("task", "seed", "method", "train_steps", "demonstration_s", "base")
+KEY: Final = (
+    *("task", "seed", "method", "train_steps", "demonstration_s", "base"),
+    *("population", "generations"),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +173,7 @@ def cells(
     run = partial(transfer_row, population=population, generations=generations, threads=threads, say=say)
     runs = [
         (
-            (one.task, seed, method, one.steps, one.seconds, _base_name(one)),
+            (one.task, seed, method, one.steps, one.seconds, _base_name(one), population, generations),
             partial(run, one, seed, method),
         )
         for one, seed, method in itertools.product(settings, seeds, methods)
@@ -307,6 +310,8 @@ def transfer_row(
         "train_steps": setting.steps,
         "demonstration_s": setting.seconds,
         "base": _base_name(setting),
+        "population": population,
+        "generations": generations,
         "commit": git_commit(),
         "command": " ".join(describe_call("deal-hw")["argv"]),
         "error": "",
