@@ -104,7 +104,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Target:
+class HiddenTarget:
     """A hidden robot, its demonstration, and the base policy in it.
 
     Attributes:
@@ -249,7 +249,7 @@ def base_policy(setting: Setting, say: Say = lambda text: None) -> Path:
 
 
 @lru_cache(maxsize=1)
-def draw_target(setting: Setting, seed: int, base: Path) -> Target:
+def draw_target(setting: Setting, seed: int, base: Path) -> HiddenTarget:
     """Draw a target and let a policy demonstrate in it; rows of one seed share it.
 
     Raises:
@@ -275,7 +275,9 @@ def draw_target(setting: Setting, seed: int, base: Path) -> Target:
     policy = OnnxPolicy(base)
     truth = truth_of(case)
     returns = judged(setting.task, truth, policy, seed)
-    return Target(case=case, truth=truth, base=policy, returns=returns, seconds=time.monotonic() - began)
+    return HiddenTarget(
+        case=case, truth=truth, base=policy, returns=returns, seconds=time.monotonic() - began
+    )
 
 
 def transfer_row(
@@ -337,7 +339,7 @@ def transfer_row(
     return row
 
 
-def _base_part(target: Target) -> Row:
+def _base_part(target: HiddenTarget) -> Row:
     returns, case = target.returns, target.case
     return {
         "return_base": returns["return"],
@@ -351,7 +353,7 @@ def _base_part(target: Target) -> Row:
 
 
 def _estimate(
-    target: Target, method: str, calibrate: Callable[..., tuple[Row, Any]]
+    target: HiddenTarget, method: str, calibrate: Callable[..., tuple[Row, Any]]
 ) -> tuple[Row, ParameterDistribution]:
     """Return a method's part of the row, and the distribution of the training."""
     case = target.case
@@ -388,7 +390,7 @@ def _policy_file(setting: Setting, seed: int, method: str) -> Path:
 
 
 def _fine_tuned(
-    setting: Setting, seed: int, method: str, target: Target, distribution: ParameterDistribution
+    setting: Setting, seed: int, method: str, target: HiddenTarget, distribution: ParameterDistribution
 ) -> OnnxPolicy:
     file = _policy_file(setting, seed, method)
     files = TrainingFiles(start=target.base.path.with_suffix(".safetensors"))
@@ -396,7 +398,7 @@ def _fine_tuned(
 
 
 def _trained_part(
-    setting: Setting, seed: int, method: str, target: Target, distribution: ParameterDistribution
+    setting: Setting, seed: int, method: str, target: HiddenTarget, distribution: ParameterDistribution
 ) -> Row:
     policy = _fine_tuned(setting, seed, method, target, distribution)
     began = time.monotonic()
@@ -411,7 +413,7 @@ def _trained_part(
     }
 
 
-def _oracle_return(setting: Setting, seed: int, target: Target) -> float:
+def _oracle_return(setting: Setting, seed: int, target: HiddenTarget) -> float:
     """Return the oracle's return; its policy is trained by the first row of a seed, and kept."""
     file = _policy_file(setting, seed, "oracle")
     try:
