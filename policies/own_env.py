@@ -19,6 +19,7 @@ from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError, short
 from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.vector_env import TaskKnowledge
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.sim.engine.in_place import ModelInPlace
 from deal_hw.sim.engine.model import actuator_of
@@ -38,7 +39,7 @@ class OwnTask:
     env: str
 
 
-class OwnVectorEnv(SyncVectorEnv):
+class OwnVectorEnv(TaskKnowledge, SyncVectorEnv):
     """N members of a user's environment; every reset draws their parameters.
 
     Args:

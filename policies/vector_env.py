@@ -48,7 +48,28 @@ class Mirror:
     sign: tuple[float, ...]
 
 
-class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
+class TaskKnowledge:
+    """What PPO may use of a task beside its transitions; nothing by default.
+
+    Attributes:
+        layout: Layout of observation and action.
+    """
+
+    layout: PolicySpec
+
+    def feedback(self) -> FloatArray:
+        """Return a fixed linear part of the policy, (A, O), that PPO adds to its network; zero by default."""
+        return np.zeros((len(self.layout.actuated), len(self.layout.observation)))
+
+    def mirror(self) -> tuple[Mirror, Mirror] | None:
+        """Return the reflections of observation and action of a robot that is symmetric; None by default.
+
+        PPO learns from each transition and from its reflection.
+        """
+        return None
+
+
+class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc.ABC):
     """N robots that follow a policy's commands; a task defines starts and rewards.
 
     Members that end are restarted in the same step (Gymnasium's SAME_STEP); their last observation is in
@@ -141,17 +162,6 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
     def privileged(self) -> FloatArray:
         """Return the critic's information beyond the observation, (N, P); nothing by default."""
         return np.zeros((self.num_envs, 0))
-
-    def feedback(self) -> FloatArray:
-        """Return a fixed linear part of the policy, (A, O), that PPO adds to its network; zero by default."""
-        return np.zeros((len(self.layout.actuated), len(self.layout.observation)))
-
-    def mirror(self) -> tuple[Mirror, Mirror] | None:
-        """Return the reflections of observation and action of a robot that is symmetric; None by default.
-
-        PPO learns from each transition and from its reflection.
-        """
-        return None
 
     def target(self, action: FloatArray) -> FloatArray:
         """Return the targets of actions, (N, A) each."""

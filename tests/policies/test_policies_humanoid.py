@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from pathlib import Path
@@ -12,9 +13,10 @@ import pytest
 from deal_hw.drivers import robot_description
 from deal_hw.drivers.humanoid.description import GEAR_NM
 from deal_hw.drivers.humanoid.model import joint_type
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, PolicyError
 from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask, stride_spec
 from deal_hw.policies.onnx_export import export_network
+from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.ppo import PpoConfig, PpoTrainer
 from deal_hw.policies.vector_env import Mirror
 from deal_hw.policy import ObservationTerm
@@ -153,6 +155,20 @@ def test_the_trained_network_contains_the_springs(tmp_path: Path) -> None:
     np.testing.assert_allclose(action, policy.act_batch(observation), atol=1e-5)
     row = HUMANOID.actuated.index("left_knee")
     assert action[1, row] - action[0, row] == pytest.approx(-0.5 * 100.0 / 80.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("rounding", "refused"), [(1.5e-5, False), (1e-3, True)])
+def test_springs_of_single_precision_may_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounding: float, refused: bool
+) -> None:
+    """Sums of the springs reach some tens: their last places are above the tolerance of actions near 1."""
+    env = make(2)
+    config = PpoConfig(steps=1, hidden=(16,), rollout=4, batches=1, epochs=1)
+    policy = PpoTrainer().train(env, config, np.random.default_rng(0))
+    real = OnnxPolicy.act_batch
+    monkeypatch.setattr(OnnxPolicy, "act_batch", lambda self, seen: real(self, seen) + rounding)
+    with pytest.raises(PolicyError, match="differs") if refused else contextlib.nullcontext():
+        export_network(policy.network, policy.spec, tmp_path / "policy.onnx")
 
 
 def test_it_learns_from_reflections(monkeypatch: pytest.MonkeyPatch) -> None:

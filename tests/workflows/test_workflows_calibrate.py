@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import deal_hw
-from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, UnknownNameError
+from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, PolicyError, UnknownNameError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.model import searched_space
@@ -206,7 +206,7 @@ def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, P
         deal_hw.calibrate(model, fit, episodes=[0])
     with pytest.raises(ConfigurationError, match="--feet, --data would have no effect: a dataset defines it"):
         deal_hw.calibrate(None, fit, dataset="d", feet=["FL"])
-    with pytest.raises(ConfigurationError, match="eki runs no policy"):
+    with pytest.raises(PolicyError, match=r"no such policy file: pi\.onnx"):
         deal_hw.calibrate(model, fit, search="eki", policy="pi.onnx")
     with pytest.raises(ConfigurationError, match="which is unknown for --model"):
         deal_hw.calibrate(model, fit, search="deal-paper")
