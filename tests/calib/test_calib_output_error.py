@@ -228,10 +228,9 @@ def test_a_robot_that_stands_still_is_what_fits_that_explain_nothing_are_compare
     first = problem.episodes[0]
     T = len(first.sample)
     moving = dataclasses.replace(problem, episodes=[first])
-    moving.episodes = [dataclasses.replace(first, position=np.arange(T)[:, None] * first.period_s)]
-    moving.starts = [
-        dataclasses.replace(moving.starts[0], position=moving.episodes[0].position, velocity=np.ones((T, 1)))
-    ]
+    position: FloatArray = first.period_s * np.arange(T, dtype=np.float64)[:, None]
+    moving.episodes = [dataclasses.replace(first, position=position)]
+    moving.starts = [dataclasses.replace(moving.starts[0], position=position, velocity=np.ones((T, 1)))]
     found = standing_rmse(moving, 4 * first.period_s)
     assert found == pytest.approx(first.period_s * np.sqrt(np.mean(np.arange(1, 5) ** 2)), rel=1e-6)
 
