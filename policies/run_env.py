@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -85,7 +84,6 @@ class RunEnv(LocomotionEnv):
     """
 
     failure_reward = 0.0
-    usual_task: ClassVar[RunTask] = RunTask()
 
     def __init__(
         self,
@@ -96,7 +94,7 @@ class RunEnv(LocomotionEnv):
         task: RunTask | None = None,
         threads: int | None = 1,
     ) -> None:
-        self.task = task or self.usual_task
+        self.task = task or RunTask()
         super().__init__(
             description,
             distribution,

@@ -134,8 +134,7 @@ def train(
     """Train, judge and write a policy; return it, read back from its file."""
     if checkpoint is not None:
         checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    files = (None if file is None else file.with_suffix(".curve.json") for file in (checkpoint, start))
-    curve = Curve(next(files), resume=resume, start=next(files), hours=hours)
+    curve = Curve(_curve_file(checkpoint), resume=resume, start=_curve_file(start), hours=hours)
     policy = train_policy(
         robot,
         udr_distribution(robot),
@@ -156,6 +155,11 @@ def train(
     if checkpoint is not None:
         ship_checkpoint(checkpoint, policy)
     return policy
+
+
+def _curve_file(checkpoint: Path | None) -> Path | None:
+    """Return the file of the curve beside a checkpoint."""
+    return None if checkpoint is None else checkpoint.with_suffix(".curve.json")
 
 
 def _short(points: Sequence[Mapping[str, float | None]]) -> list[dict[str, float | None]]:

@@ -46,7 +46,6 @@ from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
-from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.checks import (
     HALVES,
@@ -403,6 +402,9 @@ def gait() -> CalibrationPipeline:
     Start states are smoothed, not fitted: fitted ones would explain each landing of a foot. Where these fits
     explain nothing, the adversarial search looks for another start.
     """
+    # Here, as it loads torch, which the other pipelines of this file need only for that search.
+    from deal_hw.calib.search.deal import Deal
+
     settings = Validation(local_first=False, cross_validation=False)
     return CalibrationPipeline(Deal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
