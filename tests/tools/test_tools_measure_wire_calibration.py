@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from measure_wire_calibration import measure, table
+import numpy as np
+import pytest
+from measure_wire_calibration import VIRTUAL_WIRE_S, measure, table, virtual_wire
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.cartpole.device import TICK_NS
+from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.robot import Robot
+from deal_hw.sim.recordings.episode import align
+from deal_hw.transport import Message, Transport
+from deal_hw.workflows.emulation.virtual import demonstrate
+from deal_hw.workflows.running.plan import RunPlan
 
 
 def row(transport: str, error_percent: float) -> dict[str, Any]:
@@ -43,3 +55,37 @@ def test_a_row_holds_what_calibration_found() -> None:
     assert found["error"] == "" and len(found["parameters"]) == 9
     assert found["median_percent"] < 20 and 0 <= found["coverage90"] <= 1
     assert all(v["low"] < v["estimate"] < v["high"] for v in found["parameters"].values())
+
+
+class NotedTransport(VirtualTransport):
+    """A virtual wire that notes the tick in which the device handles each message."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.handled: list[int] = []
+
+    def send(self, message: Message) -> None:
+        """Note the device's next tick."""
+        super().send(message)
+        self.handled.append(self.device.device_ns // TICK_NS)
+
+
+@pytest.mark.parametrize("transport", ["serial", "can", "odrive"])
+def test_the_time_from_stamp_to_arrival_is_what_the_device_sees(transport: str) -> None:
+    """Every command of a recording arrives as many ticks after its stamp as the tool adds to the truth."""
+    virtual = virtual_wire(transport, draw_truth("sensor", 0, range_ratio=5.0))
+    wires: list[NotedTransport] = []
+
+    def noted(_: Transport, clock: Clock) -> Robot:
+        wires.append(NotedTransport(virtual.device, clock))
+        return made(wires[-1], clock)
+
+    made, virtual.robot = virtual.robot, noted
+    plan = RunPlan(robot="cartpole", motion="chirp", seconds=2.0)
+    run, _ = demonstrate(virtual, plan, attempts=1)
+    episode = align(run.trajectory, virtual.description)
+    steps = np.flatnonzero(np.any(np.diff(episode.target, axis=0) != 0, axis=1)) + 1
+    stamped = run.first_tick + episode.origin + steps
+    late = {min(handled - tick for handled in wires[-1].handled if handled >= tick) for tick in stamped}
+    assert len(stamped) > 20
+    assert late == {round(1e3 * VIRTUAL_WIRE_S.get(transport, 0.0))}

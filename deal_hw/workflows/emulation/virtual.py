@@ -60,6 +60,12 @@ class VirtualEpisode:
 class VirtualCartpole:
     """An emulated cart-pole in virtual time. Each run homes and arms it, and makes it passive at the end.
 
+    Attributes:
+        truth: Its hidden parameters, profile and seed.
+        clock: The virtual clock.
+        device: The emulated device.
+        robot: Makes the driver for its wire.
+
     Args:
         truth: Its hidden parameters, profile and seed.
         device: The emulated device; by default one with a serial port that keeps its true states.
@@ -75,7 +81,7 @@ class VirtualCartpole:
         self.truth = truth
         self.clock = VirtualClock(_START_NS)
         self.device = device or CartpoleDevice(truth, keep_truth=True)
-        self._robot = robot
+        self.robot = robot
         self._transport = VirtualTransport(self.device, self.clock)
 
     @property
@@ -98,7 +104,7 @@ class VirtualCartpole:
             path: File to write; a temporary one by default.
             metadata: For the recording.
         """
-        robot = self._robot(self._transport, self.clock)
+        robot = self.robot(self._transport, self.clock)
         ticks: list[int] = []
         with tempfile.TemporaryDirectory() as folder:
             file = path or Path(folder) / "episode.mcap"
