@@ -46,6 +46,13 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
         "An inertia or a gain was not free, or its range is too narrow.",
         "Free dof_armature, body_mass or the actuator's gain of {} (--parameters).",
     ),
+    "lag": (
+        "a servo whose damping acts late",
+        "The servo's speed is a difference of positions or filtered, so it is some milliseconds old; the "
+        "model's is not. Without saturation this acts like less inertia.",
+        "Filter the speed of {} less in the servo, or command less damping; trust predictions more than the "
+        "inertia and the effort limit.",
+    ),
     "load": (
         "a constant force",
         "A mass, its centre or an encoder's zero was not free.",

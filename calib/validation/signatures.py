@@ -21,7 +21,7 @@ from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
-Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "mass", "contact"]
+Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "lag", "load", "mass", "contact"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,6 +110,7 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             geared = name in problem.robot.description.actuated and problem.robot.base is None
             if geared:
                 forces["backlash"] = _crossing(problem, data, states[data.episode], c, size)
+                forces["lag"] = [_late_damping(problem, fit, data, states[data.episode], path, c)]
             each = [(cause, shape) for cause, shapes in forces.items() for shape in shapes]
             force = np.zeros((1 + len(each), *velocity.shape[:2], C))
             force[1:, ..., c] = size * np.stack([shape for _, shape in each])
@@ -203,6 +204,40 @@ def _crossing(
         relative = np.gradient(np.gradient(place, episode.step_s), episode.step_s)
         found.append(-inertia * relative[at] / play * SETTINGS.plays[0] / size)
     return found
+
+
+def _late_damping(
+    problem: Problem,
+    fit: Refined,
+    data: WindowData,
+    states: tuple[FloatArray, FloatArray],
+    path: FloatArray,
+    c: int,
+) -> FloatArray:
+    """Return the force of a servo whose damping acts on an older speed, in the windows, (W, S), of order 1.
+
+    To first order it is in proportion to the joint's acceleration, and 0 where the effort limit cuts the
+    servo's demand. ``path`` are the set-points, (1, S, A).
+    """
+    recorded = problem.episodes[data.episode]
+    servo = list(problem.robot.description.actuated_index).index(c - problem.robot.joints.start)
+    change = np.gradient(states[1], recorded.period_s, axis=0)
+    position, velocity, acceleration = _between(data, *states, change)
+    first = recorded.sample[data.windows.start][:, None]
+    at = np.minimum(first + np.arange(velocity.shape[1]), path.shape[1] - 1)
+    batch = problem.batch(1)
+    batch.set_parameters(fit.theta[None])
+    stiffness, damping, limit = (
+        batch.servo_factor(kind)[0, servo] * sent[at, servo]
+        for kind, sent in (
+            ("servo_stiffness", recorded.stiffness),
+            ("servo_damping", recorded.damping),
+            ("servo_effort_limit", recorded.effort_limit),
+        )
+    )
+    demand = stiffness * (path[0, at, servo] - position[..., c]) - damping * velocity[..., c]
+    force = damping * acceleration[..., c] * (np.abs(demand) < limit)
+    return np.asarray(force / max(float(np.std(force)), 1e-300))
 
 
 def place_in_play(acceleration: FloatArray, step_s: float, play: float) -> FloatArray:
