@@ -32,7 +32,6 @@ from deal_hw.calib.fit.intervals import (
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import (
     Refined,
-    at_parameters,
     local_fit,
     part_of,
     refine,
@@ -46,7 +45,6 @@ from deal_hw.calib.pipeline.calibration_run import (
 )
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
-from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
@@ -240,7 +238,7 @@ class Refinement(Fits):
     restarts: RestartSettings = RESTARTS
 
     def best(self, run: CalibrationRun) -> FitOutcome:
-        """Search, refine, and let cross-validation decide about the refinement. See :meth:`Fits.best`."""
+        """Search and refine. See :meth:`Fits.best`."""
         settings, left, floating = self.restarts, run.budget.generations, run.problem.robot.base is not None
         best: tuple[CalibrationResult, Refined] | None = None
         run.say_search()
@@ -261,9 +259,6 @@ class Refinement(Fits):
             same = same or abs(refined.chi2 - previous) < settings.same * previous
             if best is None or better(refined, best[1], settings):
                 best = (searched, refined)
-            elif attempt == 1:
-                # Cross-validation compares the refinement with a search that used its whole budget.
-                best = (searched, best[1])
             if best[1].chi2 < settings.explained or same or left < settings.fewest_generations:
                 break
         if best is None:
@@ -273,23 +268,7 @@ class Refinement(Fits):
             # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
                 best = (best[0], local)
-        return conclude_fit(run, *best, self._choose(run, *best, brief=attempt == 0), attempt)
-
-    def _choose(
-        self, run: CalibrationRun, searched: CalibrationResult, refined: Refined, *, brief: bool
-    ) -> Choice | None:
-        """Return the choice of cross-validation; None where the fit explains all but the noise."""
-        # A fold is a search and a refinement. With contacts these take a minute each.
-        floating = run.problem.robot.base is not None
-        if not run.settings.cross_validation or floating or conclusive(run.problem, refined):
-            return None
-        run.say("cross-validation", "does the refinement predict unseen data better?")
-        # Drawn after all searches, so that a resumed run draws the same seed.
-        seed = int(run.rng.integers(2**32))
-        # A fold's search needs no more generations than that on all data, and ends as early.
-        generations = max(len(searched.trace), self.restarts.fewest_generations)
-        less = dataclasses.replace(run.budget, generations=generations, brief=brief)
-        return choose(run.problem, run.attempts.search, less, seed, refined.shooting.length, searched.steps)
+        return conclude_fit(run, *best, attempt)
 
 
 def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
@@ -373,23 +352,18 @@ def conclude_fit(
     run: CalibrationRun,
     searched: CalibrationResult | None,
     refined: Refined,
-    choice: Choice | None = None,
     restarts: int = 0,
     *,
     wrong: bool = False,
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
-    ``searched`` is the search's result; None where the fit needed no search. ``choice`` is that of
-    cross-validation, if it ran. With ``wrong`` the model does not explain the recordings, although the
-    residual is as large as the weights say.
+    ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
+    not explain the recordings, although the residual is as large as the weights say.
     """
     late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
-    if choice is not None and choice.chosen == "search":
-        length, states = refined.shooting.length, refined.shooting.states(refined.point)
-        refined = at_parameters(run.problem, searched.estimate, searched.latency_s, length, states)
-    elif unexplained(refined, MISMATCH.white_samples):
+    if unexplained(refined, MISMATCH.white_samples):
         # Not before: in another minimum delays seem to explain what no parameters there do.
         late = fit_delays(run.problem, refined, MISMATCH.evidence)
         refined = refined if late is None else late.fit
@@ -397,7 +371,7 @@ def conclude_fit(
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
     steady = late is None and not (wrong or unexplained(refined))
-    if problem.fixed_latency_s is None and steady and not (choice and choice.chosen == "search"):
+    if problem.fixed_latency_s is None and steady:
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -427,8 +401,6 @@ def conclude_fit(
         "refinement_iterations": refined.iterations,
         **checked,
     }
-    if choice is not None:
-        facts["cross_validation"] = choice.to_json()
     if scan is not None:
         facts["latency_scan"] = {
             "ticks": list(scan.ticks),

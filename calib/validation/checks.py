@@ -73,7 +73,7 @@ class Validation:
     """Refine the nominal values first; where that explains the recordings there is no search."""
 
     cross_validation: bool = True
-    """Where the residual is unexplained, keep the refinement only if it predicts better on inner folds."""
+    """Choose among candidate fits by their predictions of data that they left out (`output-error`)."""
 
     split_half: bool = True
     """Refine two halves of the data alone and compare."""

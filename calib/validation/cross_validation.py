@@ -1,13 +1,10 @@
-"""Cross-validation: search alone, or search and refinement? Decided on inner folds of the fitted data only.
+"""Cross-validation: candidate fits are compared by their predictions of data that they left out.
 
-Where the model is right, the refinement is nearer the truth. Where it is wrong, the refinement fits model
-error with unrelated parameters, and a search that stopped early may predict other motion better. So each fold
-is left out, both are fitted to the rest, and the better predictor of the fold is taken.
+The folds are parts of the fitted recordings; held-out recordings stay unseen.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,29 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Member, Problem, prediction_errors
-from deal_hw.calib.fit.refinement import refine
-from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
+FOLDS = 2
+"""Number of folds."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CrossValidationSettings:
-    """Settings of :func:`choose`.
-
-    Attributes:
-        folds: Number of folds; each costs a search and a refinement.
-        blocks: Stretches of each recording that a fold leaves out.
-        most_steps: Most physics steps of all folds.
-    """
-
-    folds: int = 2
-    blocks: int = 2
-    most_steps: float = 3e9
-
-
-SETTINGS = CrossValidationSettings()
+BLOCKS = 2
+"""Stretches of each recording that a fold leaves out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,39 +53,6 @@ class Choice:
             "window_s": self.window_s,
             "steps": self.steps,
         }
-
-
-def choose(
-    problem: Problem,
-    search: CalibrationMethod[Problem],
-    budget: Budget,
-    seed: int,
-    length: int,
-    search_steps: int,
-) -> Choice:
-    """Fit every candidate without each fold and compare the predictions of that fold.
-
-    The search on all data cost ``search_steps`` physics steps. Predictions have ``length`` samples.
-    """
-    window_s = length * problem.episodes[0].period_s
-    if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
-        note = f"left out: {SETTINGS.folds} searches would take {cost:.1g} physics steps"
-        return Choice("refinement", {}, window_s, note=note)
-    before = problem.steps
-
-    def fits(train: Problem, fold: int) -> dict[str, Member]:
-        searched = search.run(train, budget, np.random.default_rng([seed, fold]))
-        refined = refine(train, searched.estimate, searched.latency_s)
-        return {
-            "search": (searched.estimate, searched.latency_s),
-            "refinement": (refined.theta, refined.latency_s),
-        }
-
-    def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
-        return prediction_error(test, members, window_s)
-
-    found = on_folds(problem, fold_masks(problem), fits, errors, "refinement", window_s)
-    return dataclasses.replace(found, steps=problem.steps - before)
 
 
 def on_folds(
@@ -142,7 +92,7 @@ def fold_numbers(count: int, folds: int, rounds: int) -> IntArray:
     return np.asarray(np.arange(count) * folds * rounds // max(count, 1) % folds)
 
 
-def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.NDArray[np.bool_]]]:
+def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each of ``count`` folds the samples of each recording that it leaves out, (T,) each.
 
     With enough motions, whole motions are left out in turn: a calibration must predict other motion. The
@@ -154,7 +104,7 @@ def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.N
     if unit[-1] + 1 < count:
         unit = list(range(len(episodes)))
     left_out = [
-        fold_numbers(len(e.sample), count, SETTINGS.blocks)
+        fold_numbers(len(e.sample), count, BLOCKS)
         if len(episodes) < count
         else np.full(len(e.sample), number % count)
         for number, e in zip(unit, episodes, strict=True)
