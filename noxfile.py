@@ -15,7 +15,7 @@ nox.options.reuse_existing_virtualenvs = True
 def base(session: nox.Session) -> None:
     """Test all parts that need no torch."""
     session.install("--constraint", "constraints-3.10.txt", "--editable", ".[sim,keys,lerobot,dds,testing]")
-    others = ("gymnasium", "hypothesis", "onnx", "pillow", "psutil", "pycdr2", "pytest-xdist")
+    others = ("gymnasium", "hypothesis", "onnx", "pillow", "pycdr2", "pytest-xdist")
     session.install("--constraint", "constraints-3.10.txt", *others)
     folders = ("contracts", "control", "data", "drivers", "sim")
     session.run("pytest", "-n", "2", *(f"tests/{name}" for name in folders), *session.posargs)

@@ -61,7 +61,6 @@ EXTRAS = (
     "onnx",
     "onnxscript",
     "matplotlib",
-    "psutil",
     "pytest",
     "hypothesis",
     "cryptography",
