@@ -14,8 +14,10 @@ nox.options.reuse_existing_virtualenvs = True
 @nox.session(python=["3.10"])
 def base(session: nox.Session) -> None:
     """Test all parts that need no torch."""
-    session.install("--constraint", "constraints-3.10.txt", "--editable", ".[sim,keys,lerobot,dds,testing]")
-    others = ("gymnasium", "hypothesis", "onnx", "pillow", "psutil", "pycdr2", "pytest-xdist")
+    session.install(
+        "--constraint", "constraints-3.10.txt", "--editable", ".[robot,sim,keys,lerobot,dds,testing]"
+    )
+    others = ("gymnasium", "hypothesis", "onnx", "pillow", "pycdr2", "pytest-xdist")
     session.install("--constraint", "constraints-3.10.txt", *others)
     folders = ("contracts", "control", "data", "drivers", "sim")
     session.run("pytest", "-n", "2", *(f"tests/{name}" for name in folders), *session.posargs)

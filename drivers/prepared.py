@@ -1,7 +1,4 @@
-"""Prepares models that are files of other packages, and keeps them in the user's cache.
-
-This repository has no copy of these models.
-"""
+"""Prepares models that others published, and keeps the results in the user's cache."""
 
 from __future__ import annotations
 
@@ -41,28 +38,25 @@ def package_file(package: str, inside: str, extra: str) -> Path:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PackagedModel:
-    """An MJCF of another package, and the change that makes it a robot's.
+class PublishedModel:
+    """An MJCF that others published, and the change that makes it a robot's.
 
     Attributes:
         robot: First part of the prepared file's name.
-        package: The package.
-        inside: The file's path inside of it.
-        extra: Our extra that installs the package.
+        file: Function that returns the path of the published file; raises MissingExtraError if it belongs to
+            a package that is not installed (:func:`package_file`).
         change: Function that changes its tree, given parameter name -> value; raises KeyError or
             AttributeError if a part is missing.
-        source: The file and the package's version that the change was written for.
+        source: The file and the version that the change was written for.
     """
 
     robot: str
-    package: str
-    inside: str
-    extra: str
+    file: Callable[[], Path]
     change: Callable[[ET.Element, Mapping[str, float]], None]
     source: str
 
     def prepare(self, text: str, values: Mapping[str, float]) -> str:
-        """Return the package's MJCF after the change.
+        """Return the published MJCF after the change.
 
         Raises:
             ConfigurationError: The file is not the one that the change was written for.
@@ -81,11 +75,10 @@ class PackagedModel:
         """Return the prepared MJCF in the user's cache folder; it is written if missing.
 
         Raises:
-            MissingExtraError: The package is not installed.
-            ConfigurationError: Its file is missing or not as expected, or no folder can be written.
+            MissingExtraError: The file's package is not installed.
+            ConfigurationError: The file is missing or not as expected, or no folder can be written.
         """
-        path = package_file(self.package, self.inside, self.extra)
-        return cached(self.robot, self.prepare(path.read_text(encoding="utf-8"), values))
+        return cached(self.robot, self.prepare(self.file().read_text(encoding="utf-8"), values))
 
 
 def find(root: ET.Element, path: str) -> ET.Element:

@@ -19,7 +19,7 @@ from deal_hw.policy import Observation, PolicySpec
 
 OPSET = 18
 IR_VERSION = 9
-"""Low enough for every onnxruntime that the base install accepts."""
+"""Low enough for every onnxruntime that the extra `deploy` accepts."""
 _ACTIVATIONS: Mapping[type[torch.nn.Module], str] = {
     torch.nn.ELU: "Elu",
     torch.nn.ReLU: "Relu",

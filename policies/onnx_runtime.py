@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import onnxruntime
 
-from deal_hw.errors import PolicyError
+from deal_hw.errors import MissingExtraError, PolicyError
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray
+
+try:
+    import onnxruntime
+except ImportError as err:
+    raise MissingExtraError("onnxruntime", "deploy") from err
 
 SPEC_KEY = "deal_hw.policy_spec"
 """Key of the spec, as JSON, in the ONNX file's metadata."""

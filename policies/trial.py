@@ -8,6 +8,8 @@ the digest the control process later knows that it opens the same bytes.
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
 import json
 import os
 import signal
@@ -27,7 +29,7 @@ from typing_extensions import Self
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
-from deal_hw.errors import PolicyError
+from deal_hw.errors import MissingExtraError, PolicyError
 from deal_hw.policies.trial_states import GivenVelocity, Probe, ProbeStates
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray
@@ -105,8 +107,10 @@ class TrialPolicy:
         """Start the process and read the spec from it.
 
         Raises:
+            MissingExtraError: onnxruntime is not installed.
             PolicyError: The file holds no policy that can be loaded.
         """
+        _require_onnxruntime()
         self._end_ns = self._clock.now_ns() + round(self._settings.time_limit_s * 1e9)
         self._connection, theirs = Pipe()
         self._said = tempfile.TemporaryFile()
@@ -241,6 +245,14 @@ class TrialPolicy:
         last = self._said.read()[-400:].decode(errors="replace").strip().splitlines()
         words = f": {last[-1]}" if last else ""
         return f"the network crashes the process that runs it ({how}{words}); give another policy"
+
+
+def _require_onnxruntime() -> None:
+    """Look for it without loading it: the process that runs the network could only crash without it."""
+    with contextlib.suppress(ImportError, ValueError):
+        if importlib.util.find_spec("onnxruntime") is not None:
+            return
+    raise MissingExtraError("onnxruntime", "deploy")
 
 
 def check_policy(

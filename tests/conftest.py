@@ -1,6 +1,5 @@
 """What holds for all tests."""
 
-import importlib.util
 import os
 import signal
 from collections import Counter
@@ -153,16 +152,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip the humanoid where its model is not installed (Python 3.13), and begin with what lasts longest.
-
-    Workers start with tests in real time, then with the files with the most slow tests.
-    """
-    if importlib.util.find_spec("dm_control") is None:
-        for item in items:
-            if "humanoid" in item.name.lower():
-                item.add_marker(
-                    pytest.mark.skip(reason="dm_control, which has the humanoid's model, is missing")
-                )
+    """Begin with what lasts longest: tests in real time, then the files with the most slow tests."""
     if hasattr(config, "workerinput"):
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
         items.sort(key=lambda item: (not real_time(item.nodeid), -slow[item.path]))

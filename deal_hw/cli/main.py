@@ -114,6 +114,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             "deploy",
             help="run a policy on the robot behind the safety filter",
             example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/policy.onnx",
+            extra="deploy",
             common="port out policy seconds task transport velocity stand trust_calibration dry_run quiet",
         ),
         "inspect": _verb(
@@ -152,7 +153,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             help="on the Go2's computer: connect DDS and Zenoh, admit one controller, damp the robot "
             "without one",
             example="bridge go2 --port eth0",
-            extra="dds",
+            extra="dds,zenoh",
         ),
         "keys": _verb(
             "keys",

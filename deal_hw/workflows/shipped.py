@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
@@ -40,10 +41,29 @@ def required_policy(robot: str) -> Path:
 
 
 def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
-    """Return a function that makes a robot's balancing behaviour; None if the robot has no policy."""
+    """Return a function that makes a robot's balancing behaviour; None if the robot has no policy.
+
+    Raises:
+        MissingExtraError: onnxruntime is not installed.
+        PolicyError: The policy must not run on this robot.
+    """
     path = policy or shipped_policy(description.name)
+    return None if path is None else _tried(path, description)
+
+
+def shipped_balancer(description: RobotDescription) -> Callable[[], Behaviour] | None:
+    """Return :func:`balancer` of the shipped policy, which is tried at the first call and not before.
+
+    Calibration needs it for advice alone, and runs without onnxruntime.
+    """
+    path = shipped_policy(description.name)
     if path is None:
         return None
+    make = functools.cache(lambda: _tried(path, description))
+    return lambda: make()()
+
+
+def _tried(path: Path, description: RobotDescription) -> Callable[[], Behaviour]:
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policies.trial import check_policy
 

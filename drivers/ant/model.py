@@ -6,11 +6,12 @@ alone determines contacts; textures are removed (a 1278-pixel cube map makes eve
 
 from __future__ import annotations
 
+import functools
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from typing import Final
 
-from deal_hw.drivers.prepared import PackagedModel, find
+from deal_hw.drivers.prepared import PublishedModel, find, package_file
 
 LEG_NUMBERS: Final = (1, 2, 3, 4)
 STEP_S: Final = 0.005
@@ -54,11 +55,9 @@ def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
     key.set("qpos", f"0 0 {HOME_HEIGHT_M!r} 1 0 0 0 {pose}")
 
 
-MODEL: Final = PackagedModel(
+MODEL: Final = PublishedModel(
     robot="ant",
-    package="gymnasium",
-    inside="envs/mujoco/assets/ant.xml",
-    extra="train",
+    file=functools.partial(package_file, "gymnasium", "envs/mujoco/assets/ant.xml", "train"),
     change=_prepare,
     source="ant.xml of gymnasium 1.x",
 )

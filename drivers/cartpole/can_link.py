@@ -13,12 +13,13 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from fastcrc import crc16
 
 from deal_hw.drivers.cartpole import protocol
-from deal_hw.errors import ConfigurationError, FrameError
+from deal_hw.errors import ConfigurationError, FrameError, MissingExtraError
 
 if TYPE_CHECKING:
     from cantools.database.can import Message as DbcMessage
@@ -86,12 +87,23 @@ _COMMANDS: Final = ("Target", "Arm", "Home")
 _FIRMWARE: Final = ("Major", "Minor", "Patch")
 
 
+def _cantools() -> ModuleType:
+    """Return cantools. It is imported here alone: it would be half of a serial emulator's start."""
+    try:
+        import cantools
+    except ImportError as error:
+        raise MissingExtraError("cantools", "can") from error
+    return cantools
+
+
 @functools.cache
 def database() -> dict[str, DbcMessage]:
-    """Return the frames of assets/cartpole.dbc by name."""
-    # Half of a serial emulator's start would be this import.
-    import cantools
+    """Return the frames of assets/cartpole.dbc by name.
 
+    Raises:
+        MissingExtraError: cantools is not installed.
+    """
+    cantools = _cantools()
     loaded = cantools.database.load_file(Path(__file__).parent / "assets" / "cartpole.dbc")
     assert isinstance(loaded, cantools.database.can.Database)
     return {message.name: message for message in loaded.messages}
@@ -151,11 +163,9 @@ class CanLink:
         *,
         device: bool = False,
     ) -> None:
-        from cantools.database import EncodeError  # Loaded with the table of frames.
-
         self.errors = self.torn = 0
         self.fault = ""
-        self._unfit = (EncodeError, KeyError, UnicodeEncodeError)
+        self._unfit = (_cantools().database.EncodeError, KeyError, UnicodeEncodeError)
         self._node, self._version, self._unique_id = check_node(node), version, unique_id
         # The host's frames have the numbers 0 to 7; a chip filters by the same bits.
         self._number_bits = 3 if device else _NUMBER_BITS

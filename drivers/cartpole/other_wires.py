@@ -70,7 +70,7 @@ def _find(path: str, clock: Clock, make: MakeTransport) -> _Wire | None:
         hello = link.resync + link.encode(protocol.Hello(1))
         if any(isinstance(m, protocol.Info) for m in link.decode(_answer(serial, clock, hello))):
             return _Wire("a device with deal-hw's serial protocol", ("serial",), path)
-    # The SDK of the servos may be absent.
+    # The SDK of the servos may be absent; then they are not asked.
     from deal_hw.drivers.cartpole.dynamixel.bus import Bus
 
     for rate in _SERVO_RATES:

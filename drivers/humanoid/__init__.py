@@ -1,1 +1,1 @@
-"""The humanoid of dm_control: facts and its model, prepared from the installed package."""
+"""The humanoid of dm_control: facts and its model, prepared from a copy of the published file."""

@@ -1,6 +1,6 @@
 """Facts about dm_control's humanoid: a free torso and 21 joints with torque motors, as in DEAL's Table 11.
 
-:data:`DESCRIPTION` is made on first access, because it needs the model of the installed dm_control.
+:data:`DESCRIPTION` is made on first access, because its model is prepared in the user's cache.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def description() -> RobotDescription:
     """Return the facts about the humanoid.
 
     Raises:
-        MissingExtraError: dm_control, which has the model, is not installed.
+        ConfigurationError: No folder for the prepared model can be written.
     """
     count = len(JOINTS)
     gear = tuple(GEAR_NM[joint_type(name)] for name in JOINTS)

@@ -1,4 +1,4 @@
-"""The humanoid's MJCF, prepared from the file of the installed dm_control; no copy of it is kept here.
+"""The humanoid's MJCF, prepared from dm_control's file (assets/README.md has its source and licence).
 
 Changes: textures, sites, sensors and cameras are removed (textures make every copy of the model 12 MB). The
 values of the parameter preset are written. The feet alone define their contacts, with friction. Bodies touch
@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Final
 
-from deal_hw.drivers.prepared import PackagedModel, find
+from deal_hw.drivers.prepared import PublishedModel, find
 
 STEP_S: Final = 0.005
 HOME_HEIGHT_M: Final = 1.29
@@ -76,11 +77,9 @@ def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
     key.set("qpos", f"0 0 {HOME_HEIGHT_M!r} 1 0 0 0 " + " ".join("0" * len(JOINTS)))
 
 
-MODEL: Final = PackagedModel(
+MODEL: Final = PublishedModel(
     robot="humanoid",
-    package="dm_control",
-    inside="suite/humanoid.xml",
-    extra="bench",
+    file=lambda: Path(__file__).parent / "assets" / "humanoid.xml",
     change=_prepare,
-    source="humanoid.xml of dm_control 1.0",
+    source="humanoid.xml of dm_control 1.0.50",
 )

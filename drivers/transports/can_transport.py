@@ -7,15 +7,15 @@ import errno
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
-
-import can
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.transports.can_bus import BITRATE, NO_ACKNOWLEDGE, CanAddress, CanTransport
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport
 from deal_hw.errors import (
     ConfigurationError,
+    MissingExtraError,
     PortNotFoundError,
     TransportError,
     TransportLostError,
@@ -23,6 +23,9 @@ from deal_hw.errors import (
     UnknownNameError,
 )
 from deal_hw.transport import Message
+
+if TYPE_CHECKING:
+    import can
 
 _NOT_SET_HERE: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose bit rate the system sets (``ip link``), or that have none."""
@@ -79,7 +82,13 @@ class PythonCanTransport(CanTransport):
         self._last_ns = 0
 
     def open(self) -> None:
-        """Open the bus."""
+        """Open the bus.
+
+        Raises:
+            MissingExtraError: python-can is not installed.
+            PortNotFoundError: The adapter is missing, or its interface is down.
+            UnknownNameError: python-can has no such interface.
+        """
         if self._bus is None:
             self._bus = self._open_bus()
             self._off, self._lost, self.trouble = False, False, ""
@@ -88,7 +97,7 @@ class PythonCanTransport(CanTransport):
         """Close the bus."""
         bus, self._bus = self._bus, None
         if bus is not None:
-            with contextlib.suppress(can.CanError, OSError):
+            with contextlib.suppress(_python_can().CanError, OSError):
                 bus.shutdown()
 
     def reopen(self) -> None:
@@ -108,24 +117,26 @@ class PythonCanTransport(CanTransport):
     def send(self, message: Message) -> None:
         """Give a frame to the adapter; never waits: a full transmit buffer is an error."""
         self._check_bus()
-        frame = can.Message(
+        python_can = _python_can()
+        frame: can.Message = python_can.Message(
             arbitration_id=int(message.channel, 16), is_extended_id=False, data=message.payload, check=True
         )
         try:
             self._open_or_raise().send(frame, timeout=0)
-        except (can.CanError, OSError) as error:
+        except (python_can.CanError, OSError) as error:
             raise self._failed(error) from error
 
     def receive(self, timeout_s: float) -> Message:
         """Return the next data frame."""
         bus = self._open_or_raise()
+        errors = (_python_can().CanError, OSError)
         deadline_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
         while True:
             self._check_bus()
             left_s = max(0, deadline_ns - self._clock.now_ns()) / 1e9
             try:
                 frame = bus.recv(left_s)
-            except (can.CanError, OSError) as error:
+            except errors as error:
                 raise self._failed(error) from error
             if frame is None:
                 raise self._timeout(timeout_s)
@@ -168,20 +179,21 @@ class PythonCanTransport(CanTransport):
         return self._bus
 
     def _open_bus(self) -> can.BusABC:
+        python_can = _python_can()
         name, channel = self.address.interface, self.address.channel
-        if name not in can.VALID_INTERFACES:
-            raise UnknownNameError("CAN interface", name, sorted(can.VALID_INTERFACES))
+        if name not in python_can.VALID_INTERFACES:
+            raise UnknownNameError("CAN interface", name, sorted(python_can.VALID_INTERFACES))
         if name == "socketcan":
             check_link(channel)
         settings: dict[str, Any] = {} if name in _NOT_SET_HERE else {"bitrate": self.address.bitrate}
         filters: list[Any] = [{"can_id": i, "can_mask": m, "extended": False} for i, m in self._accept]
         try:
-            return can.Bus(
+            bus: can.BusABC = python_can.Bus(
                 interface=name, channel=channel, can_filters=filters or None, ignore_config=True, **settings
             )
         except ValueError as error:
             raise ConfigurationError(f"{self.port}: {error}") from error
-        except (can.CanError, OSError, ImportError) as error:
+        except (python_can.CanError, OSError, ImportError) as error:
             if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
                 raise PortNotFoundError(
                     f"{self.port}: this kernel has no CAN (containers often have none); load the modules "
@@ -191,6 +203,7 @@ class PythonCanTransport(CanTransport):
                 f"{self.port} cannot be opened: {error}; check that the adapter is plugged in, and its "
                 "driver installed"
             ) from error
+        return bus
 
     def _failed(self, error: Exception) -> TransportError:
         code = getattr(error, "error_code", None) or getattr(error, "errno", None)
@@ -202,6 +215,15 @@ class PythonCanTransport(CanTransport):
             f"{self.port}: the bus is lost ({error}); check that the adapter is plugged in, and that `ip "
             "link` shows it up"
         )
+
+
+def _python_can() -> ModuleType:
+    """Return python-can, which an adapter on a serial port (slcan) does not need."""
+    try:
+        import can
+    except ImportError as error:
+        raise MissingExtraError("python-can", "can") from error
+    return can
 
 
 def can_links(root: Path = Path("/sys/class/net")) -> list[str]:

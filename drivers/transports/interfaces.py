@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import array
 import contextlib
-import fcntl
 import socket
-import struct
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+
+import psutil
 
 from deal_hw.errors import PortNotFoundError
-
-_SIOCGIFCONF: Final = 0x8912
-_SIOCGIFFLAGS: Final = 0x8913
-_IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING, _IFF_MULTICAST = 0x1, 0x8, 0x40, 0x1000
-_IFREQ_BYTES: Final = 40
-"""Size of the kernel's ``struct ifreq`` where pointers have 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +40,11 @@ class Interface:
 
 def list_interfaces() -> tuple[Interface, ...]:
     """Return the interfaces of this machine."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        addresses = _addresses(probe)
-        found = []
-        for _, name in socket.if_nameindex():
-            with contextlib.suppress(OSError):  # It vanished after it was listed.
-                found.append(_interface(probe, name, addresses.get(name, ())))
-    return tuple(found)
+    addresses = _addresses()
+    return tuple(
+        _interface(name, set(state.flags.split(",")), addresses.get(name, ()))
+        for name, state in psutil.net_if_stats().items()
+    )
 
 
 def find_interface(port: str) -> Interface:
@@ -81,31 +72,26 @@ def find_interface(port: str) -> Interface:
     return interface
 
 
-def _interface(probe: socket.socket, name: str, addresses: tuple[str, ...]) -> Interface:
-    request = struct.pack("16s24x", name.encode())
-    (flags,) = struct.unpack_from("H", fcntl.ioctl(probe, _SIOCGIFFLAGS, request), 16)
-    carrier = bool(flags & _IFF_RUNNING)
+def _interface(name: str, flags: Set[str], addresses: tuple[str, ...]) -> Interface:
+    carrier = "running" in flags
     with contextlib.suppress(OSError):
         carrier = Path("/sys/class/net", name, "carrier").read_text().strip() == "1"
     return Interface(
         name=name,
         addresses=addresses,
-        up=bool(flags & _IFF_UP),
+        up="up" in flags,
         carrier=carrier,
-        multicast=bool(flags & _IFF_MULTICAST),
-        loopback=bool(flags & _IFF_LOOPBACK),
+        multicast="multicast" in flags,
+        loopback="loopback" in flags,
     )
 
 
-def _addresses(probe: socket.socket) -> dict[str, tuple[str, ...]]:
-    room = array.array("B", bytes(_IFREQ_BYTES * 256))
-    place, length = room.buffer_info()
-    answer = fcntl.ioctl(probe, _SIOCGIFCONF, struct.pack("iP", length, place))
-    (used,) = struct.unpack_from("i", answer)
+def _addresses() -> dict[str, tuple[str, ...]]:
+    """Return the IPv4 addresses of each interface."""
     found: dict[str, tuple[str, ...]] = {}
-    for start in range(0, used, _IFREQ_BYTES):
-        entry = room[start : start + _IFREQ_BYTES].tobytes()
+    for label, addresses in psutil.net_if_addrs().items():
         # A second address of eth0 may stand under a label such as eth0:1.
-        name = entry[:16].split(b"\0")[0].decode().partition(":")[0]
-        found[name] = (*found.get(name, ()), socket.inet_ntoa(entry[20:24]))
+        name = label.partition(":")[0]
+        mine = (entry.address for entry in addresses if entry.family is socket.AF_INET)
+        found[name] = (*found.get(name, ()), *mine)
     return found

@@ -16,6 +16,7 @@ from deal_hw.drivers.transports.arrivals import Arrivals
 from deal_hw.drivers.transports.zenoh_stamps import Echoes
 from deal_hw.errors import (
     ConfigurationError,
+    MissingExtraError,
     PortBusyError,
     PortNotFoundError,
     TransportLostError,
@@ -105,6 +106,7 @@ class ZenohTransport(TopicTransport):
 
         Raises:
             ConfigurationError: The end points cannot be used as they are.
+            MissingExtraError: Zenoh is not installed.
             PortNotFoundError: Nothing listens there, or it is no Zenoh, or there is no such address here.
             PortBusyError: Another process listens there.
             TransportTimeoutError: The host does not answer.
@@ -205,9 +207,12 @@ class ZenohTransport(TopicTransport):
     def _open_session(self) -> zenoh.Session:
         endpoints = zenoh_session.parse_endpoints(self.port)
         zenoh_session.check_security(endpoints, self._options)
+        try:
+            import zenoh
+        except ImportError as error:
+            raise MissingExtraError("eclipse-zenoh", "zenoh") from error
         if not self._options.listen:
             endpoints = zenoh_session.answering(endpoints, self._options)
-        import zenoh
 
         try:
             config = zenoh.Config()

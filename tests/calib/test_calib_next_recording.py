@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,11 @@ from deal_hw.control.excitation_plan import read_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.drivers.go2.descriptions.floor import parameter_space
+from deal_hw.install import install_line
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
+from deal_hw.workflows.shipped import shipped_balancer
 
 
 def result(space: ParameterSpace, verdict: str, std: float = 0.3) -> CalibrationResult:
@@ -61,6 +64,19 @@ def test_what_cannot_be_computed_is_said(episode: SampledEpisode) -> None:
     assert rows[0]["std"] is None
     page = render(ReportInputs(robot="go2", result=dataclasses.replace(found, advice=rows)))
     assert "What to record next" in page and "held by its trunk" in page
+
+
+def test_advice_without_onnxruntime_names_the_extra(
+    episode: SampledEpisode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The motions of the menu begin with a policy that balances; the calibration itself needs none."""
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    found = result(k9_space(), "weak")
+    advice = next_recordings(
+        load_model(DESCRIPTION), found, [episode], balance=shipped_balancer(DESCRIPTION), threads=1
+    )
+    assert [one.parameter for one in advice] == list(found.space.names)
+    assert all(install_line("deploy") in one.sentence for one in advice)
 
 
 def test_advice_survives_the_file(episode: SampledEpisode) -> None:

@@ -368,6 +368,7 @@ def test_a_column_map_that_cannot_be_is_refused(
     ("line", "package", "extra"),
     [
         ("calibrate run/dataset", "threadpoolctl", "calib"),
+        ("design-excitation cartpole --out e.json", "onnxruntime", "deploy"),
         ("data export run/dataset --out o", "pyarrow", "lerobot"),
         ("data import downloaded --out o", "pyarrow", "lerobot"),
     ],

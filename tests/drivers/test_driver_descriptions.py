@@ -263,13 +263,20 @@ def test_cache_that_cannot_be_written_falls_back(tmp_path: Path, monkeypatch: py
     assert ant_model.MODEL.prepared_path({**DEFAULT, "contact.damping_ratio": 0.7}).is_file()
 
 
-def test_humanoid_of_another_dm_control_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file without the expected names is not half prepared, and a missing package names its extra."""
+def test_humanoid_of_another_dm_control_is_refused() -> None:
+    """A file without the expected names is not half prepared."""
     with pytest.raises(ConfigurationError, match=r"dm_control 1\.0"):
         humanoid_model.MODEL.prepare("<mujoco><option/></mujoco>", {"contact.damping_ratio": 0.7})
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match="dm_control is not installed"):
-        humanoid_model.MODEL.prepared_path({})
+
+
+def test_humanoid_file_is_dm_controls_and_whole() -> None:
+    """The copy loads with its includes, has the published numbers, and its licence stands beside it."""
+    published = humanoid_model.MODEL.file()
+    model = mujoco.MjModel.from_xml_path(str(published))
+    assert (model.nq, model.nv, model.nu, model.nbody) == (28, 27, 21, 17)
+    assert model.body_mass.sum() == pytest.approx(40.84, abs=0.01)
+    assert "Apache License" in (published.parent / "LICENSE").read_text(encoding="utf-8")
+    assert "dm_control 1.0.50" in (published.parent / "README.md").read_text(encoding="utf-8")
 
 
 def test_humanoid_touches_the_floor_alone_and_has_no_textures() -> None:
@@ -329,7 +336,7 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
 
 def test_descriptions_load_no_simulator() -> None:
     """Facts are read where neither MuJoCo nor gymnasium is loaded."""
-    names = [n for n in DESCRIPTIONS if n != "humanoid" or importlib.util.find_spec("dm_control")]
+    names = list(DESCRIPTIONS)
     code = (
         "import sys\n"
         "from deal_hw.drivers import parameter_spaces, robot_description\n"

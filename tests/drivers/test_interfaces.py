@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
 import pytest
 
 from deal_hw.drivers.transports import interfaces
@@ -29,6 +34,29 @@ def test_this_machine_has_loopback() -> None:
     assert lo.up
     assert lo.loopback
     assert lo.carrier
+
+
+def test_a_label_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel lists a second address of eth0 under a label such as eth0:1; other families are left out."""
+    four, six, no_flags = socket.AF_INET, socket.AF_INET6, ""
+    address = {
+        "eth0": [
+            SimpleNamespace(family=four, address="10.0.0.2"),
+            SimpleNamespace(family=six, address="fe80::1"),
+        ],
+        "eth0:1": [SimpleNamespace(family=four, address="10.0.1.2")],
+    }
+    stats = {
+        "eth0": SimpleNamespace(flags="up,broadcast,multicast"),
+        "eth1": SimpleNamespace(flags=no_flags),
+    }
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: address)
+    monkeypatch.setattr(psutil, "net_if_stats", lambda: stats)
+    monkeypatch.setattr(Path, "read_text", lambda self: "0\n")
+    assert list_interfaces() == (
+        Interface("eth0", ("10.0.0.2", "10.0.1.2"), up=True, carrier=False, multicast=True, loopback=False),
+        Interface("eth1", (), up=False, carrier=False, multicast=False, loopback=False),
+    )
 
 
 @pytest.mark.usefixtures("machine")

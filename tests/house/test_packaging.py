@@ -44,7 +44,6 @@ BASE_MODULES = (
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
     "deal_hw.drivers.cartpole.can_robot",
-    "deal_hw.drivers.cartpole.dynamixel.connect",
     "deal_hw.drivers.transports.slcan_transport",
     "deal_hw.drivers.go2.doctor",
     "deal_hw.drivers.go2.descriptions.driver",
@@ -61,14 +60,17 @@ EXTRAS = (
     "onnx",
     "onnxscript",
     "matplotlib",
-    "psutil",
     "pytest",
     "hypothesis",
     "cryptography",
     "cyclonedds",
     "zenoh",
+    "can",
+    "cantools",
+    "dynamixel_sdk",
+    "dynamixel_easy_sdk",
+    "onnxruntime",
 )
-"""Zenoh comes with the base install, but only a robot that is reached over it needs it loaded."""
 
 IMPORT_BASE = """
 import importlib, json, sys
@@ -279,7 +281,23 @@ def test_versions_agree() -> None:
     assert project()["project"]["version"] == __version__  # type: ignore[index]
 
 
-def test_the_wires_of_the_cart_pole_add_little_to_the_base_install() -> None:
+def test_the_extra_robot_is_the_four_of_a_robots_computer() -> None:
+    """Wires and the policy's runtime have extras; `robot` and `all` have these, the base install has none."""
+    extras = project()["project"]["optional-dependencies"]  # type: ignore[index]
+    wanted = {re.split("[><=;]", entry)[0] for entry in project()["project"]["dependencies"]}  # type: ignore[index]
+    parts = {
+        "can": "python-can",
+        "dynamixel": "dynamixel-sdk",
+        "zenoh": "eclipse-zenoh",
+        "deploy": "onnxruntime",
+    }
+    assert extras["robot"] == [f"deal-hw[{','.join(parts)}]"]
+    assert all(extras[extra][0].startswith(package) for extra, package in parts.items())
+    assert not wanted & {*parts.values(), "cantools"}
+    assert "robot" in re.split(r"[\[\],]", extras["all"][0])
+
+
+def test_the_can_wires_of_the_cart_pole_are_small() -> None:
     """python-can, cantools and what they need take less than 15 MB (measured: 5.5 MB)."""
     named = {"python-can", "cantools", "bitstruct", "crccheck", "textparser", "argparse-addons", "wrapt"}
     sizes = {}
@@ -289,5 +307,3 @@ def test_the_wires_of_the_cart_pole_add_little_to_the_base_install() -> None:
         sizes[name] = sum(path.stat().st_size for path in paths if path.is_file())
     assert all(sizes.values())
     assert sum(sizes.values()) < 15e6, sizes
-    wanted = project()["project"]["dependencies"]  # type: ignore[index]
-    assert {"python-can", "cantools"} <= {re.split("[><=]", entry)[0] for entry in wanted}

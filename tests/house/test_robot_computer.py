@@ -1,7 +1,8 @@
-"""The robot's own computer has the base install only: its verbs run there without the extras."""
+"""The robot's own computer has `deal-hw[robot]`, or the base install: its verbs run there without more."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import os
@@ -17,6 +18,7 @@ from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.install import install_line
 from deal_hw.policies.onnx_runtime import SPEC_KEY
+from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
@@ -32,13 +34,16 @@ EXTRAS = (
     "pyarrow",
     "cyclonedds",
 )
-REFUSE = f"""
+"""Packages that `deal-hw[robot]` does not install."""
+OF_ROBOT = ("can", "cantools", "dynamixel_sdk", "dynamixel_easy_sdk", "zenoh", "onnxruntime")
+"""Packages of `deal-hw[robot]` that the base install lacks."""
+REFUSE = """
 import sys
 
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {EXTRAS!r}:
-            raise ModuleNotFoundError(f"{{name}} is refused", name=name)
+        if name.partition(".")[0] in REFUSED:
+            raise ModuleNotFoundError(f"{name} is refused", name=name)
 
 sys.meta_path.insert(0, Refuse())
 """
@@ -117,11 +122,14 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def run_bare(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the command where no process, the command's own children included, can load an extra."""
+def run_bare(
+    tmp_path: Path, *arguments: str, refused: tuple[str, ...] = EXTRAS
+) -> subprocess.CompletedProcess[str]:
+    """Run the command where no process, the command's own children included, can load these packages."""
     (tmp_path / "refuse").mkdir(exist_ok=True)
     # Python imports a module of this name at every start, before anything else.
-    (tmp_path / "refuse" / "sitecustomize.py").write_text(REFUSE, encoding="utf-8")
+    text = f"REFUSED = {refused!r}\n{REFUSE}"
+    (tmp_path / "refuse" / "sitecustomize.py").write_text(text, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "refuse")}
     return subprocess.run(
         [sys.executable, "-m", "deal_hw", *arguments],
@@ -164,6 +172,49 @@ def test_collect_runs_without_extras(tmp_path: Path, port: str) -> None:
     assert told.returncode == 0, told.stderr
 
 
+def test_the_base_install_records_checks_and_converts(tmp_path: Path, port: str) -> None:
+    """Over a serial port; recordings are shown and verified; a CSV file becomes a dataset."""
+    run = functools.partial(run_bare, tmp_path, refused=EXTRAS + OF_ROBOT)
+    words = ("--port", port, "--motion", "chirp", "--seconds", "1", "--out", "run")
+    done = run("collect", "cartpole", *words)
+    assert done.returncode in {FINISHED, TRIPPED}, done.stderr
+    assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
+    for verb in ("info", "verify"):
+        told = run("data", verb, "run/dataset")
+        assert told.returncode == 0, told.stdout + told.stderr
+    _, (recording, *_), _ = write(make_robot("pendulum", seed=0), tmp_path / "robot", seconds=3.0)
+    told = run("data", "import", str(recording), "--out", "imported")
+    assert told.returncode == 0, told.stdout + told.stderr
+    assert "fit1" in run("data", "info", "imported").stdout
+    examined = run("doctor", "cartpole", "--port", port, "--seconds", "0.5")
+    assert "states a second" in examined.stdout, examined.stdout + examined.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        ("deploy cartpole --port PORT --policy POLICY", "deploy"),
+        ("deploy cartpole --port PORT", "deploy"),
+        ("collect cartpole --port PORT --seconds 4 --out run", "deploy"),
+        ("collect cartpole --transport can --port slcan:PORT --motion hold --out run", "can"),
+        ("collect cartpole --transport odrive --port virtual:bus --motion hold --out run", "can"),
+        ("collect cartpole --transport dynamixel --port PORT --motion hold --out run", "dynamixel"),
+        ("collect go2 --transport zenoh --port tcp/127.0.0.1:1 --motion hold --out run", "zenoh"),
+        ("deploy go2 --transport zenoh --port tcp/127.0.0.1:1", "deploy"),
+    ],
+)
+def test_the_base_install_names_the_extra_that_is_missing(
+    tmp_path: Path, port: str, policy: Path, words: str, extra: str
+) -> None:
+    """One line that says what to install; no robot was moved, and no network is called broken."""
+    line = words.replace("PORT", port).replace("POLICY", str(policy)).split()
+    done = run_bare(tmp_path, *line, refused=EXTRAS + OF_ROBOT)
+    assert done.returncode == 2, done.stderr
+    assert install_line(extra) in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").exists()
+
+
 def test_deploy_runs_without_extras(tmp_path: Path, port: str, policy: Path) -> None:
     """An ONNX policy runs and is recorded, and its recording replays."""
     robot = ("--port", port, "--out", "run")
@@ -200,7 +251,7 @@ def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, por
 
 @pytest.mark.slow
 def test_go2_runs_without_extras(tmp_path: Path) -> None:
-    """Collect and doctor reach a Go2 over Zenoh with the base install: all processes of a run included."""
+    """Collect and doctor reach a Go2 over Zenoh with `deal-hw[robot]`: all processes of a run included."""
     options = ("--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--profile", "ideal", "--nominal")
     posture = ("--fold-s", "0.3", "--rise-s", "0.6", "--lie-s", "0.6")
     with EmulatorProcess("go2", *options) as emulator:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import select
 import signal
 import subprocess
@@ -25,7 +26,9 @@ from deal_hw.drivers.ant.description import DESCRIPTION as ANT
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
-from deal_hw.errors import PolicyError, PolicyMismatchError
+from deal_hw.drivers.so101.description import DESCRIPTION as SO101
+from deal_hw.errors import MissingExtraError, PolicyError, PolicyMismatchError
+from deal_hw.install import install_line
 from deal_hw.policies import onnx_runtime
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import OnnxPolicy
@@ -33,7 +36,7 @@ from deal_hw.policies.trial import TrialPolicy, TrialSettings, check_policy
 from deal_hw.policies.trial_states import ProbeStates
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.workflows.running.plan import RunPlan, check_plan, make_behaviour
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import balancer, shipped_balancer, shipped_policy
 
 SPEC = feedback_spec(CARTPOLE)
 BRIEF = TrialSettings(nominal=2, random=5)
@@ -338,3 +341,26 @@ def test_states_of_a_trial_are_such_as_the_robot_can_have(description: RobotDesc
             upright = 1 - 2 * (body.orientation[1] ** 2 + body.orientation[2] ** 2)
             assert np.arccos(np.clip(upright, -1, 1)) <= limits.legs.tilt + 1e-9
             assert np.abs(body.angular_velocity).max() <= limits.legs.tumble
+
+
+def test_without_onnxruntime_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before a process is started. The balancing that calibration may need asks for it at the first call."""
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    words = "onnxruntime is not installed.*" + re.escape(install_line("deploy"))
+    with pytest.raises(MissingExtraError, match=words):
+        check_policy(Path(str(shipped_policy("cartpole"))), CARTPOLE, BRIEF)
+    with pytest.raises(MissingExtraError, match=words):
+        balancer(CARTPOLE, None)
+    make = shipped_balancer(CARTPOLE)
+    assert make is not None
+    with pytest.raises(MissingExtraError, match=words):
+        make()
+
+
+def test_the_shipped_balancing_is_made_at_the_first_call() -> None:
+    """A new behaviour each time; no policy is shipped for the arm."""
+    make = shipped_balancer(CARTPOLE)
+    assert make is not None
+    first, second = make(), make()
+    assert isinstance(first, PolicyBehaviour) and first is not second
+    assert shipped_balancer(SO101) is None

@@ -12,7 +12,6 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import deal_hw.workflows.environments  # noqa: F401  registers the tasks
-from deal_hw.errors import MissingExtraError
 
 STEPS = 5
 """Steps of the training that goes on: each costs the gradient steps of a whole batch."""
@@ -24,13 +23,8 @@ def main(model: Path) -> None:
     with warnings.catch_warnings():
         # Observations have no bounds, and nothing is rendered.
         warnings.simplefilter("ignore")
-        for name in list(names):
-            try:
-                env = gymnasium.make(name).unwrapped
-            except MissingExtraError as err:  # The humanoid's model has no wheel for Python 3.13.
-                names.remove(name)
-                print(f"{name} is left out: {err}")
-                continue
+        for name in names:
+            env = gymnasium.make(name).unwrapped
             check_env(env, skip_render_check=True)
             sb3_check_env(env)
             batch = gymnasium.make_vec(name, num_envs=3)

@@ -23,7 +23,7 @@ from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.calibration.walking import all_walk, weighed, while_walking
 from deal_hw.workflows.robot import recorded_robot
 from deal_hw.workflows.say import Say, silent
-from deal_hw.workflows.shipped import balancer
+from deal_hw.workflows.shipped import shipped_balancer
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
@@ -87,7 +87,7 @@ def prepare_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Sa
             "holdout": list(holdout),
         },
         advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {folder}",
-        balance=balancer(robot.description, None),
+        balance=shipped_balancer(robot.description),
         name="" if robot.base is not None else robot.description.name,
         policy=policy,
         walks=walks,

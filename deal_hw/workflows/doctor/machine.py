@@ -17,16 +17,17 @@ from deal_hw.findings import Finding, Level
 from deal_hw.install import install_line
 
 PACKAGES: Final = (
-    ("eclipse-zenoh", ""),
+    ("eclipse-zenoh", "zenoh"),
     ("cyclonedds", "dds"),
     ("mujoco", "sim"),
     ("torch", "calib"),
     ("rerun-sdk", "viz"),
-    ("onnxruntime", ""),
-    ("python-can", ""),
-    ("cantools", ""),
+    ("onnxruntime", "deploy"),
+    ("python-can", "can"),
+    ("cantools", "can"),
+    ("dynamixel-sdk", "dynamixel"),
 )
-"""Distribution, extra that installs it ("": the base install)."""
+"""Distribution, extra that installs it."""
 _LEAST_LOCK_BYTES: Final = 512 << 20
 _COARSE_S: Final = 1e-5
 _LEAST_RECEIVE_BYTES: Final = 200_000
@@ -54,11 +55,9 @@ def _packages() -> Iterator[Finding]:
     for name, extra in PACKAGES:
         if version := _version(name):
             yield Finding("packages", Level.OK, f"{name} {version}")
-        elif extra:
+        else:
             hint = f"if this computer needs it: {install_line(extra)}"
             yield Finding("packages", Level.NOTE, f"{name} is not installed", hint)
-        else:
-            yield Finding("packages", Level.FAIL, f"{name} is not installed", install_line())
 
 
 def _version(name: str) -> str:

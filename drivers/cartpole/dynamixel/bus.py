@@ -13,11 +13,9 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from dynamixel_sdk import COMM_SUCCESS, PacketHandler
-from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
-
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.dynamixel.registers import Register
+from deal_hw.drivers.cartpole.dynamixel.sdk import COMM_SUCCESS, PacketHandler, Protocol2PacketHandler
 from deal_hw.errors import FrameError, ProtocolError, TransportTimeoutError
 from deal_hw.transport import Message, Transport
 

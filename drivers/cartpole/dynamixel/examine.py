@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from dynamixel_easy_sdk.control_table import ControlTable
-from dynamixel_easy_sdk.dynamixel_error import DxlRuntimeError
-
 from deal_hw.clock import Clock
 from deal_hw.documentation import page
 from deal_hw.drivers.cartpole.dynamixel.bus import Answer, Bus
@@ -31,6 +28,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     TORQUE_ENABLE,
     Register,
 )
+from deal_hw.drivers.cartpole.dynamixel.sdk import ControlTable, DxlRuntimeError
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.errors import (
     ConfigurationError,
