@@ -23,7 +23,6 @@ REAL_TIME = (
     "control/",
     "data/test_data_recorder_process",
     "drivers/",
-    "house/test_reproductions",
     "house/test_robot_computer",
     "tools/",
     "workflows/",

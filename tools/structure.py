@@ -1,4 +1,4 @@
-"""Count lines, rooms, imports, circles and constants of a checkout, before and after a rebuild.
+"""Count lines, rooms, imports, circles and constants of a checkout, also beside those of an earlier one.
 
     python tools/structure.py                                  # this checkout, folder calib
     python tools/structure.py --root ../old --json old.json    # another checkout, counted by this tool

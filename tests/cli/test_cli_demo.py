@@ -8,6 +8,7 @@ import functools
 import json
 import os
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,12 +25,16 @@ from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.demo import Demo, Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy
+from deal_hw.cli.main import main
 from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
+from deal_hw.control.process_channel import RUNNING, Beat
+from deal_hw.control.supervisor import Supervisor
 from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
 
@@ -226,6 +231,25 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     assert capsys.readouterr().err.count("it is made again") == 1
     late = deployed(lambda _: run_of(ended(0, *OLD)), 1, "deployment")
     assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_the_first_recording_ends_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exit code 130, and the robot is not armed again for a second recording."""
+    made = 0
+
+    def press(beat: Beat) -> None:
+        if beat.phase == RUNNING and beat.count == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    class Pressed(Supervisor):
+        def __init__(self, **settings: Any) -> None:
+            nonlocal made
+            made += 1
+            super().__init__(**{**settings, "on_beat": press})
+
+    monkeypatch.setattr(episode, "Supervisor", Pressed)
+    assert (main(["demo", "--out", str(tmp_path / "demo")]), made) == (130, 1)
 
 
 @pytest.mark.parametrize("on_stand", [False, True])

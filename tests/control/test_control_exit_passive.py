@@ -419,7 +419,7 @@ class Hung:
 
 
 def test_a_go2_whose_link_drops_while_the_run_ends_is_damped_once_it_is_back() -> None:
-    """On commit d5a5f8c ten attempts were used up in no time, and the robot stayed stiff for good."""
+    """The passive command is repeated by the clock: a number of attempts would be used up at once."""
     rig = Hung()
     cut_ns = 0
 

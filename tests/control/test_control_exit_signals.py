@@ -337,7 +337,7 @@ def test_every_pair_of_signals_in_every_phase_ends_with_a_damped_robot(
 def test_a_stop_at_any_line_of_the_loop_ends_with_a_damped_robot(
     controlled: Callable[[], Controlled],
 ) -> None:
-    """Also in the lines that answer an error: on befe5678 such a stop left damping to the supervisor."""
+    """Also in the lines that answer an error: such a stop must not leave damping to the supervisor."""
     lines, code = set[int](), ControlLoop.run.__code__
 
     def traced(stop_at: int) -> tuple[Controlled, LoopReport]:
@@ -408,7 +408,7 @@ def test_the_supervisor_is_dead_or_silent_only_if_it_is(
     reason: str,
     last_resort: bool,
 ) -> None:
-    """On commit befe5678 SIGUSR1 of anybody read "the supervisor died"."""
+    """SIGUSR1 of another program is not taken for the death of the supervisor."""
     timers: list[float] = []
     monkeypatch.setattr(control_process, "kill_self_after", timers.append)
     monkeypatch.setattr(control_process, "parent_is_gone", lambda pid: gone)
@@ -464,7 +464,7 @@ def test_every_pair_of_signals_asks_once_and_kills_only_later(monkeypatch: pytes
 
 
 def test_no_signal_ends_the_supervisors_own_damping() -> None:
-    """Hundreds, while the robot does not confirm for 2 s; on befe5678 the fourth Ctrl-C gave up."""
+    """Hundreds, while the robot does not confirm for 2 s; no number of them ends the passive command."""
     bench = FakeBench(Go2OnStandRobot, mode="")
     robot = bench.armed()
     supervisor = Supervisor(module="m", plan={}, port_fd=None, passive=lambda phase, in_vain: True)

@@ -217,7 +217,7 @@ def test_the_operators_late_second_wish_kills(
 
 
 def test_requests_at_once_are_one_request() -> None:
-    """An ending session sends SIGTERM and SIGHUP; a held key repeats. On befe5678 the second killed."""
+    """An ending session sends SIGTERM and SIGHUP; a held key repeats. The second must not kill."""
 
     def storm(run: Run, beat: Beat) -> None:
         for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGINT):

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from fakes.logind import FakeLogind
 
+from deal_hw.cli.show import Terminal
 from deal_hw.control.loop import Outcome
 from deal_hw.control.planned_end import ENDING_EVENT
 from deal_hw.control.posture import PostureConfig
@@ -71,6 +72,7 @@ class Rig:
             dataset=folder,
             episodes=1,
             purpose="collect",
+            view=Terminal(quiet=False),
             on_beat=on_beat,
         )
 
@@ -133,9 +135,13 @@ def finished(rig: Rig, tmp_path: Path) -> tuple[Path, RunReport]:
     return folder, report
 
 
-def test_a_go2_stands_up_holds_and_lies_down(rig: Rig, tmp_path: Path) -> None:
+def test_a_go2_stands_up_holds_and_lies_down(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Over the network into a dataset: every command, every state with its body, and damping at the end."""
     folder, report = finished(rig, tmp_path)
+    # What deal-hw cannot help, such as the death of both its processes, is said at the start.
+    assert "holds its last command" in capsys.readouterr().err
     told = rig.finish()
     (episode,) = report.episodes
     assert (episode.outcome, episode.error) == (Outcome.FINISHED, ""), episode.reason
@@ -205,7 +211,7 @@ def test_the_end_key_lays_the_robot_down(rig: Rig, tmp_path: Path, monkeypatch: 
 def test_a_session_that_ends_leaves_the_robot_damped(
     rig: Rig, tmp_path: Path, numbers: tuple[signal.Signals, ...]
 ) -> None:
-    """A lost ssh connection, under systemd: to all processes. On befe5678 it stood stiff for ever, 6 of 6."""
+    """A lost ssh connection, under systemd: to all processes."""
 
     def hang_up() -> None:
         children = Path(f"/proc/self/task/{threading.get_native_id()}/children").read_text().split()

@@ -181,7 +181,7 @@ def test_a_killed_bridge_damps_when_it_is_back(rig: BridgeRig) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGALRM])
 def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig, number: signal.Signals) -> None:
-    """While a controller holds the robot; on befe5678 all but SIGTERM ended or stopped it without damping."""
+    """While a controller holds the robot: each signal that ends or stops the bridge damps the robot first."""
     with BridgeClient(rig.port, rig.options("controller")) as client:
         client.take_over()
         told = rig.commands()

@@ -518,6 +518,12 @@ def test_the_robot_on_a_stand_is_another_description() -> None:
     assert robot.description.stiffness == (20.0,) * 12
 
 
+def test_a_lost_connection_speaks_of_no_watchdog() -> None:
+    """The Go2 has none: it holds its last command, and only somebody beside it can stop it."""
+    said = FakeBench(mode="").robot.if_cut
+    assert "watchdog" not in said and "still holds its last command" in said and "remote" in said
+
+
 def test_recorded_bytes_can_be_decoded_again() -> None:
     """Raw messages of both directions, as they were on the wire."""
     wire = FakeBench(mode="")
