@@ -84,8 +84,10 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     )
     assert "cart.mass" in end and "latency" in end and end.count("estimates of the calibration") == 1
     inspect, page = end.strip().splitlines()[-2:]
-    assert (
-        inspect == f"deal-hw inspect {folder}/dataset/episodes/000000.mcap --calibration {folder}/calibration"
+    # A recording that tripped on a busy computer is made again, as the next episode.
+    recorded = rf"{re.escape(str(folder))}/dataset/episodes/\d{{6}}\.mcap"
+    assert re.fullmatch(
+        rf"deal-hw inspect {recorded} --calibration {re.escape(str(folder))}/calibration", inspect
     )
     assert Path(inspect.split()[2]).is_file() and Path(page.removeprefix("python3 -m webbrowser ")).is_file()
 
