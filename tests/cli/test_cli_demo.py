@@ -38,6 +38,8 @@ from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
 
+pytestmark = pytest.mark.real_time
+
 
 def beside_in_short(config: Calibrate) -> CalibrateReport:
     """Calibrate; the search beside it, whose estimates are only noted, gets 20 members and 4 generations."""

@@ -15,6 +15,8 @@ from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.settings import LinkOptions
 
+pytestmark = pytest.mark.real_time
+
 LINK = LinkOptions(transport="dynamixel")
 PATIENT = "?answer_s=0.02"
 """A busy machine may take its time; a whole run is not a measurement."""

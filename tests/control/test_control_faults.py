@@ -17,7 +17,7 @@ import pytest
 
 from deal_hw.install import install_line
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 TYPICAL_S = {"connecting": 2.0, "taking over": 0.5}

@@ -10,6 +10,8 @@ import pytest
 
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
+pytestmark = pytest.mark.real_time
+
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 pytest.importorskip("mujoco", reason="pip install 'deal-hw[sim]'")
 

@@ -22,6 +22,8 @@ from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
+pytestmark = pytest.mark.real_time
+
 EXTRAS = (
     "torch",
     "mujoco",

@@ -22,6 +22,8 @@ from deal_hw.workflows import stop as module
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.stop import StopSettings, _claimed, stop
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 60.0
 HOLDER = """
 import sys, time
