@@ -46,14 +46,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with what lasts longest: tests in real time, then the files with the most slow tests.
 
-    The controller sees node ids and no markers, so a worker writes the marker into the id, as pytest-xdist does
-    for its own groups.
+    The controller sees node ids and no markers. So a worker writes the marker into the id, like the groups of
+    pytest-xdist.
     """
     if hasattr(config, "workerinput"):
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
         items.sort(key=lambda item: (not in_real_time(item), -slow[item.path]))
         for item in filter(in_real_time, items):
-            item._nodeid += GROUP
+            item._nodeid += GROUP  # type: ignore[attr-defined, unused-ignore]
 
 
 computing = False

@@ -237,7 +237,6 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
 
 
-@pytest.mark.slow
 def test_ctrl_c_in_the_first_recording_ends_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit code 130, and the robot is not armed again for a second recording."""
     made = 0

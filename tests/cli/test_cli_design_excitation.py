@@ -53,6 +53,7 @@ def optimal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_optimal_is_written_with_what_it_will_tell(optimal: Path) -> None:
     """The file holds a plan for this robot and a predicted spread for each of the nine parameters."""
     plan = read_plan(optimal)
