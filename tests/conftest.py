@@ -1,8 +1,13 @@
 """What holds for all tests."""
 
+import functools
+import json
 import os
+import shutil
 import signal
+import tempfile
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,9 +22,6 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
 
-GROUP = "@real_time"
-"""Added to the node id of a test in real time, by which pytest-xdist's controller knows it."""
-
 NICE = 10
 """Added to the niceness of a worker that computes: tests in real time get their cores at once."""
 
@@ -30,13 +32,29 @@ def in_real_time(item: pytest.Item) -> bool:
 
 
 @pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Tell a worker of pytest-xdist where to list its tests in real time: the controller sees no markers."""
+    folder = Path(tempfile.gettempdir()) / f"deal_hw_tests_{node.workerinput['testrunuid']}"
+    folder.mkdir(exist_ok=True)
+    node.workerinput["real_time_to"] = str(folder / node.workerinput["workerid"])
+
+
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Under pytest-xdist one worker gets all tests in real time, and others get whole files."""
     from xdist.scheduler import LoadScopeScheduling
 
     class Scheduling(LoadScopeScheduling):  # type: ignore[misc, unused-ignore]
+        @functools.cached_property
+        def _real_time(self) -> frozenset[str]:
+            """By one worker's list: all collect the same tests. The lists are not needed again."""
+            files = [Path(node.workerinput["real_time_to"]) for node in self.registered_collections]
+            found = frozenset(json.loads(files[0].read_text(encoding="utf-8")))
+            shutil.rmtree(files[0].parent)
+            return found
+
         def _split_scope(self, nodeid: str) -> str:
-            return GROUP if nodeid.endswith(GROUP) else nodeid.partition("::")[0]
+            return "real time" if nodeid in self._real_time else nodeid.partition("::")[0]
 
     config.option.loadscopereorder = False  # the order is that of pytest_collection_modifyitems
     return Scheduling(config, log)
@@ -44,16 +62,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with what lasts longest: tests in real time, then the files with the most slow tests.
-
-    The controller sees node ids and no markers. So a worker writes the marker into the id, like the groups of
-    pytest-xdist.
-    """
+    """Begin with what lasts longest: tests in real time, then the files with the most slow tests."""
     if hasattr(config, "workerinput"):
         slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
         items.sort(key=lambda item: (not in_real_time(item), -slow[item.path]))
-        for item in filter(in_real_time, items):
-            item._nodeid += GROUP  # type: ignore[attr-defined, unused-ignore]
+        names = [item.nodeid for item in items if in_real_time(item)]
+        Path(config.workerinput["real_time_to"]).write_text(json.dumps(names), encoding="utf-8")
 
 
 computing = False

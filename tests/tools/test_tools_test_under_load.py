@@ -16,13 +16,13 @@ def test_failures_are_read_from_the_summary() -> None:
     """With and without a message; a parameter may have spaces; an error of the set-up counts."""
     said = (
         "FAILED tests/a.py::test_one[a b] - assert 1 == 2 - 1\n"
-        "FAILED tests/a.py::test_two@real_time\n"
+        "FAILED tests/a.py::test_two\n"
         "ERROR tests/b.py - ImportError\n"
         "2 failed, 1 passed, 1 error in 0.1s\n"
     )
     assert test_under_load.failures(said) == [
         "tests/a.py::test_one[a b]",
-        "tests/a.py::test_two@real_time",
+        "tests/a.py::test_two",
         "tests/b.py",
     ]
 
