@@ -55,7 +55,7 @@ Act = Callable[[Any, WatchedWire, FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong as the policy is asked, how the run ends, and when the motor is off at the latest [ms]."""
+    """What goes wrong as the policy is asked, how the run ends, and the latest end of torque [ms]."""
 
     act: Act
     outcome: Outcome
