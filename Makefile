@@ -19,7 +19,7 @@ SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test dds-peer avr-tools arm-tools firmware firmware-arm check dist docs coverage-safety mutation bench typing format clean
+.PHONY: help setup demo test test-slow test-peers dds-peer avr-tools arm-tools firmware firmware-arm check dist docs coverage-safety mutation bench typing format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -45,11 +45,17 @@ demo: $(STAMP) ## the whole loop on an emulated cart-pole
 # OpenMP a process: with more, the workers' threads wait for each other on two cores. Three workers: the one with the
 # tests in real time (tests/conftest.py) mostly waits, and the two that compute give way to it. Bytecode is written even
 # where the environment forbids it: else each worker compiles all tests, and each of some hundred processes the package.
-test: $(STAMP) ## all tests that need no robot
+PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3
+test: $(STAMP) test-peers ## all tests that need no robot, but the slow ones
+	$(PYTEST) -m 'not slow' $(PYTEST_ARGS)
+
+test-slow: $(STAMP) test-peers ## the other tests: long searches and calibrations, and the fault rows of the Go2
+	$(PYTEST) -m slow $(PYTEST_ARGS)
+
+test-peers:
 	@tools/build_dds_peer.sh || true
 	@tools/install_avr_tools.sh || true
 	@tools/install_arm_tools.sh || true
-	env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 $(PYTEST_ARGS)
 
 dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 	@tools/build_dds_peer.sh

@@ -154,11 +154,11 @@ def second_run(elsewhere: bool = False) -> Callable[[Rig], None]:
         second = rig.launch("second", rig.process.port if elsewhere else "")
         begun = time.monotonic()
         try:
-            code = second.wait(30.0)
+            code = second.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             second.kill()
             code = second.wait()
-            rig.notes.append("the second run was not refused within 30 s")
+            rig.notes.append(f"the second run was not refused within {PATIENCE_S:g} s")
         rig.notes += [] if code == 2 else [f"the second run ended with {code}"]
         text = (rig.folder / "out" / "second").read_text()
         rig.notes += [] if "in use" in text else [f"the second run said {headline(text)!r}"]

@@ -113,6 +113,7 @@ def test_ratios() -> None:
             parse_ratios(text)
 
 
+@pytest.mark.slow
 def test_honest_rows_for_every_task(tmp_path: Path) -> None:
     """Cells are tasks by methods; no-data baselines score the centre's error everywhere."""
     out = tmp_path / "honest.json"

@@ -69,6 +69,7 @@ def settings(base: Path, out: Path, **more: Any) -> Bench:
     return Bench(bench="transfer", **{**values, **more})
 
 
+@pytest.mark.slow
 def test_every_row_is_a_fine_tune_of_one_policy_and_none_is_run_twice(
     base: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,6 +111,7 @@ def test_every_row_is_a_fine_tune_of_one_policy_and_none_is_run_twice(
     assert bench(settings(base, out)) == 0 and len(trained) == 1
 
 
+@pytest.mark.slow
 def test_a_base_policy_is_trained_once_and_a_stopped_training_goes_on(
     base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -119,6 +119,7 @@ def test_robots_and_faults_are_chosen_by_name() -> None:
         cells([7], [], ["wobble"])
 
 
+@pytest.mark.slow
 def test_a_right_pendulum_ends_green(monkeypatch: pytest.MonkeyPatch) -> None:
     """Calibrated from CSV and MJCF as a user would: truths in the intervals, no search, said in one line."""
 

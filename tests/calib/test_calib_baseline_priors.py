@@ -54,6 +54,7 @@ def found(
     return float(result.estimate[k] / searched.nominal[k]), float(np.sqrt(result.covariance[k, k]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_priors_count(name: str, episode: SampledEpisode) -> None:
     """Nothing for a vague one; a tight one wins; one as sharp as the data meets them half way."""

@@ -27,6 +27,7 @@ from deal_hw.types import FloatArray
 Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
 
 
+@pytest.mark.slow
 class TestBo(MethodSuite):
     """`bo` on the trajectory error: within 25 %."""
 
@@ -147,6 +148,7 @@ def test_what_is_forgotten_would_never_be_seen_again() -> None:
     assert search.scored == len(points) == 8 + 29 * 3
 
 
+@pytest.mark.slow
 def test_a_critic_scores_earlier_members_again_and_resumes(small_problem: Callable[..., Problem]) -> None:
     """The paper's row: every generation has the budget's population; resumed after two, the same end."""
     budget, method = Budget(population=8, generations=3), critic_return()

@@ -33,6 +33,7 @@ def fine(noisy: Case) -> Problem:
     return whole.part([time_s < 2.5])
 
 
+@pytest.mark.slow
 def test_a_channel_finer_than_the_model_is_weighted_by_what_the_model_leaves(
     fine: Problem, noisy: Case
 ) -> None:

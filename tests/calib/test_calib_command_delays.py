@@ -207,6 +207,7 @@ def jittering() -> Case:
     return _jittering(0)
 
 
+@pytest.mark.slow
 def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     """Latency, its interval, parameters and the noise; one constant delay leaves a chi2 above 2."""
     # Those that late commands move most; the others are known.
@@ -234,6 +235,7 @@ def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     assert more_delays is not None and more_delays.theta.shape == (len(space) + 1,)
 
 
+@pytest.mark.slow
 def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     """Friction that is 40 % larger at standstill moves the latency by 6 ms; the delays vary by 1.1 ms.
 

@@ -32,6 +32,7 @@ def sensed() -> Case:
     return make_case("go2", "sensor", 0, 3.0)
 
 
+@pytest.mark.slow
 def test_smoothed_start_states_settle_to_the_noise(
     sensed: Case, beginning: Beginning, three_unknown: Known
 ) -> None:
@@ -49,6 +50,7 @@ def test_smoothed_start_states_settle_to_the_noise(
     assert correlation_time(normal.residual) < MISMATCH.correlation_samples
 
 
+@pytest.mark.slow
 def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three_unknown: Known) -> None:
     """From eight percent off the residual becomes noise, and the parameters come back."""
     space, truth = three_unknown(sensed.space, sensed.theta)

@@ -55,6 +55,7 @@ def test_given_parameters_get_start_states(noisy: Case, noisy_problem: Problem) 
     assert there.chi2 < 1.3 and not unexplained(there)
 
 
+@pytest.mark.slow
 def test_unexplained_data_keep_the_refinement_and_are_diagnosed(
     small_problem: Callable[..., Problem],
 ) -> None:
@@ -95,6 +96,7 @@ def test_huber_weights_by_hand() -> None:
     assert kurtosis([np.array([1.0, 0.0, 0.0, -1.0, 0.0])]) == 1.0
 
 
+@pytest.mark.slow
 def test_robust_fit_shrugs_off_wild_samples(
     noisy: Case, noisy_problem: Problem, noisy_refined: Refined
 ) -> None:

@@ -426,6 +426,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | No
     return make
 
 
+@pytest.mark.slow
 def test_a_right_model_has_no_cause(truth: Callable[[str, Fault | None], Truth]) -> None:
     """Neither a signature, nor a delay, nor play predicts left-out windows better."""
     _, problem, fit = truth("pendulum", None)
@@ -433,6 +434,7 @@ def test_a_right_model_has_no_cause(truth: Callable[[str, Fault | None], Truth])
     assert find_play(problem, fit) is None
 
 
+@pytest.mark.slow
 def test_faults_of_a_simulated_robot_are_named(truth: Callable[[str, Fault | None], Truth]) -> None:
     """Stribeck friction, and commands that are late by up to twice the mean delay."""
     _, problem, fit = truth("pendulum", "friction")
@@ -466,6 +468,7 @@ def test_play_behind_the_motors_encoder_is_named(truth: Callable[[str, Fault | N
     assert not any(f.cause == "mass" for f in found)
 
 
+@pytest.mark.slow
 def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Truth]) -> None:
     """The last link weighs 50 % more."""
     _, problem, fit = truth("double-pendulum", "mass")
@@ -476,6 +479,7 @@ def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Trut
     assert known.alarms and with_causes(problem, fit, known, found)[0].alarms[0] == found[0].alarm
 
 
+@pytest.mark.slow
 def test_another_minimum_is_no_play(truth: Callable[[str, Fault | None], Truth]) -> None:
     """A right model, and a local fit that ended elsewhere: the wider fit finds the truth, without play."""
     _, problem, fit = truth("pendulum", None)
@@ -497,6 +501,7 @@ def test_half_of_two_recordings_is_a_part(small_problem: Callable[..., Problem])
     assert sum(map(np.count_nonzero, left_out)) >= 200
 
 
+@pytest.mark.slow
 def test_play_is_found_and_measured(
     truth: Callable[[str, Fault | None], Truth], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -517,6 +522,7 @@ def test_play_is_found_and_measured(
     assert cause.share > diagnosis.SETTINGS.decisive
 
 
+@pytest.mark.slow
 def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault | None], Truth]) -> None:
     """No search follows; the result has the play, the true values, and one alarm."""
     robot, problem, _ = truth("pendulum", "backlash")
@@ -545,6 +551,7 @@ def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault 
     np.testing.assert_array_equal(asked.distribution().mean, result.distribution().mean[:-1])
 
 
+@pytest.mark.slow
 def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Path) -> None:
     """A rotor of 0.01 kg m^2 behind a pendulum of 0.0075; the model has none, so nothing searches it."""
     robot = make_robot("pendulum", 3)

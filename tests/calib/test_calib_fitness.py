@@ -129,6 +129,7 @@ def test_replay_that_is_forgotten_is_not_saved(problem: Problem) -> None:
         assert len(fitness.save()["_replay"]) == kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trajectory", "energy", "mmd"])
 def test_deal_paper_takes_another_fitness(problem: Problem, name: str) -> None:
     """Algorithm 1 on another fitness and a log range: median error of three seeds within 0.15 for ln 2."""

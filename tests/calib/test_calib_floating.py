@@ -72,6 +72,7 @@ def test_refinement_recovers_an_exactly_seen_go2(
     np.testing.assert_allclose(found.theta, truth, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_refinement_recovers_a_go2_from_joints_and_imu(
     sensed: Case, beginning: Beginning, three_unknown: Known
 ) -> None:

@@ -148,6 +148,7 @@ class TestDealNoCritic(MethodSuite):
         return case_of("deal-no-critic", Budget(population=30, generations=20), 5e-3)
 
 
+@pytest.mark.slow
 class TestDealPaper(MethodSuite):
     """`deal-paper`: nearer than the centre, no more; single runs end at 0.08 to 0.46."""
 
@@ -280,6 +281,7 @@ class TestMomentsUnaligned(MethodSuite):
         return case_of("moments-unaligned", Budget(population=30, generations=20), 5e-3)
 
 
+@pytest.mark.slow
 class TestDealPaperEnergy(MethodSuite):
     """`deal-paper-energy`: nearer than the centre, no more; single runs end at 0.29 to 0.33."""
 
@@ -290,6 +292,7 @@ class TestDealPaperEnergy(MethodSuite):
         return case_of("deal-paper-energy", Budget(population=100, generations=25), 0.4)
 
 
+@pytest.mark.slow
 class TestDealPaperMmd(MethodSuite):
     """`deal-paper-mmd`: nearer than the centre, no more; single runs end at 0.32 to 0.36."""
 
@@ -438,6 +441,7 @@ def test_a_critic_that_diverges_is_said_and_the_search_goes_on() -> None:
     assert np.abs(np.log(result.estimate / truth)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_diverged_critic_is_an_alarm_of_the_refined_result_where_noise_explains_none() -> None:
     """With nominal values in place of the robot's own a residual stays, and the search before it matters."""
     wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
@@ -532,6 +536,7 @@ def test_constant_fitness_does_not_find_the_truth() -> None:
     assert np.all(values.std(axis=0) < 0.3)
 
 
+@pytest.mark.slow
 def test_eki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
     """Tuning seed 0, profile sensor: mean |ln| below 0.05 where the centre has 0.6, latency within 1 ms."""
     d = recorded("sensor", 0)
@@ -542,6 +547,7 @@ def test_eki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
     assert result.chi2 < 3.0
 
 
+@pytest.mark.slow
 def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
     """Tuning seed 0, profile sensor: mean |ln| within 0.2 where the centre is at 0.6, latency within 10 ms.
 
@@ -554,6 +560,7 @@ def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
     assert abs(result.latency_s - d.latency_s) < 10e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("search", "population"), [(Eki(), 60), (Deal(), 100)])
 def test_a_brief_search_ends_in_the_refinements_basin(search: Eki | Deal, population: int) -> None:
     """Tuning seed 0, profile sensor: at most half the generations, refined to where the truth refines to."""

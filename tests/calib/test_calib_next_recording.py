@@ -124,6 +124,7 @@ def test_one_step_is_next_with_its_commands() -> None:
     assert next_step([]) == []
 
 
+@pytest.mark.slow
 def test_the_command_makes_the_recording_that_was_reckoned_with(tmp_path: Path) -> None:
     """`deal-hw design-excitation` with the options of each of the menu's designs writes that very plan."""
     for name, design in menu_designs(DESCRIPTION, balances=True).items():

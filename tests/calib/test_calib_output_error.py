@@ -188,6 +188,7 @@ def test_a_right_model_needs_no_search(problem: Problem) -> None:
 CANDIDATES = {"short", "0.4 s", "0.8 s", "1.2 s", "long", "long, robust", "long, no latency"}
 
 
+@pytest.mark.slow
 def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationResult) -> None:
     """Every candidate has an error in each fold, a fit wins, and the truth lies in the intervals."""
     folds = result.provenance["cross_validation"]
@@ -271,6 +272,7 @@ class StoppedError(Exception):
     """Raised by a callback."""
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_resumed_to_the_same_numbers(problem: Problem, tmp_path: Path) -> None:
     """Stopped in the search, the checkpoint holds its generations; the rest is done again."""
     method = searching(folds=False)

@@ -134,6 +134,7 @@ def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:
     assert finer.starts is problem.starts and finer.steps == problem.steps > 0
 
 
+@pytest.mark.slow
 def test_a_step_that_fine_encoders_show_is_halved_before_a_search(tmp_path: Path) -> None:
     """A right model of 2 ms, on a grid of 2.5 ms, beside a robot of 0.25 ms: no search is needed.
 

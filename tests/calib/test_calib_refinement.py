@@ -91,6 +91,7 @@ def test_a_hopeless_fit_does_not_begin_again(small_problem: Callable[..., Proble
     assert early.iterations < whole.iterations and early.shooting.length < whole.shooting.length
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rescued_by", ["local fit", "drawn points"])
 def test_a_search_that_ends_in_another_minimum_is_not_the_answer(noisy: Case, rescued_by: str) -> None:
     """A search returns the middle of the range. Refined, that is up to 190 % off: chi2 1.68 instead of 0.92.
@@ -114,6 +115,7 @@ def test_a_search_that_ends_in_another_minimum_is_not_the_answer(noisy: Case, re
     assert found.facts["restarts"] == 0
 
 
+@pytest.mark.slow
 def test_members_of_the_search_lead_where_its_mean_does_not() -> None:
     """A second of balancing, without noise: the refined mean of the search leaves 2.5 times the noise.
 
@@ -127,6 +129,7 @@ def test_members_of_the_search_lead_where_its_mean_does_not() -> None:
     assert log_error_x100(found.estimate, case.theta) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("windows_s", [(0.2,), (0.2, 0.4)])
 @pytest.mark.parametrize(("lower", "fits"), [(True, 2), (False, 5)])
 def test_new_start_states_are_tried_before_drawn_points(
@@ -158,6 +161,7 @@ def test_new_start_states_are_tried_before_drawn_points(
     assert len(calls) == fits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("drawn", "brief"), [(0, [True, False]), (2, [True])])
 def test_only_the_first_search_is_brief(
     noisy: Case, monkeypatch: pytest.MonkeyPatch, drawn: int, brief: list[bool]
@@ -179,6 +183,7 @@ def test_only_the_first_search_is_brief(
     assert outcome.facts["restarts"] == len(brief) - 1
 
 
+@pytest.mark.slow
 def test_refinement_recovers_an_ideal_robot_exactly(ideal: Case) -> None:
     """Truth recovery: from 10 % off, all parameters within 0.01 % and the latency within a microsecond."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
@@ -189,6 +194,7 @@ def test_refinement_recovers_an_ideal_robot_exactly(ideal: Case) -> None:
     assert found.chi2 < 2.0
 
 
+@pytest.mark.slow
 def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None:
     """Truth recovery with noise: mean error within 3 %, latency to the tick, 7 of 9 intervals hold."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
@@ -234,6 +240,7 @@ def test_no_prediction_of_noisy_samples_errs_by_less_than_their_noise(noisy: Cas
     assert exact.errors({"truth": truth}).to_json()["noise"]["mean"] is None
 
 
+@pytest.mark.slow
 def test_a_residual_that_no_drawn_point_lowers_is_the_models(small_problem: Callable[..., Problem]) -> None:
     """With a wrong latency forced on it nothing explains the data: one brief search, and an alarm."""
     problem = small_problem(fixed_latency_s=0.02)

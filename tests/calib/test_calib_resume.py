@@ -116,6 +116,7 @@ def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> Non
     check_same(run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), 0), whole)
 
 
+@pytest.mark.slow
 def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
     """Stopped in the second search and in the refinement: no search runs twice, the numbers are the same."""
     # Nothing is ever explained and no two searches agree: all three attempts are made.

@@ -177,6 +177,7 @@ def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noi
     assert split.rows == () and "too few" in split.note
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("profile", "seed"), [("ideal", 0), ("sensor", 0), ("sensor", 2)])
 def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed: int) -> None:
     """Two exact null directions are named, nearly all parameters have no value, their intervals the range.

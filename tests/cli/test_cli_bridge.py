@@ -16,6 +16,8 @@ from deal_hw.cli.main import EXIT_ERROR, main
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.errors import ConfigurationError
 
+pytestmark = pytest.mark.real_time
+
 HEAVY = {"torch", "mujoco", "scipy", "onnxruntime", "rerun", "matplotlib", "cryptography"}
 SERVE = """
 import json, sys

@@ -72,6 +72,7 @@ def test_floating_robot_needs_feet(folder: Path, capsys: pytest.CaptureFixture[s
     assert "needs --feet" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_stiffness_is_found_from_joints_and_imu(folder: Path) -> None:
     """Within 3 % of the hidden 48 N·m/rad; the held-out error covers joints and orientation."""
     words = command(folder, "--fit-seconds", "2.5", "--window", "0.2", "--feet", *FEET)
@@ -83,6 +84,7 @@ def test_stiffness_is_found_from_joints_and_imu(folder: Path) -> None:
     assert len(rmse["by_coordinate"]["null"]) == 15
 
 
+@pytest.mark.slow
 def test_a_dataset_keeps_the_base_of_a_floating_robot(folder: Path, tmp_path: Path) -> None:
     """IMU, feet and MJCF come with it: the same stiffness as from the file itself, and inspect shows it."""
     yaml, dataset = tmp_path / "robot.yaml", tmp_path / "run" / "dataset"

@@ -147,6 +147,7 @@ def test_stretches_are_left_out(folder: Path, tmp_path: Path) -> None:
     assert provenance["left_out"] == [["rec", 2.0, 4.0]]
 
 
+@pytest.mark.slow
 def test_speed_limit_of_a_servo_is_found(folder: Path, tmp_path: Path) -> None:
     """The shoulder's set-point moves at 1.2 rad/s at most; that is found within 3 % from 3 rad/s.
 
@@ -165,6 +166,7 @@ def test_speed_limit_of_a_servo_is_found(folder: Path, tmp_path: Path) -> None:
     assert "deal_hw.speed_limit" in (tmp_path / "calibration" / "calibrated.xml").read_text()
 
 
+@pytest.mark.slow
 def test_spikes_do_not_move_the_estimate(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,6 +194,7 @@ def test_spikes_do_not_move_the_estimate(
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["local", "default"])
 def test_latency_at_the_end_of_its_range(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str

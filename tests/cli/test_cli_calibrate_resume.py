@@ -69,6 +69,7 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
     monkeypatch.setattr(verb, "watching", watching)
 
 
+@pytest.mark.slow
 def test_stopped_calibration_says_how_to_go_on_and_does(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,6 +14,8 @@ from deal_hw.cli.completion import completion
 from deal_hw.cli.main import EXIT_ERROR, VERBS, main
 from deal_hw.drivers import ROBOTS
 
+pytestmark = pytest.mark.real_time
+
 ASK = """\
 source "$1"; shift
 COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))

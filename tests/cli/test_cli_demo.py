@@ -38,6 +38,8 @@ from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
 
+pytestmark = pytest.mark.real_time
+
 
 def beside_in_short(config: Calibrate) -> CalibrateReport:
     """Calibrate; the search beside it, whose estimates are only noted, gets 20 members and 4 generations."""
@@ -235,7 +237,6 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
 
 
-@pytest.mark.slow
 def test_ctrl_c_in_the_first_recording_ends_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit code 130, and the robot is not armed again for a second recording."""
     made = 0

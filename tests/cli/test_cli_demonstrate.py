@@ -31,6 +31,8 @@ from deal_hw.workflows.emulation.virtual import VirtualCartpole, VirtualEpisode,
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.shipped import shipped_policy
 
+pytestmark = pytest.mark.real_time
+
 
 def shown(truth: CartpoleTruth) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
     """Return the demonstration of an emulated robot."""

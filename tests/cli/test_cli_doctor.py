@@ -27,6 +27,8 @@ from deal_hw.workflows.doctor import machine
 from deal_hw.workflows.doctor.examine import DoctorReport, judge_interfaces
 from deal_hw.workflows.doctor.robot import examine_robot
 
+pytestmark = pytest.mark.real_time
+
 
 def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[Level]:
     """Return the levels of an area's findings."""

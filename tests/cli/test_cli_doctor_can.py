@@ -23,6 +23,8 @@ from deal_hw.workflows.doctor import can as doctor_can
 from deal_hw.workflows.doctor.can import listen_to_bus
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
+pytestmark = pytest.mark.real_time
+
 CHANNELS = (f"doctor{number}" for number in itertools.count())
 
 

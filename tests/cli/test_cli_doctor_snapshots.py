@@ -42,6 +42,8 @@ from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.transport import TopicTransport
 from deal_hw.workflows.doctor import can, examine, machine
 
+pytestmark = pytest.mark.real_time
+
 FOLDER = Path(__file__).parent / "doctor_snapshots"
 LO = Interface("lo", ("127.0.0.1",), up=True, carrier=True, multicast=False, loopback=True)
 CABLE = Interface("enp2s0", ("192.168.123.99",), up=True, carrier=True, multicast=True, loopback=False)

@@ -117,6 +117,7 @@ def test_the_recording_has_states_at_500_hz_and_commands_at_50(dataset: Path) ->
     assert (np.diff(numbers) == 1).all()
 
 
+@pytest.mark.slow
 def test_hidden_gains_and_latency_are_found_over_the_wire(
     calibrated: CalibrateReport, truth: Go2Truth
 ) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 import pytest
 from fakes.faulty_proxy import FaultyProxy
 
+pytestmark = pytest.mark.real_time
+
 SHORT_S = 0.2
 LONG_S = 10.0
 

@@ -16,6 +16,8 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.types import RobotState, Status
 
+pytestmark = pytest.mark.real_time
+
 SEEDS = range(2000, 2010)
 ACCELERATIONS = (2.0, 5.0, 10.0, 20.0, 50.0)
 """Of the cart at full effort [m/s2]."""

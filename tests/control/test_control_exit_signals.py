@@ -31,6 +31,8 @@ from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.workflows.running import control_process
 from deal_hw.workflows.running.control_process import _Stopper
 
+pytestmark = pytest.mark.real_time
+
 DEFAULT = {
     "end": "HUP INT QUIT TERM PIPE ALRM XCPU USR1 USR2 VTALRM PROF IO PWR STKFLT ABRT TRAP SYS TSTP",
     "left": "KILL STOP SEGV BUS FPE ILL CHLD CONT URG WINCH TTIN TTOU XFSZ",

@@ -23,6 +23,8 @@ from deal_hw.control.supervisor import ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
 from deal_hw.signals import OPERATOR, SUSPENDED
 
+pytestmark = pytest.mark.real_time
+
 GRACE_S = module._GRACE_S
 CHILD = """
 import json, os, signal, socket, struct, sys, time

@@ -20,6 +20,8 @@ from deal_hw.control.realtime import priority
 from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 from deal_hw.errors import PortBusyError
 
+pytestmark = pytest.mark.real_time
+
 SILENCE_S = 0.02
 PATIENCE_S = 20.0
 

@@ -2,6 +2,7 @@
 
 `tools/measure_go2_faults.py` and `tools/measure_cartpole_faults.py` draw moments and repeat each row; here
 the worst rows run once, at a moment of their own. The emulator says what the robot was told, never deal-hw.
+Rows of the cart-pole are short and no slow tests; those of the Go2 are, but one.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ import pytest
 
 from deal_hw.install import install_line
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.real_time
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
+SLOW = pytest.mark.slow
+CARTPOLE = ("cartpole", "serial")
+GO2 = [pytest.param("go2", wire, marks=SLOW) for wire in ("zenoh", "dds")]
 TYPICAL_S = {"connecting": 2.0, "taking over": 0.5}
 
 
@@ -67,6 +71,7 @@ def assert_passive(row: dict[str, Any]) -> None:
     assert row["passive_ms"] is not None
 
 
+@SLOW
 @pytest.mark.parametrize(
     "name", ["the link freezes for 3 s as the run ends", "the link is reset for 1.5 s as the run ends"]
 )
@@ -77,12 +82,13 @@ def test_a_go2_whose_link_is_away_as_the_run_ends_is_damped_when_it_is_back(meas
     assert row["exit_code"] == 3
 
 
+@SLOW
 def test_a_go2_whose_wire_is_cut_as_the_run_ends_is_damped_when_it_is_back(measure: Any) -> None:
     """Over DDS no error tells of a link that is gone: silence alone does."""
     assert_passive(measure("go2", "dds", "the link is cut for 3 s as the run ends", "ending"))
 
 
-@pytest.mark.parametrize(("robot", "wire"), [("go2", "zenoh"), ("cartpole", "serial")])
+@pytest.mark.parametrize(("robot", "wire"), [GO2[0], CARTPOLE])
 @pytest.mark.parametrize(
     ("name", "code"), [("Ctrl-Z, then fg", 130), ("the supervisor stands still (SIGSTOP)", 130)]
 )
@@ -95,7 +101,7 @@ def test_a_program_that_is_stopped_leaves_a_passive_robot(
     assert row["exit_code"] == code
 
 
-@pytest.mark.parametrize(("robot", "wire"), [("go2", "zenoh"), ("go2", "dds"), ("cartpole", "serial")])
+@pytest.mark.parametrize(("robot", "wire"), [*GO2, CARTPOLE])
 @pytest.mark.parametrize("phase", ["connecting", "running"])
 def test_a_second_run_is_refused_and_never_takes_over(
     measure: Any, robot: str, wire: str, phase: str
@@ -106,13 +112,14 @@ def test_a_second_run_is_refused_and_never_takes_over(
     assert row["exit_code"] == 130
 
 
+@SLOW
 def test_a_second_run_from_another_computer_is_refused(measure: Any) -> None:
     """By another address the kernel's claim does not see it: the claim on the wire does."""
     name = "a second run by another address, as from another computer"
     assert_passive(measure("go2", "zenoh", name, "running"))
 
 
-@pytest.mark.parametrize(("robot", "wire"), [("go2", "zenoh"), ("go2", "dds"), ("cartpole", "serial")])
+@pytest.mark.parametrize(("robot", "wire"), [*GO2, CARTPOLE])
 @pytest.mark.parametrize(
     ("name", "phase"),
     [("dry run: a policy that hangs", ""), ("dry run: the control process is killed", "connecting")],
@@ -126,7 +133,7 @@ def test_a_dry_run_that_dies_has_told_the_robot_nothing(
     assert (row["ends"], row["exit_code"]) == ("never commanded", 2)
 
 
-@pytest.mark.parametrize("wire", ["zenoh", "dds"])
+@pytest.mark.parametrize("wire", ["zenoh", pytest.param("dds", marks=SLOW)])
 def test_a_run_that_is_killed_while_sport_mode_stands_commands_no_motor(measure: Any, wire: str) -> None:
     """Damping beside sport mode would make a standing robot shake or fall."""
     row = measure("go2", wire, "killed while taking over from sport mode, which stands", "taking over")
@@ -134,6 +141,7 @@ def test_a_run_that_is_killed_while_sport_mode_stands_commands_no_motor(measure:
     assert row["ends"] == "never commanded"
 
 
+@SLOW
 def test_only_the_robot_can_help_where_both_processes_are_killed(measure: Any) -> None:
     """The cart-pole's watchdog stops its motor; the Go2 has none and stays stiff, as the docs say."""
     assert measure("go2", "zenoh", "both processes are killed (SIGKILL)", "running")["ends"] == "active"

@@ -17,6 +17,8 @@ from deal_hw.data.recording.record import CycleRecord, decode
 from deal_hw.errors import DatasetError
 from deal_hw.transport import Message
 
+pytestmark = pytest.mark.real_time
+
 Pair = tuple[socket.socket, socket.socket]
 
 

@@ -13,6 +13,8 @@ import pytest
 
 from deal_hw.workflows.running import control_process
 
+pytestmark = pytest.mark.real_time
+
 
 class Status:
     """Keeps what the supervisor would get."""

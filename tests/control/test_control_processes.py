@@ -46,6 +46,8 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.supervised import InterruptedRunError, run_episodes
 
+pytestmark = pytest.mark.real_time
+
 AT_BEAT = 25
 """Faults happen half a second into the run."""
 PASSIVE_S = 0.5

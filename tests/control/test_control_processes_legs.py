@@ -33,7 +33,7 @@ from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.sleep_lock import ASLEEP
 from deal_hw.workflows.running.supervised import InterruptedRunError, run_episodes
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.real_time
 
 PLAN = RunPlan(
     robot="go2",

@@ -24,7 +24,7 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.supervised import run_episodes
 from deal_hw.workflows.running.view import RunView
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 PLAN = RunPlan(
     robot="go2",

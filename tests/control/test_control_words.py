@@ -11,6 +11,8 @@ import pytest
 from deal_hw.control.process_channel import HEARTBEAT, Beat, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.supervisor import ChildEnd, Supervisor
 
+pytestmark = pytest.mark.real_time
+
 CHILD = """
 import json, os, signal, socket, sys
 

@@ -19,6 +19,8 @@ from deal_hw.data.recording.repair import repair, verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError, TornRecordingError
 
+pytestmark = pytest.mark.real_time
+
 MakeCycle = Callable[[int], CycleRecord]
 
 

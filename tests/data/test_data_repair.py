@@ -184,7 +184,6 @@ def test_hopeless_files_are_refused(tmp_path: Path) -> None:
         repair(tmp_path / "foreign.mcap")
 
 
-@pytest.mark.slow
 def test_rerun_converts_a_repaired_file(write_episode: WriteEpisode, tmp_path: Path) -> None:
     """A torn file is refused by rerun; after repair it reads the states."""
     pytest.importorskip("rerun")

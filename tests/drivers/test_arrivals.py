@@ -14,6 +14,8 @@ import pytest
 
 from deal_hw.drivers.transports.arrivals import Arrivals
 
+pytestmark = pytest.mark.real_time
+
 
 class StopError(Exception):
     """Raised by a signal handler, as the control process does while it connects."""

@@ -41,6 +41,8 @@ from deal_hw.errors import (
 from deal_hw.testing.transport_suite import TransportPair, TransportSuite
 from deal_hw.transport import Message
 
+pytestmark = pytest.mark.real_time
+
 CHANNELS = (f"bus{number}" for number in itertools.count())
 SECOND_NS = 10**9
 

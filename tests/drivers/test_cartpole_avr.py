@@ -164,7 +164,6 @@ def test_arming_needs_homing_and_homing_needs_the_switch(board: Board) -> None:
     assert board.status == Status.NONE
 
 
-@pytest.mark.slow
 def test_homing_without_a_switch_ends_in_a_fault(board: Board) -> None:
     """After 15 s of pulling the motor is off, the fault bit is set and nothing may be armed."""
     board.say(protocol.Home(1))
@@ -325,7 +324,6 @@ class TestCartpoleOnTheChip(RobotSuite):
         chip.device.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_robot_with_hidden_truth_homes_arms_and_follows(seed: int) -> None:
     """Homing finds the middle within 2.5 mm and the pole upright; the cart then gets where it is sent."""
@@ -356,7 +354,6 @@ def test_a_robot_with_hidden_truth_homes_arms_and_follows(seed: int) -> None:
     bench.device.close()
 
 
-@pytest.mark.slow
 def test_the_chip_moves_the_same_robot_as_the_float_servo() -> None:
     """Random steps of up to 100 mm for 1.2 s: cart paths differ by less than 1 mm rms, beside the zero."""
     truth = nominal_truth("ideal")
@@ -381,6 +378,7 @@ def test_the_chip_moves_the_same_robot_as_the_float_servo() -> None:
     assert np.ptp(paths[0]) > 0.05
 
 
+@pytest.mark.real_time
 def test_the_emulator_runs_the_chip_behind_a_port(tmp_path: Path) -> None:
     """`emulate cartpole --firmware avr` as a process: connect, home, and the serial number of seed 3."""
     from deal_hw.clock import MonotonicClock

@@ -351,6 +351,7 @@ def test_an_adapter_answers_what_other_programs_ask() -> None:
     assert adapter.advance_to(0) == b"\r\rz\rF00\r"
 
 
+@pytest.mark.real_time
 def test_python_can_reads_the_emulated_bus() -> None:
     """Another program's slcan client finds states of node 1."""
     clock = VirtualClock()
@@ -414,6 +415,7 @@ def test_options_of_a_bus_need_one() -> None:
     Emulate(robot="cartpole", transport="can", can=CanFaults(node=3))
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("transport", ["can", "odrive"])
 def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     """Two processes, an inherited adapter, the emulator as a third: every state is there, none torn."""
@@ -435,6 +437,7 @@ def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     assert np.isfinite(trajectory.position).all()
 
 
+@pytest.mark.real_time
 def test_python_can_logs_the_bus_and_cantools_decodes_it(tmp_path: Path) -> None:
     """Other people's programs at the emulator's port: python-can's slcan and logger, cantools' `decode`."""
     log = tmp_path / "candump.log"

@@ -30,6 +30,8 @@ from deal_hw.transport import Message
 from deal_hw.types import Status
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
+pytestmark = pytest.mark.real_time
+
 MS = 1_000_000
 
 

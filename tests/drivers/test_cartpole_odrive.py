@@ -504,6 +504,7 @@ def test_parts_that_do_not_fit_are_refused(query: str) -> None:
         odrive_settings(f"can0?{query}")
 
 
+@pytest.mark.real_time
 def test_another_encoder_number_is_refused_over_the_adapter() -> None:
     """As a user sees it who forgot the number."""
     with EmulatorProcess("cartpole", "--transport", "odrive", "--profile", "ideal", "--nominal") as emulator:

@@ -19,6 +19,8 @@ from deal_hw.findings import Finding, Level
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.transport import Transport
 
+pytestmark = pytest.mark.real_time
+
 SLCAN, SERVOS, SERIAL = (
     "a serial CAN adapter",
     "Dynamixel servos (id 1, 2 at",

@@ -13,6 +13,8 @@ from deal_hw.drivers.transports import dds_discovery
 from deal_hw.drivers.transports.dds_discovery import DdsEndpoint, DdsPeer, _unicast, _vendor
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL, UINT8
 
+pytestmark = pytest.mark.real_time
+
 NAME = TYPES[LOW_COMMAND]
 KEY = uuid.UUID("01102866-bb83-421f-7037-3285000001c1")
 PEER = DdsPeer(KEY, "Cyclone DDS", host="go2", process="ai_sport", pid=812, addresses=("192.168.123.161",))

@@ -22,6 +22,8 @@ from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
 from deal_hw.transport import Message, WireOptions
 
+pytestmark = pytest.mark.real_time
+
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 MESSAGES = 300
 

@@ -10,11 +10,12 @@ import pytest
 
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
+pytestmark = pytest.mark.real_time
+
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 pytest.importorskip("mujoco", reason="pip install 'deal-hw[sim]'")
 
 
-@pytest.mark.slow
 def test_a_0102_program_releases_sport_mode_stands_the_robot_up_and_lays_it_down(
     dds_peer: Path, dds_domain: int
 ) -> None:

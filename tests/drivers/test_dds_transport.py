@@ -36,6 +36,8 @@ from deal_hw.install import install_line
 from deal_hw.testing.transport_suite import TopicPair, TopicTransportSuite
 from deal_hw.transport import Message, WireOptions
 
+pytestmark = pytest.mark.real_time
+
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 
 BYTES = {"rt/lowcmd": 812, "rt/lowstate": 1180, "rt/wirelesscontroller": 22}

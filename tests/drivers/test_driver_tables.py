@@ -20,6 +20,8 @@ from deal_hw.drivers import (
 from deal_hw.errors import ConfigurationError, PortNotFoundError, UnknownNameError
 from deal_hw.robot import Robot
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_is_described_under_its_name(name: str) -> None:

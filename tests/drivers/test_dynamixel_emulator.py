@@ -38,6 +38,8 @@ from deal_hw.errors import ConfigurationError, PortNotFoundError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import Transport
 
+pytestmark = pytest.mark.real_time
+
 TORQUE_ENABLE, LED, GOAL_POSITION, PRESENT_POSITION, REALTIME_TICK = 64, 65, 116, 132, 120
 
 PATIENT = "?answer_s=0.3"

@@ -15,6 +15,8 @@ from deal_hw.drivers.cartpole.dynamixel.registers import OperatingMode, Register
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.cartpole.truth import nominal_truth
 
+pytestmark = pytest.mark.real_time
+
 MS = 1_000_000
 FACTORY = {
     r.MODEL_NUMBER: 1190,

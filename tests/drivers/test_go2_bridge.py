@@ -25,10 +25,13 @@ from deal_hw.types import JointCommand
 from deal_hw.workflows import stop as stop_workflow
 from deal_hw.workflows.stop import StopReport
 
-pytestmark = pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("cyclonedds", "cryptography", "mujoco")),
-    reason="pip install 'deal-hw[dds,keys,sim]'",
-)
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(
+        any(importlib.util.find_spec(name) is None for name in ("cyclonedds", "cryptography", "mujoco")),
+        reason="pip install 'deal-hw[dds,keys,sim]'",
+    ),
+]
 
 
 @pytest.fixture(scope="module")

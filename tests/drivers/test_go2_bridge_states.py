@@ -30,6 +30,8 @@ from deal_hw.drivers.go2.messages.rpc import Request, encode_request
 from deal_hw.drivers.transports.zenoh_stamps import Echo, Stamp
 from deal_hw.transport import Message
 
+pytestmark = pytest.mark.real_time
+
 STEP_NS = 250_000_000
 # The limit for silence is 0.4 s here, so that two steps are beyond it.
 CONFIG = BridgeConfig(command_age_s=0.5, margin_s=0.1)

@@ -21,6 +21,8 @@ from deal_hw.drivers.transports.zenoh_stamps import Echo, read_stamp
 from deal_hw.errors import TransportError, TransportLostError
 from deal_hw.transport import Message
 
+pytestmark = pytest.mark.real_time
+
 ZERO = np.zeros(12)
 DAMPING = LowCommandEncoder().encode(LowCommand(ZERO, ZERO, ZERO, np.full(12, 5.0), ZERO))
 

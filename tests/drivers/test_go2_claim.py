@@ -21,6 +21,8 @@ from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import PortBusyError, TransportLostError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport, WireOptions
 
+pytestmark = pytest.mark.real_time
+
 CLOCK = MonotonicClock()
 
 

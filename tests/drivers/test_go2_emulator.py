@@ -125,6 +125,7 @@ def test_a_cut_wire_does_not_stop_the_robot() -> None:
     assert bench.emulator.report()["unsent"] == 7
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("transport", ["dds", "zenoh"])
 @pytest.mark.parametrize(
     "shares", [{"corrupt": 0.6}, dict.fromkeys(SHARES, 1.0), dict.fromkeys(SHARES[1:], 1.0)]
@@ -214,6 +215,7 @@ def test_a_free_port_is_found() -> None:
         free_port("tcp/192.0.2.1:0")
 
 
+@pytest.mark.real_time
 def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
     """A client releases sport mode and commands, sees ticks that count up; at the end the truth is told."""
     pytest.importorskip("zenoh")

@@ -45,6 +45,7 @@ def by_truth(walking: VirtualWalk) -> VelocityError:
     return found
 
 
+@pytest.mark.slow
 def test_legs_and_imu_tell_the_velocity_to_4_cm_a_second(walking: VirtualWalk) -> None:
     """Each part's mean velocity, and the whole walk's error, as the truth has it."""
     assert walking.report.outcome is Outcome.FINISHED

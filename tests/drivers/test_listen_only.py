@@ -24,6 +24,8 @@ from deal_hw.errors import SafetyError, TransportTimeoutError, UnknownNameError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message, Transport
 
+pytestmark = pytest.mark.real_time
+
 S = 10**9
 
 

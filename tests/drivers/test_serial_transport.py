@@ -22,6 +22,8 @@ from deal_hw.errors import (
 from deal_hw.testing.transport_suite import TransportPair, TransportSuite, receive_bytes
 from deal_hw.transport import Message
 
+pytestmark = pytest.mark.real_time
+
 
 class Pty:
     """The device's end of a pty."""

@@ -13,6 +13,8 @@ from deal_hw.drivers.transports.zenoh_session import Endpoint, check_security, p
 from deal_hw.errors import ConfigurationError
 from deal_hw.transport import WireOptions
 
+pytestmark = pytest.mark.real_time
+
 HOSTS = st.one_of(
     st.ip_addresses(v=4).map(str),
     st.ip_addresses(v=6).map(str),

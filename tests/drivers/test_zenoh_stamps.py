@@ -12,6 +12,8 @@ from deal_hw.drivers.transports.zenoh_access import access_settings
 from deal_hw.drivers.transports.zenoh_stamps import Echo, Echoes, Stamp, read_echo, read_stamp
 from deal_hw.errors import ConfigurationError, FrameError
 
+pytestmark = pytest.mark.real_time
+
 U64 = st.integers(0, 2**64 - 1)
 
 

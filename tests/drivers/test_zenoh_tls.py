@@ -16,9 +16,12 @@ from deal_hw.testing.transport_suite import TopicPair, meet
 from deal_hw.transport import WireOptions
 
 COMMAND, STATE = "rt/lowcmd", "rt/lowstate"
-pytestmark = pytest.mark.skipif(
-    shutil.which("openssl") is None, reason="makes certificates with the command openssl; install openssl"
-)
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(
+        shutil.which("openssl") is None, reason="makes certificates with the command openssl; install openssl"
+    ),
+]
 
 
 def openssl(*arguments: object) -> None:

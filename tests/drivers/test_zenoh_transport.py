@@ -28,6 +28,8 @@ from deal_hw.errors import (
 from deal_hw.testing.transport_suite import TopicPair, TopicTransportSuite, meet, next_message
 from deal_hw.transport import Message, WireOptions
 
+pytestmark = pytest.mark.real_time
+
 COMMAND, STATE = "rt/lowcmd", "rt/lowstate"
 LISTEN = WireOptions(listen=True)
 

@@ -22,6 +22,7 @@ def listed() -> list[str]:
     return said.stdout.split()
 
 
+@pytest.mark.slow
 def test_every_kind_survives_a_few_inputs() -> None:
     """No traceback, hang, long message or gigabyte in thirty inputs of each kind."""
     done = subprocess.run(

@@ -231,6 +231,7 @@ def test_a_message_of_the_wheel_names_a_page_that_can_be_opened(unpacked: Path, 
     assert Path(named) == unpacked / "deal_hw/docs/how-to/add.md" and Path(named).is_file()
 
 
+@pytest.mark.slow
 def test_the_wheel_calibrates_a_robot_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
     """Installed by pip beside the packages that it names: a model and a recording give a calibrated one."""
     from deal_hw.testing.plain_robots import make_robot, write

@@ -34,6 +34,7 @@ def found() -> list[refusals.Refusal]:
     return refusals.refusals()
 
 
+@pytest.mark.slow
 def test_the_table_is_that_of_the_sources(found: list[refusals.Refusal]) -> None:
     """A new, removed or changed refusal shows as a line of a diff."""
     kept = (ROOT / refusals.TABLE).read_text(encoding="utf-8")

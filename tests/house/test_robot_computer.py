@@ -22,6 +22,8 @@ from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
+pytestmark = pytest.mark.real_time
+
 EXTRAS = (
     "torch",
     "mujoco",
@@ -249,7 +251,6 @@ def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, por
     assert set(told["opened"]) & networks == {own}
 
 
-@pytest.mark.slow
 def test_go2_runs_without_extras(tmp_path: Path) -> None:
     """Collect and doctor reach a Go2 over Zenoh with `deal-hw[robot]`: all processes of a run included."""
     options = ("--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--profile", "ideal", "--nominal")

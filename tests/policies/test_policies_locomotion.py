@@ -353,6 +353,7 @@ def tool() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "steps"), [("ant", 5_120), ("go2", 384)])
 def test_a_short_training_makes_a_policy_that_acts(
     robot: str, steps: int, tool: ModuleType, tmp_path: Path
@@ -369,6 +370,7 @@ def test_a_short_training_makes_a_policy_that_acts(
     assert path.stat().st_size < 200_000
 
 
+@pytest.mark.slow
 def test_a_stopped_training_goes_on_with_its_curve(
     tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

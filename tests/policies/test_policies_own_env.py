@@ -148,6 +148,7 @@ def test_an_action_is_a_target_that_acts_late(robot: Path, latency_s: float, lat
     assert controls == [0.0] * late + [1.0, -0.5, 0.25, 0.0][: 4 - late]
 
 
+@pytest.mark.slow
 def test_a_policy_is_trained_and_exported(robot: Path, tmp_path: Path) -> None:
     """Both trainers; the file says robot, terms and scale."""
     for trainer, steps in (("sac", 1_200), ("ppo", 2_000)):

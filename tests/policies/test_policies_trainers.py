@@ -101,6 +101,7 @@ def ppo_case() -> TrainerCase:
     return toy_case(PpoTrainer(), 64, PpoConfig(steps=60_000, **settings), PpoConfig(steps=1_024, **settings))
 
 
+@pytest.mark.slow
 class TestSac(TrainerSuite):
     """SAC keeps the contract of trainers."""
 
@@ -111,6 +112,7 @@ class TestSac(TrainerSuite):
         return sac_case()
 
 
+@pytest.mark.slow
 class TestPpo(TrainerSuite):
     """PPO keeps the contract of trainers."""
 
@@ -166,6 +168,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_stable_baselines3_goes_on_with_the_model_that_is_kept(kept: Path, tmp_path: Path) -> None:
     """The zip opens in SAC.load on a registered task's spaces, trains there, and is a start of ours again."""
     path = model_path(kept)

@@ -16,6 +16,8 @@ import pytest
 from check_clients import TOOLS, Run, check, main, run_in_terminal, transcript
 from clients.programs import CLIENTS, Client
 
+pytestmark = pytest.mark.real_time
+
 PLAIN = Client(name="plain", source="plain.py", command=("{source}",), emulator=("cartpole",))
 
 

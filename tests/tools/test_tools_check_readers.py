@@ -21,7 +21,6 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_every_input_is_among_the_samples(samples: Path) -> None:
     """No reader asks for what is not written, and each has its script."""
     for reader in check_readers.READERS:

@@ -11,6 +11,8 @@ from compare_places import places, summary
 from deal_hw.drivers.cartpole.description import SPACES
 from deal_hw.errors import ConfigurationError
 
+pytestmark = pytest.mark.real_time
+
 
 def row(seed: int, method: str, bench: str = "fixed-range") -> dict[str, Any]:
     """Return a row whose estimate is the truth ("reads"), or a draw ("guesses"), or the middle."""

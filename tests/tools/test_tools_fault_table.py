@@ -11,6 +11,8 @@ from fault_rig import RUNNING, Case, SpoiledError
 from fault_table import page
 from measure_go2_faults import Go2Rig
 
+pytestmark = pytest.mark.real_time
+
 
 def result(wire: str, fault: str, passive_ms: float) -> dict[str, Any]:
     """Return a file of one row with one repetition."""

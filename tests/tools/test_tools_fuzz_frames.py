@@ -9,6 +9,8 @@ import fuzz_frames
 import pytest
 from fuzz_frames import CODECS, CORE, Codec, FuzzFrames, damaged, fuzz, main
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.mark.parametrize("name", CODECS)
 def test_no_codec_takes_a_corrupt_frame(name: str) -> None:

@@ -7,6 +7,8 @@ from measure_cartpole_wires import WIRE_MS, measure, spread, table
 
 from deal_hw.drivers.cartpole.can_link import database
 
+pytestmark = pytest.mark.real_time
+
 
 def test_spread_has_the_middle_and_the_tail() -> None:
     """Of 0 to 100: 50, 99 and 100."""

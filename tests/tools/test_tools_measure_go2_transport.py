@@ -20,6 +20,8 @@ from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import ConfigurationError, TransportError
 from deal_hw.transport import WireOptions
 
+pytestmark = pytest.mark.real_time
+
 SPREAD = {"p50_s": 0.001, "p99_s": 0.002, "max_s": 0.003}
 
 

@@ -25,7 +25,6 @@ def policy() -> OnnxPolicy:
     return OnnxPolicy(path)
 
 
-@pytest.mark.slow
 def test_the_shipped_policy_walks_where_it_is_told(
     policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:

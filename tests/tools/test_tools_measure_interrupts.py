@@ -8,6 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.real_time
+
 TOOL = Path(__file__).parents[2] / "tools" / "measure_interrupts.py"
 
 

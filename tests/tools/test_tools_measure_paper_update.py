@@ -8,6 +8,8 @@ from measure_paper_update import UPDATES, measure, printed_rows
 
 from deal_hw.bench import calibration
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.mark.parametrize(
     ("update", "method"), [("literal", "deal-paper-literal-flat"), ("deal-paper", "deal-paper-flat")]

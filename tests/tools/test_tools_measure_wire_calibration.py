@@ -49,6 +49,8 @@ def test_what_goes_wrong_is_kept_in_the_row() -> None:
     assert found["error"] and "nosuch" in found["error"] and "error_percent" not in found
 
 
+@pytest.mark.slow
+@pytest.mark.real_time
 def test_a_row_holds_what_calibration_found() -> None:
     """A whole row over a real emulator: right to 20 % in the median, every parameter with its interval."""
     found = measure("can", "ideal", 1)

@@ -11,6 +11,8 @@ from stall_monitor import Account, Pause, watch_stalls
 
 from deal_hw.errors import ConfigurationError
 
+pytestmark = pytest.mark.real_time
+
 MS = 1_000_000
 
 

@@ -51,6 +51,7 @@ def found(pendulum: tuple[Path, Path, Path]) -> deal_hw.Calibration:
     return deal_hw.calibrate(model, arrays_of(fit), holdout=arrays_of(other), threads=1)
 
 
+@pytest.mark.slow
 def test_arrays_are_calibrated_like_their_file(
     pendulum: tuple[Path, Path, Path], found: deal_hw.Calibration
 ) -> None:

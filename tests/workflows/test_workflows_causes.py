@@ -14,6 +14,8 @@ from deal_hw.workflows import causes
 from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
 from deal_hw.workflows.running.episode_end import account
 
+pytestmark = pytest.mark.real_time
+
 BUSY, IDLE = Load(12.34, 2), Load(0.2, 4)
 
 

@@ -27,6 +27,8 @@ SCRIPTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
 """Script -> arguments, and what it must have told at its end."""
 SHORT: dict[str, Any] = {"refine": False, "population": 20, "generations": 3}
 """A calibration that ends at once, for a script in real time, for which other such tests have to wait."""
+IN_REAL_TIME = ("cartpole_loop", "compare_models")
+"""Scripts that emulate a robot as a process and command it."""
 NOTEBOOK = EXAMPLES / "hidden_payload.ipynb"
 EXECUTE = """
 import sys
@@ -60,7 +62,13 @@ def run(script: Path, tries: int = 3) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.real_time] if name in IN_REAL_TIME else [], id=name)
+        for name in SCRIPTS
+    ],
+)
 def test_a_script_runs(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -18,6 +18,8 @@ from deal_hw.workflows.running.keyboard import HELP, keys
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.supervised import run_episodes
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 20.0
 STOP = "(stop)"
 

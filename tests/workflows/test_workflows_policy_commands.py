@@ -20,6 +20,8 @@ from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import required_policy
 
+pytestmark = pytest.mark.real_time
+
 STATES_A_TICK = 4
 """State samples of the cart-pole in one of its control periods."""
 

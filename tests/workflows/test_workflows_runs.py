@@ -32,6 +32,8 @@ from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.say import silent
 from deal_hw.workflows.shipped import required_policy
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 0.6
 

@@ -22,6 +22,8 @@ from deal_hw.workflows import stop as module
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.stop import StopSettings, _claimed, stop
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE_S = 60.0
 HOLDER = """
 import sys, time
@@ -193,7 +195,6 @@ def test_a_cartpole_is_stopped_with_and_without_a_run(
     assert "was NOT made passive" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_go2_is_damped_whoever_holds_it(
     rig: Callable[..., Rig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,8 @@ import pytest
 from deal_hw.errors import ConfigurationError, TransportError
 from deal_hw.workflows.emulation.process import VerbProcess
 
+pytestmark = pytest.mark.real_time
+
 DYING = (
     "import sys; print('port /dev/gone', flush=True); print('out of memory', file=sys.stderr); sys.exit(3)"
 )

@@ -1,0 +1,82 @@
+#!/usr/bin/env python3
+"""Run tests beside processes that keep the processors busy, several times, and list the failures.
+
+python tools/test_under_load.py
+python tools/test_under_load.py --loops 10 --repetitions 3 tests/control -m "not slow"
+
+What is not an option of this program goes to pytest. Without it the tests of `make test` run.
+The exit code is 1 where a test failed in one of the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+DEFAULT = ("-m", "not slow")
+BUSY = "while True: pass"
+
+
+@contextlib.contextmanager
+def busy_loops(count: int) -> Iterator[None]:
+    """Keep as many processes computing as long as the context lasts."""
+    loops = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+        for loop in loops:
+            loop.wait()
+
+
+def run_tests(arguments: Sequence[str], workers: int) -> tuple[int, str]:
+    """Run pytest and return its exit code and what it printed."""
+    command = [sys.executable, "-m", "pytest", "-q", "-n", f"{workers}", *arguments]
+    done = subprocess.run(
+        command,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stdout
+
+
+def failures(output: str) -> list[str]:
+    """Return the tests that failed or had an error, by the summary of pytest."""
+    return re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", output, re.MULTILINE)
+
+
+def main() -> int:
+    """Run the tests under load."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--loops", type=int, default=10, help="processes that keep the processors busy")
+    parser.add_argument("--repetitions", type=int, default=3, help="runs, one after the other")
+    parser.add_argument("--workers", type=int, default=3, help="processes of pytest")
+    given, arguments = parser.parse_known_args()
+    failed: Counter[str] = Counter()
+    bad = 0
+    for number in range(given.repetitions):
+        with busy_loops(given.loops):
+            code, output = run_tests(arguments or DEFAULT, given.workers)
+        failed.update(failures(output))
+        bad += code != 0
+        last = output.strip().splitlines()[-1:]
+        print(f"run {number + 1}: exit code {code}: {''.join(last)}", flush=True)
+        if code and not failures(output):
+            print(output[-3000:], flush=True)
+    for name, count in failed.most_common():
+        print(f"failed in {count} of {given.repetitions}: {name}")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
