@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
+import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import with_rows
@@ -53,6 +54,7 @@ def problem_of(truth: CartpoleTruth, late: int) -> Problem:
     return Problem(load_model(DESCRIPTION), k9_space().with_ratio(5.0), [episode], threads=1)
 
 
+@pytest.mark.slow
 def test_a_servo_whose_damping_acts_late_is_named() -> None:
     """10 ms late: the first cause, at the cart, and not its inertia; the pole has no servo."""
     truth = draw_truth("sensor", 4, range_ratio=5.0)
