@@ -75,13 +75,30 @@ class Rig:
         assert process.poll() is None
         return process
 
+    def kill_run(self, *options: str) -> None:
+        """Start a run and kill all of it at once; again where the run had ended itself before.
+
+        Where one process is killed alone, the others see it and damp the robot, while a busy machine keeps
+        the next kill waiting. So all are stopped first: for 0.2 s nobody misses anybody. A machine that
+        stands still for 60 ms trips a run, whatever is done to it.
+        """
+        for _ in range(3):
+            run = self.run(*options)
+            pids = self.processes()
+            for number in (signal.SIGSTOP, signal.SIGKILL):
+                for pid in pids:
+                    os.kill(pid, number)
+            run.wait()
+            if self.told()[-1] in (STIFF, "armed"):
+                return
+
     def told(self) -> list[str]:
         """Return the robot's log: kinds of command, or what happened to it."""
         return [json.loads(line)[2] for line in self._events.read_text().splitlines()]
 
     def processes(self) -> list[int]:
-        """Return the processes of the only run."""
-        (found,) = find_runs()
+        """Return the processes of the newest run, and of no other on this computer."""
+        (found,) = [run for run in find_runs() if run.pid == self.runs[-1].pid]
         with found:
             return [found.pid, *(pid for pid in found.holders() if pid != found.pid)]
 
@@ -207,10 +224,7 @@ def test_a_go2_is_damped_whoever_holds_it(
     assert run.wait(PATIENCE_S) == 130
     assert robot.told()[-1] == DAMPING
 
-    run = robot.run(*motion)
-    for pid in robot.processes():
-        os.kill(pid, signal.SIGKILL)
-    run.wait()
+    robot.kill_run(*motion)
     assert robot.told()[-1] == STIFF
     assert stop("go2").passive is False, "without a run and a port nobody is found"
     assert robot.told()[-1] == STIFF
