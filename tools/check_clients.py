@@ -19,7 +19,6 @@ multicast, which a network of its own allows:
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import pty
@@ -38,6 +37,7 @@ from pathlib import Path
 import can
 from clients.programs import CLIENTS, Client
 from dynamixel_sdk import PacketHandler, PortHandler
+from measuring import parser
 
 from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
 from deal_hw.drivers.cartpole.odrive_endpoints import flat_endpoints
@@ -242,16 +242,14 @@ def transcript(runs: Sequence[Run]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a row for each program; return 1 if one fails."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path, help="folder of your checkouts")
-    parser.add_argument("--only", nargs="*", help="these programs")
-    parser.add_argument("--environments", type=Path, default=Path("build/clients"), help="kept")
-    parser.add_argument("--pip-args", default="", help="passed on to every `pip install`")
-    parser.add_argument("--unitree-python", type=Path, help="a Python with cyclonedds 0.10.2 and numpy")
-    parser.add_argument("--transcript", type=Path, help="a Markdown file for what they print")
-    options = parser.parse_args(arguments)
+    made = parser(__doc__, out=False)
+    made.add_argument("folder", type=Path, help="folder of your checkouts")
+    made.add_argument("--only", nargs="*", help="these programs")
+    made.add_argument("--environments", type=Path, default=Path("build/clients"), help="kept")
+    made.add_argument("--pip-args", default="", help="passed on to every `pip install`")
+    made.add_argument("--unitree-python", type=Path, help="a Python with cyclonedds 0.10.2 and numpy")
+    made.add_argument("--transcript", type=Path, help="a Markdown file for what they print")
+    options = made.parse_args(arguments)
     folder = options.folder.resolve()
     chosen = [c for c in CLIENTS if not options.only or c.name in options.only]
     runs = []

@@ -10,7 +10,6 @@ mjlab install torch). LeRobot 0.4.4 needs an older torch and rerun than deal-hw,
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import subprocess
 import sys
@@ -20,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 from measure_recording_size import CYCLE_NS, START_NS, cycles
+from measuring import Rows, markdown, parser
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.calib.report.page import write_result
 from deal_hw.calibration import CalibrationResult, Identifiability
 from deal_hw.clock import VirtualClock
@@ -201,14 +200,11 @@ def check(reader: Reader, samples: Path, folder: Path, pip_args: list[str]) -> l
 
 def main() -> int:
     """Print a row for each reader and input; return 1 if one fails."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--environments", type=Path, required=True, help="folder for the environments; kept")
-    parser.add_argument("--only", nargs="*", choices=[r.name for r in READERS], help="these readers")
-    parser.add_argument("--pip-args", default="", help="passed on to every `pip install`")
-    parser.add_argument("--out", type=Path, help="a JSON file for the rows")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--environments", type=Path, required=True, help="folder for the environments; kept")
+    made.add_argument("--only", nargs="*", choices=[r.name for r in READERS], help="these readers")
+    made.add_argument("--pip-args", default="", help="passed on to every `pip install`")
+    options = made.parse_args()
     chosen = [reader for reader in READERS if not options.only or reader.name in options.only]
     with tempfile.TemporaryDirectory() as folder:
         samples = Path(folder)
@@ -220,12 +216,11 @@ def main() -> int:
                 reader, samples, options.environments.resolve(), shlex.split(options.pip_args)
             )
         ]
-    print("| reader | versions | input | result | output |\n|---|---|---|---|---|")
-    for found in findings:
-        verdict = "pass" if found.passed else "FAIL"
-        print(f"| {found.reader} | {found.versions} | `{found.input}` | {verdict} | {found.words} |")
-    if options.out is not None:
-        write_rows(options.out, [asdict(found) for found in findings], program="tools/check_readers.py")
+    heads = ("reader", "versions", "input", "result", "output")
+    words = {True: "pass", False: "FAIL"}
+    lines = [(f.reader, f.versions, f"`{f.input}`", words[f.passed], f.words) for f in findings]
+    print(markdown(heads, lines))
+    Rows(__file__, options.out).keep([asdict(found) for found in findings])
     return 0 if all(found.passed for found in findings) else 1
 
 

@@ -12,7 +12,6 @@ logarithmic: 0 is the lower end, 1 the upper one.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import parser
 
 from deal_hw.bench.rows import load_rows
 from deal_hw.drivers import parameter_spaces
@@ -72,12 +72,12 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> int:
     """Print the summary of the files' rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
+    options = parser(__doc__, out=False)
+    options.add_argument(
         "files", nargs="+", type=Path, help="rows of `deal-hw bench`; later files add to earlier ones"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    given = parser.parse_args()
+    options.add_argument("--json", action="store_true", help="print JSON")
+    given = options.parse_args()
     rows = [row for file in given.files for row in load_rows(file)]
     found = summary(rows)
     if given.json:

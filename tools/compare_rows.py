@@ -1,14 +1,12 @@
 """Compare two files of `deal-hw bench ... --out FILE.json`, cell by cell; exit 1 if the new one is worse.
 
-    python tools/compare_rows.py docs/measured/base_cartpole_sensor.json new.json
-    python tools/compare_rows.py old.json new.json --map open-loop=default
+    python tools/compare_rows.py docs/measured/tuning_cartpole_sensor.json new.json
+    python tools/compare_rows.py old.json new.json --map eki=deal
 
 A cell has one bench, task, parameter set (space), profile, demonstration, split, range ratio, method and
-choice of refinement, with all its seeds. Tables in this file map old words to new ones (`weki` is `eki`,
-`near` is `local`, `open-loop` is `output-error`, field `xi` is `range_ratio`, ...), so each file may have
-either. ``--map OLD=NEW`` compares a method of OLD with another one of NEW. Some methods choose the refinement
-themselves (default, local, output-error, and those that ignore the data). For these the row's refinement is
-not compared. Cells that only NEW has are named and not judged.
+choice of refinement, with all its seeds. ``--map eki=deal`` compares a method of OLD with another one of NEW.
+Some methods choose the refinement themselves (default, local, output-error, and those that ignore the data).
+For these the row's refinement is not compared. Cells that only NEW has are named and not judged.
 
 A cell is a loss if one of these holds. Figures are of the seeds that both files have without an error.
 
@@ -45,18 +43,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deal_hw.bench.rows import FORMER_BENCHES, FORMER_FIELDS
 from deal_hw.calib.pipeline.methods import NO_DATA_METHODS, divided
 from deal_hw.ranges import option
 
-FIELDS: Mapping[str, str] = {"polish": "refined", **FORMER_FIELDS}
-"""Old name of a row's field -> new name."""
-
-METHODS = {"weki": "eki", "near": "local", "open-loop": "output-error", "centre": "midpoint"}
-"""Old name of a method -> new name; others keep theirs."""
-
 WHOLE = frozenset({"default", "local", "output-error"})
-"""Methods, by their new names, that choose the refinement themselves."""
+"""Methods that choose the refinement themselves."""
 
 KEY = (
     "bench",
@@ -113,7 +104,7 @@ class Comparison:
     """One cell of both files.
 
     Attributes:
-        key: Its name, by new names.
+        key: Its name.
         seeds: Number of compared seeds.
         figures: Name of a figure -> (old, new), each None if there is none.
         losses: Reasons why it is worse; empty if it is not.
@@ -132,8 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     limits = Limits(**{name: getattr(given, name) for name in HELP})
     try:
-        renamed = METHODS | dict(_pair(text) for text in given.map)
-        old, new = read_cells(given.old, renamed), read_cells(given.new, METHODS)
+        old, new = read_cells(given.old, dict(_pair(text) for text in given.map)), read_cells(given.new, {})
     except (OSError, ValueError) as err:
         print(f"compare_rows: {err}", file=sys.stderr)
         return 2
@@ -167,16 +157,16 @@ def _parser() -> argparse.ArgumentParser:
 def _pair(text: str) -> tuple[str, str]:
     old, equals, new = text.partition("=")
     if not (old and equals and new):
-        raise ValueError(f"--map {text!r}: give a method of OLD and one of NEW, such as open-loop=default")
-    return old, METHODS.get(new, new)
+        raise ValueError(f"--map {text!r}: give a method of OLD and one of NEW, such as eki=deal")
+    return old, new
 
 
 def read_cells(path: Path, methods: Mapping[str, str]) -> Cells:
-    """Return the rows of a file by cell and seed, under new names.
+    """Return the rows of a file by cell and seed.
 
     Args:
         path: A file of `deal-hw bench`.
-        methods: Old name of a method -> new name.
+        methods: Name of a method -> the name that it is compared under.
 
     Raises:
         ValueError: It is no such file, a row is no calibration's, or two rows have the same cell and seed.
@@ -185,10 +175,9 @@ def read_cells(path: Path, methods: Mapping[str, str]) -> Cells:
     if not isinstance(values, dict) or not isinstance(values.get("rows"), list):
         raise ValueError(f"{path} has no rows; name a file that `deal-hw bench ... --out` wrote")
     cells: Cells = {}
-    for number, given in enumerate(values["rows"]):
-        if not isinstance(given, dict):
+    for number, row in enumerate(values["rows"]):
+        if not isinstance(row, dict):
             raise ValueError(f"{path}: row {number} is no object")
-        row: Row = {FIELDS.get(name, name): value for name, value in given.items()}
         if lacking := [name for name in ("bench", "task", "method", "seed") if name not in row]:
             raise ValueError(
                 f"{path}: row {number} has no {lacking[0]!r}, so it is not of a calibration bench"
@@ -211,12 +200,10 @@ def whole(method: str) -> bool:
 
 def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
     """Return the name of a row's cell, as texts in the order of `KEY`; "" if one does not apply."""
-    bench, method = str(row["bench"]), str(row["method"])
-    method = methods.get(method, method)
+    method = methods.get(str(row["method"]), str(row["method"]))
     optional = not whole(method) and method not in NO_DATA_METHODS
     known = {
         **{name: str(row.get(name, "")) for name in KEY},
-        "bench": FORMER_BENCHES.get(bench, bench),
         "demonstration": str(row.get("demonstration", "excite")),
         "demonstration_s": f"{float(row.get('demonstration_s', 4.0)):g}" if "task" in row else "",
         "range_ratio": f"{float(row['range_ratio']):g}" if row.get("range_ratio") is not None else "",

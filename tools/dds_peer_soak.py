@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import tyro
 from fakes.go2 import FakeGo2
+from measuring import head, spread, write_document
 
-from deal_hw.bench.rows import describe_call
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
@@ -98,12 +98,7 @@ class Side:
             "lost": span - len(numbers),
             "lost_percent": round(100.0 * (span - len(numbers)) / span, 3),
             "in_order": bool(np.all(np.diff(numbers) > 0)),
-            "arrival_period_ms": {
-                name: round(float(value), 3)
-                for name, value in zip(
-                    ("p50", "p99", "max"), np.percentile(gaps_ms, (50, 99, 100)), strict=True
-                )
-            },
+            "arrival_period_ms": spread(gaps_ms.tolist()),
             "slowest_send_ms": round(self.slowest_send_ns * 1e-6, 3),
         }
 
@@ -176,7 +171,7 @@ def main(config: DdsPeerSoak) -> int:
     as_user = Side(LOW_COMMAND, LOW_STATE, command_bytes())
     as_robot = Side(LOW_STATE, LOW_COMMAND, state_bytes())
     result: dict[str, Any] = {
-        **describe_call(f"tools/{Path(__file__).name}"),
+        **head(__file__),
         "scheduling": became.scheduling,
         "cyclonedds_python": importlib.metadata.version("cyclonedds"),
         "seconds_each": config.seconds,
@@ -197,11 +192,9 @@ def build_peer() -> None:
 
 def finish(result: dict[str, Any], out: Path | None) -> int:
     """Write a result to a file or print it; return the exit status."""
-    text = json.dumps(result, indent=1) + "\n"
     if out is None:
-        print(text, end="")
-    else:
-        out.write_text(text)
+        print(json.dumps(result, indent=1))
+    write_document(out, result)
     return 0 if result["passed"] else 1
 
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import tyro
 from dds_peer_soak import PEER, build_peer, finish
+from measuring import head
 
-from deal_hw.bench.rows import describe_call
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
 STAND, LIE = 3, 4
@@ -86,8 +86,7 @@ def main(config: DdsPeerStand) -> int:
         and lay["emulator"]["base_height_m"] < LYING_M
         and all(clean(result) for result in (stood, lay))
     )
-    call = describe_call(f"tools/{Path(__file__).name}")
-    settings = {**call, "passed": passed, "profile": config.profile, "seed": config.seed}
+    settings = {**head(__file__), "passed": passed, "profile": config.profile, "seed": config.seed}
     return finish({**settings, "stood": stood, "lay_down": lay}, config.out)
 
 

@@ -4,7 +4,7 @@
 - ``reference/api.md`` and ``reference/api-*.md``: every public name of ``deal_hw``, then the contracts, for
   mkdocstrings;
 - ``reference/alarms.md``: every alarm of a calibration, from the calls that make one;
-- ``reference/errors.md``: every refusal, from tests/house/refusals.txt;
+- ``reference/errors.md``: every refusal, from the sources by tools/refusals.py;
 - ``how-to/examples.md``: the files of examples/;
 - ``contributing.md`` and ``changelog.md``: CONTRIBUTING.md and CHANGELOG.md with links for the site.
 """
@@ -14,10 +14,11 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
+import itertools
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -25,11 +26,10 @@ from typing import Any, cast
 if str(Path(__file__).parent) not in sys.path:  # mkdocs loads a hook by its path.
     sys.path.append(str(Path(__file__).parent))
 
-from refusals import words
+from refusals import EXIT_ERROR, Refusal, refusals, words
 
 ROOT = Path(__file__).resolve().parents[1]
 ALARM_FOLDERS = ("calib", "deal_hw")
-REFUSALS = ROOT / "tests" / "house" / "refusals.txt"
 
 API_NAMES = {
     "Calibrate": ("calibrate", "Calibration", "design_excitation"),
@@ -268,12 +268,8 @@ def reference(name: str, heading: str, *, inherited: bool = False) -> list[str]:
     ]
 
 
-def errors_page(table: str) -> str:
-    """Return the page of refusals.
-
-    Args:
-        table: The text of tests/house/refusals.txt.
-    """
+def errors_page(found: Iterable[Refusal]) -> str:
+    """Return the page of the refusals that end a command, by file."""
     lines = [
         "# Error messages",
         "",
@@ -282,18 +278,10 @@ def errors_page(table: str) -> str:
         "[Troubleshooting](../troubleshooting.md) explains the frequent messages.",
         "",
     ]
-    path = ""
-    rows: list[Any] = []
-    for line in [*table.splitlines(), ""]:
-        if line.startswith("#"):
-            continue
-        if not line.startswith(" "):
-            if rows:
-                lines += [f"## {path}", "", "| error | message |", "|---|---|", *rows, ""]
-            path, rows = line.strip(), []
-            continue
-        if match := re.match(r"\s+.+?  (\w+) 2  (.+)$", line):
-            rows.append(f"| `{match[1]}` | {cell(shortened(match[2]))} |")
+    ending = (one for one in found if one.exit_code == EXIT_ERROR and one.words)
+    for path, group in itertools.groupby(ending, key=lambda one: one.path):
+        rows = (f"| `{one.kind}` | {cell(shortened(one.words))} |" for one in group)
+        lines += [f"## {path}", "", "| error | message |", "|---|---|", *rows, ""]
     return "\n".join(lines)
 
 
@@ -379,7 +367,7 @@ def pages() -> dict[str, str]:
         "reference/cli.md": cli_page(),
         **api_pages(),
         "reference/alarms.md": alarms_page(),
-        "reference/errors.md": errors_page(REFUSALS.read_text(encoding="utf-8")),
+        "reference/errors.md": errors_page(refusals(ROOT)),
         "how-to/examples.md": examples_page(),
         "contributing.md": moved("CONTRIBUTING.md"),
         "changelog.md": moved("CHANGELOG.md"),

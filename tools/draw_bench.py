@@ -2,16 +2,13 @@
 
     python tools/draw_bench.py docs/measured/loop_sensor.json docs/measured/loop_realistic.json
 
-Each figure is written beside its rows, as a PNG of the same name. Methods of older rows get their present
-names, as in compare_rows.py.
+Each figure is written beside its rows, as a PNG of the same name.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-
-from compare_rows import METHODS
 
 from deal_hw.bench.figures import draw
 from deal_hw.bench.rows import load_rows
@@ -20,8 +17,7 @@ from deal_hw.bench.transfer_figure import draw_transfer
 
 def draw_again(path: Path) -> Path | None:
     """Draw a file's figure and return it; None if every cell failed."""
-    rows = [row | {"method": METHODS.get(row["method"], row["method"])} for row in load_rows(path)]
-    good = [row for row in rows if not row["error"]]
+    good = [row for row in load_rows(path) if not row["error"]]
     if not good:
         return None
     figure = path.with_suffix(".png")

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
-import signal
 import statistics
 import sys
 import tempfile
@@ -25,9 +23,9 @@ from typing import Any
 
 import numpy as np
 from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case, Rig, SpoiledError, headline
+from measuring import head, hear_signals, load, parser, write_document
 from stall_monitor import watch_stalls
 
-from deal_hw.bench.rows import describe_call
 from deal_hw.control.realtime import priority
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.errors import DealHwError
@@ -232,7 +230,7 @@ def run_cases(
             numbers = range(len(row["repetitions"]), given.repetitions)
             if not numbers:
                 continue
-            load = [round(os.getloadavg()[0], 1)]
+            loads = [load()]
             with watch_stalls(PAUSE_NS) as account:
                 try:
                     done = list(pool.map(lambda number, case=case: one(case, number), numbers))
@@ -248,14 +246,14 @@ def run_cases(
                 if found["complaints"] and longest_ns > _LONG_PAUSE_NS:
                     ms = round(longest_ns * 1e-6)
                     found["complaints"].append(f"the whole machine stood still for {ms} ms in that run")
-            load.append(round(os.getloadavg()[0], 1))
+            loads.append(load())
             yield summary(
                 {
                     "fault": case.name,
                     "wire": wire,
                     "expected": case.expect,
                     "from_return": case.from_ms > 0,
-                    "load": [*row["load"], *load],
+                    "load": [*row["load"], *loads],
                     "repetitions": [*row["repetitions"], *done],
                 }
             )
@@ -289,7 +287,7 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
     results = [{**result, "rows": [summary(row) for row in result["rows"]]} for result in results]
     wires = list(dict.fromkeys(row["wire"] for result in results for row in result["rows"]))
     names = dict.fromkeys(row["fault"] for result in results for row in result["rows"])
-    loads = [load for result in results for row in result["rows"] for load in row["load"]]
+    loads = [one for result in results for row in result["rows"] for one in row["load"]]
     first = results[0]["calls"][-1]["machine"]
     lines = [
         f"# {title}",
@@ -349,19 +347,19 @@ def main(
     rig_type: type[Rig], cases: Sequence[Case], title: str, words: Sequence[str], doc: str | None
 ) -> int:
     """Run a table, or write a page; return 1 if a repetition was not as expected."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
+    options = parser(doc, out=False)
     if len(rig_type.wires) > 1:
-        parser.add_argument("--transport", choices=rig_type.wires, default=rig_type.wires[0])
-    parser.add_argument("--repetitions", type=int, default=20)
-    parser.add_argument("--only", default="", help="only rows whose name matches this regular expression")
-    parser.add_argument("--skip", default="^$", help="leave out rows whose name matches this one")
-    parser.add_argument("--seed", type=int, default=0, help="draws phases and moments")
-    parser.add_argument(
+        options.add_argument("--transport", choices=rig_type.wires, default=rig_type.wires[0])
+    options.add_argument("--repetitions", type=int, default=20)
+    options.add_argument("--only", default="", help="only rows whose name matches this regular expression")
+    options.add_argument("--skip", default="^$", help="leave out rows whose name matches this one")
+    options.add_argument("--seed", type=int, default=0, help="draws phases and moments")
+    options.add_argument(
         "--jobs", type=int, default=1, help="repetitions at the same time, each on a wire of its own"
     )
-    parser.add_argument("--list", action="store_true", help="list the rows")
-    parser.add_argument("--out", type=Path, default=None, help="results; repetitions in it count")
-    parser.add_argument(
+    options.add_argument("--list", action="store_true", help="list the rows")
+    options.add_argument("--out", type=Path, default=None, help="results; repetitions in it count")
+    options.add_argument(
         "--table",
         type=Path,
         nargs="+",
@@ -369,7 +367,7 @@ def main(
         metavar="FILE",
         help="write a page (first) from results (others), and measure nothing",
     )
-    given = parser.parse_args()
+    given = options.parse_args()
     if given.table is not None:
         results = [json.loads(path.read_text(encoding="utf-8")) for path in given.table[1:]]
         given.table[0].write_text(page(title, words, results), encoding="utf-8")
@@ -385,12 +383,9 @@ def main(
     if given.list:
         print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
         return 0
-    # A shell makes a background program ignore Ctrl-C, and nohup SIGHUP; all its children would inherit this.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGQUIT, signal.SIG_DFL)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    hear_signals()
     calls, rows = earlier(given.out)
-    calls.append(describe_call(f"tools/{Path(sys.argv[0]).name}"))
+    calls.append(head(sys.argv[0]))
     bad = 0
     for row in run_cases(rig_type, chosen, wire, given, rows):
         rows[row["fault"]] = row
@@ -399,8 +394,7 @@ def main(
         if given.out is not None:
             order = [case.name for case in cases]
             known = sorted(rows.values(), key=lambda one: order.index(one["fault"]))
-            text = json.dumps({"format": FORMAT, "calls": calls, "rows": known}, indent=1, ensure_ascii=False)
-            given.out.write_text(text + "\n", encoding="utf-8")
+            write_document(given.out, {"format": FORMAT, "calls": calls, "rows": known})
     return int(bad > 0)
 
 

@@ -14,7 +14,6 @@ The kinds are tables, one module a group in ``tools/fuzz/``: add a module with `
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 import time
@@ -23,6 +22,7 @@ from pathlib import Path
 
 from fuzz.kind import FileKind, Kind
 from fuzz.run import make_input, run
+from measuring import parser
 
 GROUPS = ("recordings", "wire", "cartpole_wires", "calibration")
 
@@ -43,17 +43,15 @@ def kinds() -> dict[str, Kind]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--kind", action="append", help="a kind of input; may be repeated (default: all)")
-    parser.add_argument("--count", type=int, default=1000, help="inputs of each kind")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", type=int, help="read this one input, without guards")
-    parser.add_argument("--limit-s", type=float, default=10.0, help="processor time for one input [s]")
-    parser.add_argument("--limit-mb", type=int, default=1024, help="memory for one input [MiB]")
-    parser.add_argument("--list", action="store_true", help="name the kinds and end")
-    given = parser.parse_args()
+    options = parser(__doc__, out=False)
+    options.add_argument("--kind", action="append", help="a kind of input; may be repeated (default: all)")
+    options.add_argument("--count", type=int, default=1000, help="inputs of each kind")
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--only", type=int, help="read this one input, without guards")
+    options.add_argument("--limit-s", type=float, default=10.0, help="processor time for one input [s]")
+    options.add_argument("--limit-mb", type=int, default=1024, help="memory for one input [MiB]")
+    options.add_argument("--list", action="store_true", help="name the kinds and end")
+    given = options.parse_args()
     warnings.simplefilter("ignore")
     table = kinds()
     if given.list:
@@ -62,7 +60,7 @@ def main() -> int:
     failed = False
     for name in given.kind or table:
         if name not in table:
-            parser.error(f"no kind {name!r}; there are {', '.join(table)}")
+            options.error(f"no kind {name!r}; there are {', '.join(table)}")
         if given.only is not None:
             _only(table[name], given.seed, given.only)
             continue

@@ -27,10 +27,10 @@ import tyro
 from fakes.go2 import FakeGo2
 from fuzz.cartpole_wires import blocks, read_answer
 from fuzz.wire import low_commands
+from measuring import Rows
 from rich.console import Console
 from rich.progress import track
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.dynamixel import packets
 from deal_hw.drivers.go2.messages.low_command import decode_low_command
@@ -200,18 +200,17 @@ def fuzz_core(name: str, inputs: int, seed: int) -> dict[str, Any]:
 
 def main(config: FuzzFrames) -> int:
     """Print each row; return 1 if a codec accepts more than its checksum may by chance."""
-    rows = []
+    rows = Rows(__file__, config.out)
     for name in config.codecs or (*CORES, *CODECS):
         if name in CORES:
             row = fuzz_core(name, config.inputs, config.seed)
         else:
             row = fuzz(name, CODECS[name], config.inputs, config.seed)
-        print(json.dumps(row), flush=True)
-        rows.append(row)
-    if config.out is not None:
-        write_rows(config.out, rows, program=f"tools/{Path(__file__).name}")
+        rows.add(row)
     # Four standard deviations of a Poisson count above what is expected.
-    return int(any(row["accepted"] > row["expected"] + 4 * max(row["expected"], 1) ** 0.5 for row in rows))
+    return int(
+        any(row["accepted"] > row["expected"] + 4 * max(row["expected"], 1) ** 0.5 for row in rows.rows)
+    )
 
 
 if __name__ == "__main__":

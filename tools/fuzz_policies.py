@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import parser
 
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
@@ -300,13 +301,13 @@ def judge_network(seed: int, number: int) -> str:
 
 def main() -> int:
     """Print the table; return 1 where anything failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--specs", type=int, default=10_000)
-    parser.add_argument("--networks", type=int, default=1_000)
-    parser.add_argument("--every", type=int, default=50, help="1 of N networks gets the whole check")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", type=int, nargs=3, default=None, help=argparse.SUPPRESS)
-    given = parser.parse_args()
+    options = parser(__doc__, out=False)
+    options.add_argument("--specs", type=int, default=10_000)
+    options.add_argument("--networks", type=int, default=1_000)
+    options.add_argument("--every", type=int, default=50, help="1 of N networks gets the whole check")
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--work", type=int, nargs=3, default=None, help=argparse.SUPPRESS)
+    given = options.parse_args()
     if given.work is not None:
         work(*given.work)
         return 0

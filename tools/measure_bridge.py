@@ -32,10 +32,10 @@ import numpy as np
 import tyro
 from bridge_client import BridgeClient
 from bridge_rig import BridgeRig, bridge_process, make_keys, wire
+from measuring import head, write_document
 from side_process import SideProcess
 from stall_monitor import watch_stalls
 
-from deal_hw.bench.rows import describe_call
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import FIFO_PRIORITY
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
@@ -87,11 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
     except DealHwError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    if config.out is not None:
-        config.out.write_text(
-            json.dumps({**describe_call(f"tools/{Path(__file__).name}"), **result}, indent=1) + "\n",
-            encoding="utf-8",
-        )
+    write_document(config.out, {**head(__file__), **result})
     return 0
 
 

@@ -13,15 +13,11 @@ it, because the emulators' wires take no time. Only the emulated Dynamixel servo
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-from pathlib import Path
 from typing import Any
 
-import numpy as np
+from measuring import Rows, markdown, parser, read_rows, spread
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.drivers import make_robot
@@ -86,52 +82,47 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
     }
 
 
-def spread(values: list[float]) -> dict[str, float]:
-    """Return p50, p99 and max."""
-    found = np.percentile(values or [np.nan], (50, 99, 100))
-    return dict(zip(("p50", "p99", "max"), (round(float(v), 3) for v in found), strict=True))
+HEADS = (
+    "wire",
+    "commands a second",
+    "seconds",
+    "round trip p50 / p99 / max [ms]",
+    "cycle late p50 / p99 / max [ms]",
+    "command, state on the wire [ms]",
+    "transport errors",
+)
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the rows as Markdown."""
-    lines = [
-        "| wire | commands a second | seconds | round trip p50 / p99 / max [ms] | "
-        "cycle late p50 / p99 / max [ms] | command, state on the wire [ms] | transport errors |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for row in rows:
         trip, late = (
             " / ".join(f"{row[name][k]:.2f}" for k in ("p50", "p99", "max"))
             for name in ("round_trip_ms", "late_ms")
         )
         wire = ", ".join(f"{value:.2f}" for value in row["wire_ms"] or ())
-        lines.append(
-            f"| {row['transport']} | {row['rate_hz']} | {row['seconds']:g} | {trip} | {late} | {wire} | "
-            f"{row['transport_errors']} |"
-        )
-    return "\n".join(lines)
+        first = (row["transport"], row["rate_hz"], f"{row['seconds']:g}")
+        lines.append((*first, trip, late, wire, row["transport_errors"]))
+    return markdown(HEADS, lines)
 
 
 def main() -> int:
     """Measure the rows and print them as a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--transports", nargs="+", default=["serial", "can", "odrive", "dynamixel"])
-    parser.add_argument("--rates", nargs="+", type=int, default=[50, 200])
-    parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--out", type=Path, default=None)
-    parser.add_argument("--table", type=Path, default=None, help="print the table of a result")
-    given = parser.parse_args()
+    options = parser(__doc__, table=True)
+    options.add_argument("--transports", nargs="+", default=["serial", "can", "odrive", "dynamixel"])
+    options.add_argument("--rates", nargs="+", type=int, default=[50, 200])
+    options.add_argument("--seconds", type=float, default=120.0)
+    given = options.parse_args()
     if given.table is not None:
-        print(table(json.loads(given.table.read_text(encoding="utf-8"))["rows"]))
+        print(table(read_rows(given.table)))
         return 0
-    rows = []
+    rows = Rows(__file__, given.out)
     for transport in given.transports:
         for rate_hz in given.rates:
-            rows.append(measure(transport, rate_hz, given.seconds))
-            print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
-    print(table(rows))
-    if given.out is not None:
-        write_rows(given.out, rows, program="tools/measure_cartpole_wires.py")
+            row = measure(transport, rate_hz, given.seconds)
+            rows.add(row, table([row]).splitlines()[-1], table=True)
+    print(table(rows.rows))
     return 0
 
 

@@ -13,16 +13,14 @@ servo, to measure the cost of a dead one.
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
+from measuring import Rows, spread
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
 from deal_hw.drivers.cartpole.dynamixel.bus import Bus
@@ -81,14 +79,11 @@ def measure(
             missed += 1
         trips.append((clock.now_ns() - asked_ns) / 1e6)
     wire_bytes = QUESTION_BYTES + bus.answer_bytes(len(servos), BLOCK_BYTES, not absent)
-    p50, p99 = np.percentile(trips, [50, 99])
     return {
         "rate_hz": rate_hz,
         "questions": count,
         "missed": missed,
-        "p50_ms": round(float(p50), 3),
-        "p99_ms": round(float(p99), 3),
-        "max_ms": round(max(trips), 3),
+        **spread(trips, "_ms"),
         "wire_ms": round(1e4 * wire_bytes / settings.baud_rate, 3),
     }
 
@@ -108,17 +103,14 @@ def some_port(config: MeasureBus) -> Iterator[str]:
 
 def main(config: MeasureBus) -> None:
     """Measure and print each row as it comes."""
-    rows = []
+    rows = Rows(__file__, config.out)
     with some_port(config) as port:
         path, settings = parse_port(port)
         become_realtime()
         with SerialTransport(path, settings.baud_rate) as transport:
             bus = Bus(transport, MonotonicClock(), settings.baud_rate, settings.answer_s)
             for rate_hz in config.rates:
-                rows.append(measure(bus, settings, rate_hz, config.seconds, config.absent))
-                print(json.dumps(rows[-1]), flush=True)
-    if config.out is not None:
-        write_rows(config.out, rows, program=f"tools/{Path(__file__).name}")
+                rows.add(measure(bus, settings, rate_hz, config.seconds, config.absent))
 
 
 if __name__ == "__main__":

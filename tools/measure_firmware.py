@@ -8,6 +8,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from measuring import markdown
+
 from deal_hw.drivers.cartpole import native, protocol
 from deal_hw.drivers.cartpole.avr_device import Chip, eeprom
 from deal_hw.drivers.cartpole.host_firmware import Settings
@@ -38,8 +40,8 @@ def armed_chip() -> Chip:
     return chip
 
 
-def row(name: str, period: int, cart: int, pole: int, ticks: int = 1000) -> str:
-    """Return a line of the table: ticks between targets, counts of both encoders in each."""
+def row(name: str, period: int, cart: int, pole: int, ticks: int = 1000) -> list[str]:
+    """Return the cells of a line: ticks between targets, counts of both encoders in each."""
     chip, plain = armed_chip(), 0
     for tick in range(ticks):
         data = b""
@@ -54,7 +56,7 @@ def row(name: str, period: int, cart: int, pole: int, ticks: int = 1000) -> str:
     asleep = 100 * chip.asleep / CYCLES_PER_TICK / ticks
     cycles, less = (f"{count:,}".replace(",", " ") for count in (chip.longest_step, plain))
     chip.close()
-    return f"| {name} | {cycles} | {less} | {left:.0f} % | {asleep:.0f} % |"
+    return [name, cycles, less, f"{left:.0f} %", f"{asleep:.0f} %"]
 
 
 def main() -> None:
@@ -62,12 +64,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         print(native.write_image(Path(folder)))
         print(native.write_stm32_image(Path(folder)), end="\n\n")
-    print("| situation | with a state frame | without | left of 16 000 | asleep |\n|---|---|---|---|---|")
-    print(row("armed, at rest, targets at 50 Hz", 20, 0, 0))
-    print(row("armed, at rest, targets at 200 Hz", 5, 0, 0))
-    print(row("1 m/s, pole at 2 turns a second, 50 Hz", 20, 40, 8))
-    print(row("2 m/s, pole at 4 turns a second, 50 Hz", 20, 80, 16))
-    print(row("2.5 m/s, pole at 5 turns a second, 50 Hz", 20, 100, 20))
+    lines = [
+        row("armed, at rest, targets at 50 Hz", 20, 0, 0),
+        row("armed, at rest, targets at 200 Hz", 5, 0, 0),
+        row("1 m/s, pole at 2 turns a second, 50 Hz", 20, 40, 8),
+        row("2 m/s, pole at 4 turns a second, 50 Hz", 20, 80, 16),
+        row("2.5 m/s, pole at 5 turns a second, 50 Hz", 20, 100, 20),
+    ]
+    print(markdown(("situation", "with a state frame", "without", "left of 16 000", "asleep"), lines))
 
 
 if __name__ == "__main__":

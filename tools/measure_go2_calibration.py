@@ -16,7 +16,6 @@ millisecond.
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import subprocess
 import sys
@@ -27,9 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import add_seeds, head, parser, write_document
 
-from deal_hw.bench.rows import describe_call
-from deal_hw.cli.bench import parse_seeds
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.workflows.emulation.process import EmulatorProcess
@@ -43,18 +41,13 @@ GAINS = ("stiffness", "damping")
 def main() -> int:
     """Measure each seed and write the rows."""
     options = _options()
-    result: dict[str, Any] = {
-        **describe_call("tools/measure_go2_calibration.py"),
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "rows": [],
-    }
+    result: dict[str, Any] = {**head(__file__, dated=True), "rows": []}
     for seed in options.seeds:
         row = measure(options, seed)
         result["rows"].append(row)
         print(json.dumps({k: v for k, v in row.items() if k != "parameters"}), flush=True)
         result["summary"] = summary(result["rows"])
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_document(options.out, result)
     print(json.dumps(result["summary"], indent=1))
     return 0 if all("error" not in row for row in result["rows"]) else 1
 
@@ -208,20 +201,18 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--transport", choices=tuple(PORTS), default="zenoh")
-    parser.add_argument("--domain", type=int, default=77, help="DDS domain")
-    parser.add_argument("--seeds", type=parse_seeds, default=(1000,), help="such as 1000-1004")
-    parser.add_argument("--profile", default="sensor", help="profile of the emulator")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of the recording to fit")
-    parser.add_argument("--heldout", default="steps", help="family of the held-out motion")
-    parser.add_argument("--heldout-seconds", type=float, default=6.0)
-    parser.add_argument("--calibrate", default="--method local", help="further options of calibrate")
-    parser.add_argument("--keep", type=Path, default=None, help="folder for the runs' temporary folders")
-    parser.add_argument("--out", type=Path, required=True)
-    return parser.parse_args()
+    made = parser(__doc__, out=False)
+    made.add_argument("--transport", choices=tuple(PORTS), default="zenoh")
+    made.add_argument("--domain", type=int, default=77, help="DDS domain")
+    add_seeds(made, 1000)
+    made.add_argument("--profile", default="sensor", help="profile of the emulator")
+    made.add_argument("--seconds", type=float, default=10.0, help="length of the recording to fit")
+    made.add_argument("--heldout", default="steps", help="family of the held-out motion")
+    made.add_argument("--heldout-seconds", type=float, default=6.0)
+    made.add_argument("--calibrate", default="--method local", help="further options of calibrate")
+    made.add_argument("--keep", type=Path, default=None, help="folder for the runs' temporary folders")
+    made.add_argument("--out", type=Path, required=True)
+    return made.parse_args()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ Memory is the resident set of each process, every 5 s. The supervisor reads the 
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import threading
@@ -20,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from measuring import head, parser, write_document
 
-from deal_hw.bench.rows import describe_call
 from deal_hw.data.recording.repair import verify
 from deal_hw.drivers.go2.emulator.profiles import PROFILES
 from deal_hw.workflows.deploy import deploy
@@ -126,20 +125,15 @@ def measure(transport: str, profile: str, seed: int, seconds: float) -> dict[str
 
 def main() -> None:
     """Walk as the command line says; print the row."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--transport", choices=("dds", "zenoh"), default="zenoh")
-    parser.add_argument("--profile", choices=sorted(PROFILES), default="realistic")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--out", type=Path, help="write the row to this JSON file, too")
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--transport", choices=("dds", "zenoh"), default="zenoh")
+    options.add_argument("--profile", choices=sorted(PROFILES), default="realistic")
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--seconds", type=float, default=600.0)
+    args = options.parse_args()
     row = measure(args.transport, args.profile, args.seed, args.seconds)
     print(json.dumps(row, indent=1))
-    if args.out is not None:
-        document = {**describe_call(f"tools/{Path(__file__).name}"), "rows": [row]}
-        args.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_document(args.out, {**head(__file__), "rows": [row]})
 
 
 if __name__ == "__main__":

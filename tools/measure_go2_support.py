@@ -7,14 +7,11 @@ prints a table with their range over seeds and profiles, for each situation.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-from pathlib import Path
-from typing import Any
 
 import numpy as np
+from measuring import Rows, line, markdown, parser
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.drivers.go2.descriptions.leg_geometry import foot_loads, foot_positions
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth
@@ -43,13 +40,12 @@ def window(device: Go2Device, after_ms: int) -> list[LowStateFrame]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--out", type=Path, help="write the rows to this JSON file, too")
-    options = parser.parse_args()
-    found: list[dict[str, Any]] = []
-    print("| situation | answers | reach [m] | third foot [m] | load [N] | foot sensors | fastest joint |")
-    print("|---|---|---|---|---|---|---|")
+    made = parser(__doc__)
+    made.add_argument("--seeds", type=int, default=5)
+    options = made.parse_args()
+    found = Rows(__file__, options.out)
+    heads = ("reach [m]", "third foot [m]", "load [N]", "foot sensors", "fastest joint")
+    print(markdown(("situation", "answers", *heads), ()))
     for name, settings in SITUATIONS.items():
         rows, answers = [], set()
         for profile, seed in itertools.product(("sensor", "realistic"), range(options.seeds)):
@@ -65,12 +61,10 @@ def main() -> None:
                 (reach.mean(), np.sort(reach)[1], foot_loads(position, effort)[:, 2].sum(), feet.max(), speed)
             )
             values = dict(zip(COLUMNS, map(float, rows[-1]), strict=True))
-            found.append({"situation": name, "profile": profile, "seed": seed, "answer": answer, **values})
+            found.add({"situation": name, "profile": profile, "seed": seed, "answer": answer, **values}, "")
         low, high = np.min(rows, axis=0), np.max(rows, axis=0)
         cells = [f"{a:.{n}f} to {b:.{n}f}" for a, b, n in zip(low, high, (3, 3, 1, 0, 2), strict=True)]
-        print(f"| {name} | {', '.join(sorted(answers))} | {' | '.join(cells)} |")
-    if options.out is not None:
-        write_rows(options.out, found, program=f"tools/{Path(__file__).name}")
+        print(line(name, ", ".join(sorted(answers)), *cells))
 
 
 if __name__ == "__main__":

@@ -19,10 +19,11 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 from go2_transport_sides import LATE_NS
+from measuring import Rows
 from side_process import SideProcess
 from stall_monitor import Account, watch_stalls
 
-from deal_hw.bench.rows import describe_machine, write_rows
+from deal_hw.bench.rows import describe_machine
 from deal_hw.cli.show import seconds_bar
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.ranges import Range, check_ranges
@@ -93,10 +94,9 @@ def bench_transport(settings: TransportBench) -> int:
     row["load_before"] = machine["load"]
     if not settings.quiet:
         print("\n".join(lines(row)))
-    if settings.out is not None:
-        write_rows(settings.out, [row], program="tools/measure_go2_transport.py")
-        if not settings.quiet:
-            print(f"written: {settings.out}")
+    Rows(__file__, settings.out).add(row, "")
+    if settings.out is not None and not settings.quiet:
+        print(f"written: {settings.out}")
     return int(row["frozen"] is not None and _longest_s(row["frozen"]) > FREEZE_LIMIT_S)
 
 

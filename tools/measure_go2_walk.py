@@ -19,7 +19,6 @@ goes on where it was.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
 import os
@@ -28,8 +27,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import head, parser, program, write_document
 
-from deal_hw.bench.rows import Cells, Row, describe_call, run_cells
+from deal_hw.bench.rows import Cells, Row, run_cells
 from deal_hw.control.loop import Outcome
 from deal_hw.control.planned_end import PlannedEnd
 from deal_hw.control.posture import PostureConfig
@@ -193,16 +193,13 @@ def measure_ends(
 
 def main() -> None:
     """Walk as the command line says; print a row for each robot."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--policy", type=Path, default=shipped_policy("go2"))
-    parser.add_argument("--profile", choices=sorted(PROFILES), default="realistic")
-    parser.add_argument("--seeds", type=int, nargs="*", default=[0], help="none: the nominal robot")
-    parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--ends", type=int, default=0, help="end walks at so many phases; needs --out")
-    parser.add_argument("--out", type=Path, help="write the rows to this JSON file, too")
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--policy", type=Path, default=shipped_policy("go2"))
+    options.add_argument("--profile", choices=sorted(PROFILES), default="realistic")
+    options.add_argument("--seeds", type=int, nargs="*", default=[0], help="none: the nominal robot")
+    options.add_argument("--rounds", type=int, default=1)
+    options.add_argument("--ends", type=int, default=0, help="end walks at so many phases; needs --out")
+    args = options.parse_args()
     policy = OnnxPolicy(args.policy)
     if args.ends:
         runs = [
@@ -215,20 +212,18 @@ def main() -> None:
         ]
         cells = Cells(names=("profile", "seed", "velocity"), runs=runs)
         if args.out is None:
-            parser.error("--ends needs --out FILE.json, which keeps the rows")
+            options.error("--ends needs --out FILE.json, which keeps the rows")
 
         def after(number: str, row: Row, rows: list[Row]) -> None:
             print(number, json.dumps(row), flush=True)
 
-        run_cells(cells, args.out, after, f"tools/{Path(__file__).name}")
+        run_cells(cells, args.out, after, program(__file__))
         return
     rows = []
     for seed in args.seeds or [None]:
         rows.append(measure(policy, args.profile, seed, args.rounds))
         print(json.dumps(rows[-1]), flush=True)
-    if args.out is not None:
-        document = {**describe_call(f"tools/{Path(__file__).name}"), "policy": policy.digest, "rows": rows}
-        args.out.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    write_document(args.out, {**head(__file__), "policy": policy.digest, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ run took longer than five seconds, was killed, or left something behind.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -25,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import Rows, load, parser
 from safetensors import safe_open
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 
 MOST_S = 5.0
@@ -99,7 +98,7 @@ def measure(verb: str, dataset: Path, number: signal.Signals, after_s: float) ->
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
         time.sleep(after_s)
-        load, early = os.getloadavg()[0], process.poll()
+        now_load, early = load(), process.poll()
         process.send_signal(number)
         sent = time.monotonic()
         try:
@@ -121,7 +120,7 @@ def measure(verb: str, dataset: Path, number: signal.Signals, after_s: float) ->
             "broken_files": list(broken(Path(out))),
             "files": sorted(path.name for path in Path(out).rglob("*") if path.is_file()),
             "last_words": words[-1][-200:] if words else "",
-            "load": round(load, 1),
+            "load": now_load,
         }
 
 
@@ -150,26 +149,21 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("dataset", type=Path, help="of a cart-pole, such as the demo's")
-    parser.add_argument("--runs", type=int, default=20, help="signals in all, the verbs in turn")
-    parser.add_argument("--verbs", nargs="+", choices=VERBS, default=VERBS)
-    parser.add_argument("--longest", type=float, default=40.0, help="latest signal [s]")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="JSON file of the rows")
-    given = parser.parse_args(words)
-    rng, rows = np.random.default_rng(given.seed), []
+    options = parser(__doc__)
+    options.add_argument("dataset", type=Path, help="of a cart-pole, such as the demo's")
+    options.add_argument("--runs", type=int, default=20, help="signals in all, the verbs in turn")
+    options.add_argument("--verbs", nargs="+", choices=VERBS, default=VERBS)
+    options.add_argument("--longest", type=float, default=40.0, help="latest signal [s]")
+    options.add_argument("--seed", type=int, default=0)
+    given = options.parse_args(words)
+    rng, rows = np.random.default_rng(given.seed), Rows(__file__, given.out)
     for run in range(given.runs):
         verb = given.verbs[run % len(given.verbs)]
         number = (signal.SIGINT, signal.SIGTERM)[run // len(given.verbs) % 2]
-        rows.append(measure(verb, given.dataset, number, float(rng.uniform(0.5, given.longest))))
-        print(json.dumps({name: value for name, value in rows[-1].items() if name != "files"}), flush=True)
-        if given.out is not None:
-            write_rows(given.out, rows, program="tools/measure_interrupts.py")
-    print(table(rows))
-    return int(not all(map(sound, rows)))
+        row = measure(verb, given.dataset, number, float(rng.uniform(0.5, given.longest)))
+        rows.add(row, json.dumps({name: value for name, value in row.items() if name != "files"}))
+    print(table(rows.rows))
+    return int(not all(map(sound, rows.rows)))
 
 
 if __name__ == "__main__":

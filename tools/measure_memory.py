@@ -16,7 +16,6 @@ slope of a line through the second half is the growth.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import json
 import platform
@@ -29,8 +28,8 @@ from typing import Any, Literal
 import numpy as np
 from fakes.recorded_commands import RecordedCommands
 from fakes.simulated_episode import simulated_episode
+from measuring import head, parser
 
-from deal_hw.bench.rows import describe_call
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calibration import Budget, Progress
@@ -238,22 +237,19 @@ def write(path: Path, settings: Mapping[str, Any], rows: Sequence[Mapping[str, A
     kept = before["rows"] if before.get("settings") == settings else []
     found = {row["method"]: row for row in (*kept, *rows)}
     lines = ",\n".join(json.dumps(found[m]) for m in (*SEARCHES, *WHOLES) if m in found)
-    head = json.dumps({**describe_call(f"tools/{Path(__file__).name}"), "settings": settings})
-    path.write_text(f'{head[:-1]},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
+    first = json.dumps({**head(__file__), "settings": settings})
+    path.write_text(f'{first[:-1]},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
 
 
 def main() -> int:
     """Measure and write one JSON file; return 1 if a method's memory grows."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--methods", nargs="+", default=[*SEARCHES, *WHOLES])
-    parser.add_argument("--generations", type=int, default=60)
-    parser.add_argument("--population", type=int, default=8)
-    parser.add_argument("--seconds", type=float, default=0.6, help="length of the recording")
-    parser.add_argument("--out", type=Path, default=None, help="file to write; printed only without it")
-    parser.add_argument("--one", action="store_true", help="measure in this process and print JSON")
-    config = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--methods", nargs="+", default=[*SEARCHES, *WHOLES])
+    options.add_argument("--generations", type=int, default=60)
+    options.add_argument("--population", type=int, default=8)
+    options.add_argument("--seconds", type=float, default=0.6, help="length of the recording")
+    options.add_argument("--one", action="store_true", help="measure in this process and print JSON")
+    config = options.parse_args()
     settings = {key: getattr(config, key) for key in ("generations", "population", "seconds")}
     if config.one:
         print(json.dumps(watch(config.methods[0], **settings)))

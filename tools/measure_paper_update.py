@@ -15,21 +15,19 @@ parameters together have this error, above the truth.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import Rows, add_seeds, parser
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.calib.pipeline.methods import PAPER_POPULATION
 from deal_hw.calib.search.algorithm1 import PaperSettings, literal
 from deal_hw.calib.search.diffusion_evolution import DiffusionEvolution, DiffusionSettings
-from deal_hw.cli.bench import parse_ratios, parse_seeds
+from deal_hw.cli.bench import parse_ratios
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +130,12 @@ def measure(name: str, dimensions: int, ratio: float, seed: int) -> dict[str, An
 
 def main() -> int:
     """Measure each reading, and print the mean error over the seeds."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seeds", type=parse_seeds, default=(0,), help="such as 1,2,3 or 1000-1009")
-    parser.add_argument("--updates", nargs="+", choices=UPDATES, default=list(UPDATES), metavar="UPDATE")
-    parser.add_argument("--parameters", type=int, nargs="+", default=[9, 11, 50, 92, 122], metavar="K")
-    parser.add_argument("--range-ratio", type=parse_ratios, default=(10.0, 15.0, 20.0))
-    parser.add_argument("--out", type=Path, default=None, help="write the rows to this JSON file")
-    given = parser.parse_args()
+    options = parser(__doc__)
+    add_seeds(options, 0)
+    options.add_argument("--updates", nargs="+", choices=UPDATES, default=list(UPDATES), metavar="UPDATE")
+    options.add_argument("--parameters", type=int, nargs="+", default=[9, 11, 50, 92, 122], metavar="K")
+    options.add_argument("--range-ratio", type=parse_ratios, default=(10.0, 15.0, 20.0))
+    given = options.parse_args()
     rows: list[dict[str, Any]] = []
     for name, dimensions, ratio in itertools.product(given.updates, given.parameters, given.range_ratio):
         mine = [measure(name, dimensions, ratio, seed) for seed in given.seeds]
@@ -150,8 +147,7 @@ def main() -> int:
             file=sys.stderr,
             flush=True,
         )
-    if given.out is not None:
-        write_rows(given.out, [*rows, *printed_rows()], program="tools/measure_paper_update.py")
+    Rows(__file__, given.out).keep([*rows, *printed_rows()])
     return 0
 
 

@@ -8,7 +8,6 @@ noisy, as on a robot: repeated ones would compress to nothing.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from measuring import Rows, parser
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -120,25 +119,20 @@ def record(robot: str, made: list[CycleRecord], left_out: frozenset[str]) -> tup
 
 def main() -> None:
     """Print a line for each robot."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of each recording")
-    parser.add_argument("--out", type=Path, help="a JSON file for the rows")
-    options = parser.parse_args()
-    rows = []
+    known = parser(__doc__)
+    known.add_argument("--seconds", type=float, default=10.0, help="length of each recording")
+    options = known.parse_args()
+    rows = Rows(__file__, options.out)
     for robot in ("cartpole", "go2"):
         made = cycles(robot, round(options.seconds * 50), np.random.default_rng(0))
         without, with_ = record(robot, made, frozenset(STANDARD)), record(robot, made, frozenset())
-        print(
+        said = (
             f"{robot}: {without[0] / 1e3:.1f} kB/s without, {with_[0] / 1e3:.1f} with standard messages: "
             f"{with_[0] / without[0]:.2f} times; {without[1]:.3f} and {with_[1]:.3f} ms a cycle"
         )
         sizes = {"bytes_per_second": without[0], "with_standard_messages": with_[0]}
         times = {"ms_per_cycle": without[1], "ms_with_standard_messages": with_[1]}
-        rows.append({"robot": robot, **sizes, **times})
-    if options.out is not None:
-        write_rows(options.out, rows, program="tools/measure_recording_size.py")
+        rows.add({"robot": robot, **sizes, **times}, said)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ row has the best fit until then.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -32,8 +31,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import Rows, hear_signals, parser
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.testing.plain_robots import RATE_HZ, PlainRobot, record
 
 STEP_S = 0.0025
@@ -298,32 +297,26 @@ def words(row: dict[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--joints", type=int, nargs="+", default=[7, 14], choices=range(1, 15), metavar="N")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="SEED")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of what is fitted [s]")
-    parser.add_argument("--limit", type=float, default=1200.0, help="stop a calibration after this time [s]")
-    parser.add_argument("--options", default="", help="more options of deal-hw calibrate, in one word")
-    parser.add_argument("--profile", type=Path, help="file for cProfile's figures; the last run's are kept")
-    parser.add_argument("--out", type=Path, help="file of the rows (JSON)")
-    given = parser.parse_args(arguments)
-    # A shell starts background jobs with Ctrl-C ignored, and so would be the calibration's limit.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    rows = []
+    options = parser(__doc__)
+    options.add_argument("--joints", type=int, nargs="+", default=[7, 14], choices=range(1, 15), metavar="N")
+    options.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="SEED")
+    options.add_argument("--seconds", type=float, default=60.0, help="length of what is fitted [s]")
+    options.add_argument("--limit", type=float, default=1200.0, help="stop a calibration after this time [s]")
+    options.add_argument("--options", default="", help="more options of deal-hw calibrate, in one word")
+    options.add_argument("--profile", type=Path, help="file for cProfile's figures; the last run's are kept")
+    given = options.parse_args(arguments)
+    # The limit ends a calibration by Ctrl-C.
+    hear_signals()
+    rows = Rows(__file__, given.out)
     for joints in given.joints:
         for seed in given.seeds:
             row = measure(joints, seed, given.seconds, given.limit, given.options.split(), given.profile)
-            rows.append(row)
-            print(words(row), flush=True)
-            if given.out is not None:
-                write_rows(given.out, rows, program="tools/measure_size.py")
+            rows.add(row, words(row))
     if given.profile is not None and given.profile.exists():
         figures = pstats.Stats(str(given.profile))
         figures.sort_stats("cumulative").print_stats(SHOWN_FUNCTIONS)
         figures.sort_stats("tottime").print_stats(SHOWN_FUNCTIONS)
-    return int(any(row["error"] for row in rows))
+    return int(any(row["error"] for row in rows.rows))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ an ODrive's is always 1 ms, which is added to the truth.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -32,10 +31,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import Rows, add_seeds, parser, read_rows
 
-from deal_hw.bench.rows import write_rows
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.cli.bench import parse_seeds
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.drivers.cartpole.avr_device import AvrDevice
@@ -256,35 +254,29 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Measure the rows and print them as a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--transports", nargs="+", choices=WIRES, default=WIRES, help="all by default")
-    parser.add_argument("--virtual", action="store_true", help="in virtual time")
-    parser.add_argument("--profile", default="sensor")
-    parser.add_argument("--seeds", type=parse_seeds, default=(1, 2, 3), help="such as 1,2,3 or 0-9")
-    parser.add_argument("--repeats", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=None)
-    parser.add_argument("--table", type=Path, default=None, help="print the table of a result")
-    given = parser.parse_args()
+    options = parser(__doc__, table=True)
+    add_seeds(options, 1, 2, 3)
+    options.add_argument("--transports", nargs="+", choices=WIRES, default=WIRES, help="all by default")
+    options.add_argument("--virtual", action="store_true", help="in virtual time")
+    options.add_argument("--profile", default="sensor")
+    options.add_argument("--repeats", type=int, default=1)
+    given = options.parse_args()
     if given.table is not None:
-        kept = json.loads(given.table.read_text(encoding="utf-8"))["rows"]
+        kept = read_rows(given.table)
         print(table(kept), coverage_table(kept), sep="\n\n")
         return 0
-    rows: list[dict[str, Any]] = []
-    if given.virtual and given.out is not None and given.out.exists():
-        rows = json.loads(given.out.read_text(encoding="utf-8"))["rows"]
-    done = {(row["transport"], row["profile"], row["seed"]) for row in rows if not row["error"]}
+    # In virtual time a run gives the same row again.
+    rows = Rows(__file__, given.out, ("transport", "profile", "seed") if given.virtual else ())
     # Wires take turns, so that other work on the machine affects all of them.
     for seed in tuple(given.seeds) * given.repeats:
         for transport in given.transports:
-            if (transport, given.profile, seed) in done:
+            if given.virtual and rows.done(transport, given.profile, seed):
                 continue
             run = measure_virtual if given.virtual else measure
-            rows.append(run(transport, given.profile, seed))
-            short = rows[-1]["error"] or f"{rows[-1]['error_percent']:.2f} %"
-            print(f"{transport} seed {seed}: {short}", file=sys.stderr, flush=True)
-            if given.out is not None:
-                write_rows(given.out, rows, program="tools/measure_wire_calibration.py")
-    print(table(rows), coverage_table(rows), sep="\n\n")
+            row = run(transport, given.profile, seed)
+            short = row["error"] or f"{row['error_percent']:.2f} %"
+            rows.add(row, f"{transport} seed {seed}: {short}", table=True)
+    print(table(rows.rows), coverage_table(rows.rows), sep="\n\n")
     return 0
 
 

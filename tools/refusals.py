@@ -1,7 +1,6 @@
 """List every refusal of the product: function, type and message.
 
-    python tools/refusals.py                        # print the table
-    python tools/refusals.py --write                # rewrite tests/house/refusals.txt
+    python tools/refusals.py                        # print the table; two checkouts' tables can be compared
     python tools/refusals.py --unreached COV.json   # those that no test ran, by a report of `coverage json`
 
 A refusal is a call that makes an error: of a class of deal_hw/errors.py or of its subclasses; of
@@ -27,12 +26,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("deal_hw", "drivers", "policies", "calib")
-TABLE = Path("tests/house/refusals.txt")
 ERRORS = Path("deal_hw/errors.py")
-HEAD = """\
-# Every refusal of the product: function, type, exit code of the command ("-": see tools/refusals.py), words.
-# After a change that is meant: python tools/refusals.py --write
-"""
 EXIT_ERROR = "2"
 
 
@@ -133,7 +127,7 @@ def calls(tree: ast.Module, known: frozenset[str], defines: bool) -> Iterator[tu
 
 def table(found: list[Refusal]) -> str:
     """Return the table as text."""
-    lines, path = [HEAD.rstrip("\n")], ""
+    lines, path = [], ""
     for refusal in found:
         if refusal.path != path:
             path = refusal.path
@@ -193,10 +187,9 @@ def words(node: ast.AST) -> str:
 
 
 def main() -> int:
-    """Print or write the table, or the refusals that no test reaches."""
+    """Print the table, or the refusals that no test reaches."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--root", type=Path, default=ROOT, help="the checkout")
-    parser.add_argument("--write", action="store_true", help=f"write {TABLE}")
     parser.add_argument("--unreached", type=Path, metavar="COV.json", help="a report of `coverage json`")
     given = parser.parse_args()
     found = refusals(given.root)
@@ -204,8 +197,6 @@ def main() -> int:
         left = unreached(found, given.unreached)
         sys.stdout.write(table(left))
         print(f"# {len(left)} of {len(found)} refusals: not reached by the tests that were measured")
-    elif given.write:
-        (given.root / TABLE).write_text(table(found), encoding="utf-8")
     else:
         sys.stdout.write(table(found))
     return 0

@@ -16,8 +16,6 @@ For each recording the model is calibrated on all others, as a user would, and p
 
 from __future__ import annotations
 
-import argparse
-import datetime
 import json
 import time
 from dataclasses import dataclass
@@ -26,9 +24,9 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import mujoco
 import numpy as np
+from measuring import head, parser, write_document
 
 import deal_hw
-from deal_hw.bench.rows import describe_call
 from deal_hw.types import FloatArray, IntArray
 
 Search: TypeAlias = Literal["deal", "eki", "deal-paper"]
@@ -188,28 +186,19 @@ def medians(rows: list[dict[str, Any]]) -> dict[str, dict[str, list[float]]]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path, help="of tools/convert_cartpole.py")
-    parser.add_argument("--leave-out", nargs="*", default=[], help="names of recordings; default: each one")
-    parser.add_argument("--search", choices=get_args(Search), help="search of the calibration")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="write the rows to this file (JSON)")
-    options = parser.parse_args(arguments)
+    made = parser(__doc__)
+    made.add_argument("folder", type=Path, help="of tools/convert_cartpole.py")
+    made.add_argument("--leave-out", nargs="*", default=[], help="names of recordings; default: each one")
+    made.add_argument("--search", choices=get_args(Search), help="search of the calibration")
+    made.add_argument("--seed", type=int, default=0)
+    options = made.parse_args(arguments)
     files = sorted(options.folder.glob("*.npz"))
     if len(files) < 2:
-        parser.error(f"{options.folder} holds {len(files)} recordings (*.npz); two or more are needed")
+        made.error(f"{options.folder} holds {len(files)} recordings (*.npz); two or more are needed")
     unknown = set(options.leave_out) - {path.stem for path in files}
     if unknown:
-        parser.error(
-            f"no recording {', '.join(sorted(unknown))}; here are {', '.join(p.stem for p in files)}"
-        )
-    result: dict[str, Any] = {
-        **describe_call("tools/score_cartpole.py"),
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "rows": [],
-    }
+        made.error(f"no recording {', '.join(sorted(unknown))}; here are {', '.join(p.stem for p in files)}")
+    result: dict[str, Any] = {**head(__file__, dated=True), "rows": []}
     for path in files:
         if options.leave_out and path.stem not in options.leave_out:
             continue
@@ -217,8 +206,7 @@ def main(arguments: list[str] | None = None) -> int:
         result["rows"].append(row)
         print(json.dumps({k: row[k] for k in ("left_out", "calibrated", "processor_seconds")}), flush=True)
         result["median"] = medians(result["rows"])
-        if options.out is not None:
-            options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_document(options.out, result)
     print(json.dumps(result["median"], indent=1))
     return 0
 

@@ -11,25 +11,22 @@ fixed-range`, not refined; ``kalman`` is `deal` itself. A row has 100 times the 
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
 import torch
+from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
-from deal_hw.bench.rows import write_rows
 from deal_hw.calib.search.critic import PenaltyCritic, Samples
 from deal_hw.calib.search.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
-from deal_hw.cli.bench import parse_seeds
 from deal_hw.types import FloatArray
 
 GENERATIONS = 50
@@ -166,20 +163,17 @@ def measure(name: str, seed: int, ratio: float) -> dict[str, Any]:
 
 def main() -> int:
     """Search each robot with each step, and print the rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seeds", type=parse_seeds, default=(0,), help="such as 1,2,3 or 0-9")
-    parser.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), metavar="STEP")
-    parser.add_argument("--range-ratio", type=float, default=5.0)
-    parser.add_argument("--out", type=Path, default=None, help="write the rows to this JSON file")
-    given = parser.parse_args()
+    options = parser(__doc__)
+    add_seeds(options, 0)
+    options.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), metavar="STEP")
+    options.add_argument("--range-ratio", type=float, default=5.0)
+    given = options.parse_args()
     torch.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
+    rows = Rows(__file__, given.out)
     for seed, name in itertools.product(given.seeds, given.steps):
-        rows.append(measure(name, seed, given.range_ratio))
-        error = rows[-1]["log_error_x100"]
-        print(f"{name}, seed {seed}: {rows[-1]['error'] or f'{error:.3g}'}", file=sys.stderr, flush=True)
-        if given.out is not None:
-            write_rows(given.out, rows, program="tools/try_diffusion_regression.py")
+        row = measure(name, seed, given.range_ratio)
+        error = row["error"] or format(row["log_error_x100"], ".3g")
+        rows.add(row, f"{name}, seed {seed}: {error}", table=True)
     return 0
 
 

@@ -67,13 +67,6 @@ def run_cells(
     return rows
 
 
-FORMER_FIELDS = {"xi": "range_ratio"}
-"""Names of fields in older files."""
-
-FORMER_BENCHES = {"honest": "fixed-range"}
-"""Names of benches in older files."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Rows:
     """The content of a bench's file."""
@@ -93,11 +86,7 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     found = read_json(path, _Rows, "rows of a bench", "name another file")
     if found.format != FORMAT:
         raise DatasetError(f"{path} has format {shown(found.format)}, not {FORMAT!r}; name another file")
-    rows = [{FORMER_FIELDS.get(name, name): value for name, value in row.items()} for row in found.rows]
-    for row in rows:
-        if row.get("bench") in FORMER_BENCHES:
-            row["bench"] = FORMER_BENCHES[row["bench"]]
-    return rows
+    return list(found.rows)
 
 
 def save_rows(path: Path, rows: Sequence[Mapping[str, Any]], program: str = "deal-hw") -> None:

@@ -1,7 +1,7 @@
 """What a user can ask for wrongly: exit code 2, one line that says what to do, nothing written, no traceback.
 
 Other tests hold what one verb or one reader refuses (`git grep EXIT_ERROR tests`); here are the refusals that
-they do not provoke, each by the command line that leads to it. All sites: tests/house/refusals.txt.
+they do not provoke, each by the command line that leads to it. All sites: python tools/refusals.py.
 """
 
 from __future__ import annotations

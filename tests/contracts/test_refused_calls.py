@@ -1,6 +1,6 @@
 """What a Python program can ask for wrongly, where no command line leads to it: error and words.
 
-Beside `tests/cli/test_cli_refusals.py`. All sites: tests/house/refusals.txt.
+Beside `tests/cli/test_cli_refusals.py`. All sites: python tools/refusals.py.
 """
 
 from __future__ import annotations

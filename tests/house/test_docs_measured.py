@@ -69,4 +69,4 @@ def test_a_tool_that_writes_rows_writes_their_head(path: Path) -> None:
     """Each tool that writes figures as JSON also writes the description of its call."""
     text = path.read_text(encoding="utf-8")
     if path.name.startswith(("measure_", "dds_peer_")) and re.search(r'"--out"|out: Path', text):
-        assert re.search(r"\b(?:describe_call|write_rows)\(", text) or "fault_table" in text
+        assert re.search(r"\b(?:Rows|head|run_cells)\(", text) or "fault_table" in text

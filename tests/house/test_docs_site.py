@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
 
 import check_site
 import docs_pages
 import pytest
+from refusals import Refusal
 
 import deal_hw
 from deal_hw import documentation
@@ -53,15 +55,14 @@ def test_each_verb_is_in_the_reference() -> None:
 
 def test_each_refusal_is_on_the_page_of_errors() -> None:
     """Messages with exit status 2 are rows below their file; others are left out."""
-    table = """\
-# head
-a/b.py
-    f  DatasetError 2  {x} | is <odd>
-    g  ValueError -  no
-c.py
-    h  KeyError -  no
-"""
-    page = docs_pages.errors_page(table)
+    made = functools.partial(Refusal, line=1, column=0, last_line=1)
+    page = docs_pages.errors_page(
+        [
+            made(path="a/b.py", function="f", kind="DatasetError", words="{x} | is <odd>", exit_code="2"),
+            made(path="a/b.py", function="g", kind="ValueError", words="no", exit_code="-"),
+            made(path="c.py", function="h", kind="KeyError", words="no", exit_code="-"),
+        ]
+    )
     assert page.endswith(
         "## a/b.py\n\n| error | message |\n|---|---|\n| `DatasetError` | … \\| is &lt;odd> |\n"
     )

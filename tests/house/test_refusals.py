@@ -1,8 +1,7 @@
-"""Every refusal has its line in a table, so that none disappears or changes its words unnoticed."""
+"""Every refusal of the sources is found by the tool, and says something."""
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
 import pytest
@@ -35,20 +34,11 @@ def found() -> list[refusals.Refusal]:
 
 
 @pytest.mark.slow
-def test_the_table_is_that_of_the_sources(found: list[refusals.Refusal]) -> None:
-    """A new, removed or changed refusal shows as a line of a diff."""
-    kept = (ROOT / refusals.TABLE).read_text(encoding="utf-8")
-    diff = difflib.unified_diff(
-        kept.splitlines(),
-        refusals.table(found).splitlines(),
-        "kept",
-        "sources",
-        lineterm="",
-        n=1,
-    )
-    assert not (lines := list(diff)), "\n".join(
-        [*lines, "", "If that is meant: python tools/refusals.py --write"]
-    )
+def test_a_refusal_says_something(found: list[refusals.Refusal]) -> None:
+    """No error of deal-hw is raised without a text; helpers behind `raise` make theirs themselves."""
+    known = refusals.error_classes()
+    silent = [f"{one.path}:{one.line}: {one.kind}" for one in found if one.kind in known and not one.words]
+    assert not silent, "\n".join(silent)
 
 
 def test_all_kinds_of_refusal_are_found(tmp_path: Path) -> None:

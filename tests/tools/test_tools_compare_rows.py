@@ -14,12 +14,12 @@ Row = dict[str, Any]
 
 
 def row(seed: int = 0, error: float = 1.0, heldout: float = 0.01, coverage: float = 0.9, **other: Any) -> Row:
-    """Return an old row of the bench `honest`."""
+    """Return a row of the bench `fixed-range`."""
     return {
-        "bench": "honest", "task": "cartpole", "space": "", "profile": "sensor", "demonstration": "excite",
-        "method": "default", "polish": True, "xi": 5.0, "seed": seed, "error": "", "error_percent": error,
-        "log_error_x100": error, "heldout_nrmse_calibrated": heldout, "coverage90": coverage,
-        "alarms": [], "seconds": 10.0, **other,
+        "bench": "fixed-range", "task": "cartpole", "space": "", "profile": "sensor",
+        "demonstration": "excite", "method": "default", "refined": True, "range_ratio": 5.0, "seed": seed,
+        "error": "", "error_percent": error, "log_error_x100": error, "heldout_nrmse_calibrated": heldout,
+        "coverage90": coverage, "alarms": [], "seconds": 10.0, **other,
     }  # fmt: skip
 
 
@@ -110,8 +110,8 @@ def test_bad_seed_is_named(files: Files) -> None:
         (0.5, 0.6, {"profile": "realistic"}, []),
         (0.5, 0.6, {"bench": "mismatch"}, []),
         (0.6, 0.5, {"profile": "realistic"}, ["coverage 0.600 -> 0.500"]),
-        (0.1, 0.1, {"method": "deal", "polish": False}, []),
-        (0.1, 0.1, {"method": "deal", "polish": True}, ["below 0.85"]),
+        (0.1, 0.1, {"method": "deal", "refined": False}, []),
+        (0.1, 0.1, {"method": "deal", "refined": True}, ["below 0.85"]),
     ],
 )
 def test_coverage(files: Files, old: float, new: float, other: Row, losses: list[str]) -> None:
@@ -128,35 +128,33 @@ def test_coverage_that_is_enough(files: Files) -> None:
     assert files([row(coverage=1.0)], [row(coverage=0.92)], "--coverage-enough", "0.9")[0] == 0
 
 
-def test_old_and_new_words_name_one_cell(files: Files) -> None:
-    """Fields, benches and methods are mapped; a whole method's refinement does not matter."""
-    old = [row(method="weki"), row(method="near", polish=False), row(method="open-loop", polish=False)]
-    new = []
-    for method, refined in (("eki", True), ("local", True), ("output-error", True)):
-        renamed = row(method=method, bench="fixed-range", refined=refined, range_ratio=5)
-        new.append({k: v for k, v in renamed.items() if k not in {"polish", "xi", "space", "demonstration"}})
+def test_a_whole_methods_refinement_does_not_matter(files: Files) -> None:
+    """It chooses for itself; settings that a row leaves out are the usual ones."""
+    old = [row(method=method, refined=False) for method in ("default", "local", "output-error")]
+    new = [row(method=method, refined=True, range_ratio=5) for method in ("default", "local", "output-error")]
+    new = [{k: v for k, v in one.items() if k not in {"space", "demonstration"}} for one in new]
     assert files(old, new)[0] == 0
     assert files(new, old)[0] == 0
 
 
 def test_search_with_and_without_refinement_are_two_cells(files: Files) -> None:
     """The refined search is not compared with the bare one."""
-    code, said = files([row(method="weki")], [row(method="eki", polish=False)])
+    code, said = files([row(method="eki")], [row(method="eki", refined=False)])
     assert code == 1
     assert "missing in NEW" in said
     assert "only in new.json: fixed-range cartpole sensor ratio 5 eki\n" in said
 
 
 def test_map_compares_methods_by_hand(files: Files) -> None:
-    """A method that is gone is compared with the one that took its place."""
-    old, new = [row(method="open-loop", error=2.0)], [row(error=2.1)]
+    """One method of OLD beside another of NEW."""
+    old, new = [row(method="eki", error=2.0)], [row(method="deal", error=2.1)]
     assert files(old, new)[0] == 1
-    assert files(old, new, "--map", "open-loop=default")[0] == 0
+    assert files(old, new, "--map", "eki=deal")[0] == 0
 
 
 def test_what_is_missing_is_a_loss(files: Files) -> None:
     """A cell, a seed, a figure, or a seed with an error; an old error and a new cell are none."""
-    _, said = files([row(), row(xi=20.0)], [row()])
+    _, said = files([row(), row(range_ratio=20.0)], [row()])
     assert "missing in NEW" in said
     code, said = files([row(0), row(1), row(2)], [row(0), row(1) | {"error": "CalibrationError: no"}])
     assert code == 1
@@ -164,7 +162,7 @@ def test_what_is_missing_is_a_loss(files: Files) -> None:
     assert "seed 1: CalibrationError: no" in said
     code, said = files([row()], [row(coverage90=None)])
     assert (code, "coverage90 is missing in NEW for seed 0" in said) == (1, True)
-    code, said = files([row(0), row(1) | {"error": "refused"}], [row(0), row(1), row(xi=20.0)])
+    code, said = files([row(0), row(1) | {"error": "refused"}], [row(0), row(1), row(range_ratio=20.0)])
     assert (code, "seed 1 had an error in OLD" in said) == (0, True)
 
 
@@ -172,7 +170,7 @@ def test_real_recordings_are_judged_in_radians_too(files: Files) -> None:
     """Each split is a cell; the pooled error counts beside the mean of joints."""
     real: Row = {
         "bench": "real", "task": "so101", "split": "a", "profile": "real", "method": "default",
-        "polish": True, "xi": 5.0, "seed": 0, "error": "", "alarms": ["x"], "seconds": 9.0,
+        "refined": True, "range_ratio": 5.0, "seed": 0, "error": "", "alarms": ["x"], "seconds": 9.0,
         "heldout_nrmse_calibrated": 0.02, "heldout_rmse_calibrated": 0.005,
         "heldout_pooled_calibrated": 0.006,
     }  # fmt: skip
@@ -196,7 +194,7 @@ def test_seconds_are_judged_where_asked(files: Files) -> None:
         ([row(), row()], [], "two rows for seed 0"),
         ([{"bench": "go2-codec"}], [], "row 0 has no 'task'"),
         (["text"], [], "row 0 is no object"),
-        ([row()], ["--map", "open-loop"], "give a method of OLD and one of NEW"),
+        ([row()], ["--map", "eki"], "give a method of OLD and one of NEW"),
     ],
 )
 def test_what_cannot_be_compared(files: Files, rows: list[Any], options: list[str], message: str) -> None:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from measure_cartpole_wires import WIRE_MS, measure, spread, table
+from measure_cartpole_wires import WIRE_MS, measure, table
 
 from deal_hw.drivers.cartpole.can_link import database
 
 pytestmark = pytest.mark.real_time
-
-
-def test_spread_has_the_middle_and_the_tail() -> None:
-    """Of 0 to 100: 50, 99 and 100."""
-    assert spread([float(k) for k in range(101)]) == {"p50": 50.0, "p99": 99.0, "max": 100.0}
 
 
 def test_times_on_the_wire_follow_from_the_frames() -> None:
