@@ -491,7 +491,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         run.left_out[SHARED_ERRORS] = f"{left}: they would take longer than the fits"
         return found
     run.say(BEFORE_SEARCH, str(suspect.alarm))
-    unchecked = Validation(cross_validation=False, split_half=False, physics_step=False, diagnosis=False)
+    unchecked = Validation(split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
     if suspect.confirmed(found.theta, found.latency_s):
         return found.but(suspect.alarm, shared_error=suspect.to_json())

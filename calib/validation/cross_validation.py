@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.problem import Member, Problem, prediction_errors
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
-
-FOLDS = 2
-"""Number of folds."""
 
 BLOCKS = 2
 """Stretches of each recording that a fold leaves out."""
@@ -92,7 +89,7 @@ def fold_numbers(count: int, folds: int, rounds: int) -> IntArray:
     return np.asarray(np.arange(count) * folds * rounds // max(count, 1) % folds)
 
 
-def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
+def fold_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each of ``count`` folds the samples of each recording that it leaves out, (T,) each.
 
     With enough motions, whole motions are left out in turn: a calibration must predict other motion. The
@@ -134,17 +131,3 @@ def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:
         found.append(number)
         last = at
     return found
-
-
-def prediction_error(problem: Problem, fits: Sequence[Member], seconds: float) -> FloatArray:
-    """Return the root mean squared prediction error of each candidate in units of the sensor's noise, (N,).
-
-    Predictions start from smoothed states and last ``seconds``, or less where no stretch is so long.
-    """
-    total, count = np.zeros(len(fits)), 0
-    for data, error in prediction_errors(problem, fits, seconds):
-        # A diverged member counts as an error of the whole range.
-        error = np.where(np.isfinite(error), error, np.ptp(data.measured, axis=(0, 1))) / data.std
-        total += np.sum(error**2, axis=(1, 2, 3))
-        count += int(np.count_nonzero(data.reported))
-    return np.asarray(np.sqrt(total / max(count, 1)))

@@ -102,7 +102,7 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             for p, column in zip(heavier, _changes(masses, data) / SETTINGS.heavier, strict=True):
                 found.setdefault(("mass", p.elements[0]), []).append(column[..., None])
         path = _path(problem, fit, data)
-        velocity, acceleration = _along(problem, data, states[data.episode][1])
+        position, velocity, acceleration = _along(problem, data, *states[data.episode])
         for name, c in zip(problem.robot.description.joint_names, range(C)[joints], strict=True):
             forces = _forces(velocity[..., c], speed[c])
             forces["inertia"] = [acceleration[..., c] / max(float(np.std(acceleration[..., c])), 1e-300)]
@@ -110,7 +110,8 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             geared = name in problem.robot.description.actuated and problem.robot.base is None
             if geared:
                 forces["backlash"] = _crossing(problem, data, states[data.episode], c, size)
-                forces["lag"] = [_late_damping(problem, fit, data, states[data.episode], path, c)]
+                moving = position[..., c], velocity[..., c], acceleration[..., c]
+                forces["lag"] = [_late_damping(problem, fit, data, *moving, path, c)]
             each = [(cause, shape) for cause, shapes in forces.items() for shape in shapes]
             force = np.zeros((1 + len(each), *velocity.shape[:2], C))
             force[1:, ..., c] = size * np.stack([shape for _, shape in each])
@@ -210,19 +211,19 @@ def _late_damping(
     problem: Problem,
     fit: Refined,
     data: WindowData,
-    states: tuple[FloatArray, FloatArray],
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
     path: FloatArray,
     c: int,
 ) -> FloatArray:
     """Return the force of a servo whose damping acts on an older speed, in the windows, (W, S), of order 1.
 
     To first order it is in proportion to the joint's acceleration, and 0 where the effort limit cuts the
-    servo's demand. ``path`` are the set-points, (1, S, A).
+    servo's demand. The joint's motion is (W, S) each; ``path`` are the set-points, (1, S, A).
     """
     recorded = problem.episodes[data.episode]
     servo = list(problem.robot.description.actuated_index).index(c - problem.robot.joints.start)
-    change = np.gradient(states[1], recorded.period_s, axis=0)
-    position, velocity, acceleration = _between(data, *states, change)
     first = recorded.sample[data.windows.start][:, None]
     at = np.minimum(first + np.arange(velocity.shape[1]), path.shape[1] - 1)
     batch = problem.batch(1)
@@ -235,8 +236,8 @@ def _late_damping(
             ("servo_effort_limit", recorded.effort_limit),
         )
     )
-    demand = stiffness * (path[0, at, servo] - position[..., c]) - damping * velocity[..., c]
-    force = damping * acceleration[..., c] * (np.abs(demand) < limit)
+    demand = stiffness * (path[0, at, servo] - position) - damping * velocity
+    force = damping * acceleration * (np.abs(demand) < limit)
     return np.asarray(force / max(float(np.std(force)), 1e-300))
 
 
@@ -303,11 +304,12 @@ def _changes(observed: FloatArray, data: WindowData) -> FloatArray:
     return data.whitened(change).reshape(*change.shape[:2], -1)
 
 
-def _along(problem: Problem, data: WindowData, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return velocities and accelerations at the device periods of each window, (W, H * stride, C) each."""
+def _along(
+    problem: Problem, data: WindowData, position: FloatArray, velocity: FloatArray
+) -> list[FloatArray]:
+    """Return positions, velocities and accelerations at the device periods of each window, (W, S, C) each."""
     period_s = problem.episodes[data.episode].period_s
-    of_velocity, of_acceleration = _between(data, velocity, np.gradient(velocity, period_s, axis=0))
-    return of_velocity, of_acceleration
+    return _between(data, position, velocity, np.gradient(velocity, period_s, axis=0))
 
 
 def _between(data: WindowData, *values: FloatArray) -> list[FloatArray]:

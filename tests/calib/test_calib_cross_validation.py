@@ -10,14 +10,14 @@ import pytest
 from fakes.fixed_search import FixedSearch
 
 from deal_hw.bench.tasks import Case
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, prediction_errors
 from deal_hw.calib.fit.output_error import Recipe, fit_output_error
 from deal_hw.calib.fit.refinement import Refined, at_parameters
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.validation.checks import Validation, unexplained
-from deal_hw.calib.validation.cross_validation import fold_masks, prediction_error
+from deal_hw.calib.validation.cross_validation import fold_masks
 from deal_hw.calibration import Budget
 
 
@@ -38,7 +38,8 @@ def test_folds_are_disjoint_and_cover_everything(noisy_problem: Problem) -> None
 def test_the_truth_predicts_left_out_motion_better(noisy: Case, noisy_problem: Problem) -> None:
     """The error of a prediction is smaller at the truth than 10 % beside it."""
     members = [(noisy.theta, noisy.latency_s), (noisy.theta * 1.1, noisy.latency_s)]
-    truth = prediction_error(noisy_problem, members, 0.2)
+    each = [error / data.std for data, error in prediction_errors(noisy_problem, members, 0.2)]
+    truth = np.sum([np.sum(error**2, axis=(1, 2, 3)) for error in each], axis=0)
     assert truth[0] < truth[1]
 
 
