@@ -101,7 +101,7 @@ def _cases(configs: Mapping[str, Any]) -> list[str]:
 
 
 def _names(config: Any) -> Sequence[str]:
-    from deal_hw.drivers import ROBOTS
+    from deal_hw.robots import driven_robots
 
     if not isinstance(config, type):
         return ()
@@ -110,5 +110,5 @@ def _names(config: Any) -> Sequence[str]:
         if tyro.conf.Positional in marks:
             if typing.get_origin(kind) is Literal:
                 return typing.get_args(kind)
-            return tuple(ROBOTS) if name == "robot" and kind is str else ()
+            return driven_robots() if name == "robot" and kind is str else ()
     return ()

@@ -9,7 +9,6 @@ from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.safety import Safety
-from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
@@ -22,6 +21,7 @@ from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, UnknownNameError
 from deal_hw.robot import Robot
+from deal_hw.robots import adopt_robot, make_robot
 from deal_hw.transport import Message, Transport
 
 pytestmark = pytest.mark.real_time
