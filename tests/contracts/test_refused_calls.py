@@ -28,7 +28,7 @@ from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.go2.emulator.sport_service import SportMode
 from deal_hw.errors import (
     ConfigurationError,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from deal_hw.drivers.cartpole.faults import CanFaults, ServoFaults
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.ranges import Checked, Range, check_ranges
