@@ -29,7 +29,8 @@ def required_policy(robot: str) -> Path:
     path = shipped_policy(robot)
     if path is None:
         raise ConfigurationError(
-            f"no policy is shipped for robot {robot!r}; `deal-hw train {robot}` trains one"
+            f"no policy is shipped for robot {robot!r}; tools/train_udr_policy.py trains one for the "
+            "cart-pole, tools/train_demo_policy.py for others"
         )
     return path
 
