@@ -306,7 +306,7 @@ def alarms() -> list[tuple[str, ...]]:
     for folder in ALARM_FOLDERS:
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Alarm" and node.args:
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding.alarm" and node.args:
                     parts = [shortened(words(part)) for part in node.args]
                     # An alarm without a text of its own is copied from a file or from the table of causes.
                     if parts[0].strip("…"):
