@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.errors import ConfigurationError, DealHwError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.ranges import Checked, Range
 from deal_hw.robots import (
     default_transport,
@@ -77,13 +77,13 @@ class DoctorReport:
     findings: tuple[Finding, ...]
 
     def _repr_html_(self) -> str:
-        rows = [(f.area, f.level.value, f.message, f.remedy) for f in self.findings]
+        rows = [(f.code, f.severity.value, f.seen, f.do) for f in self.findings]
         return html_table(("area", "level", "what", "what to do"), rows)
 
     @property
     def exit_code(self) -> int:
         """For the shell: 0, or 1 if a check failed."""
-        return int(any(finding.level is Level.FAIL for finding in self.findings))
+        return int(any(finding.severity is Severity.FAIL for finding in self.findings))
 
 
 @from_settings(DoctorSettings)
@@ -114,7 +114,7 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
     try:
         yield from _examine_link(config, name, clock)
     except DealHwError as error:
-        yield Finding("link", Level.FAIL, str(error))
+        yield Finding("link", Severity.FAIL, str(error))
         yield from other_wires(config.robot, config.port, name, clock)
 
 
@@ -161,16 +161,16 @@ def judge_interfaces(port: str) -> Iterator[Finding]:
     from deal_hw.drivers.transports.interfaces import list_interfaces
 
     for interface in list_interfaces():
-        level, remedy = Level.OK, ""
+        level, remedy = Severity.OK, ""
         if port in (interface.name, *interface.addresses) and not interface.carrier:
-            level, remedy = Level.FAIL, "check the cable, and that the robot is switched on"
+            level, remedy = Severity.FAIL, "check the cable, and that the robot is switched on"
         elif not interface.multicast and not interface.loopback and interface.up:
-            level = Level.WARN
+            level = Severity.WARN
             remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
         elif (
             not interface.multicast and interface.loopback and port in (interface.name, *interface.addresses)
         ):
-            level = Level.NOTE
+            level = Severity.NOTE
             remedy = (
                 "deal-hw's own programs find each other; programs on the vendor's SDK need `ip link set "
                 f"{interface.name} multicast on`"

@@ -1,1 +1,0 @@
-"""A bench cart-pole of others as a robot of deal-hw."""
