@@ -15,8 +15,8 @@ from verb_options import dataclasses_of
 
 from deal_hw.calib.pipeline.methods import DEFAULT_SEARCH, METHODS, SEARCHES
 from deal_hw.cli.main import VERBS, main, run
-from deal_hw.control.posture import PostureConfig
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.motions.posture import PostureConfig
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import Only
 
