@@ -18,7 +18,13 @@ import numpy as np
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.intervals import intervals
-from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
+from deal_hw.calib.fit.residual import (
+    LATENCY_STEP_S,
+    PARAMETER_STEP,
+    POSITION_STEP,
+    VELOCITY_STEP,
+    value_bounds,
+)
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import Z90, Alarm, CalibrationResult
 from deal_hw.types import FloatArray
@@ -164,9 +170,9 @@ class _Passes(Stepper):
         covariance[n:, n:] = np.diag(self._prior_std**2)
         steps = np.concatenate(
             [
-                np.full(C, DIFFERENCES.position),
-                np.full(C, DIFFERENCES.velocity),
-                np.append(np.full(len(problem.space), DIFFERENCES.parameter), DIFFERENCES.latency_s)[:P],
+                np.full(C, POSITION_STEP),
+                np.full(C, VELOCITY_STEP),
+                np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)[:P],
             ]
         )
         drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)

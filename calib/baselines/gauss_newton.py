@@ -23,7 +23,7 @@ from deal_hw.calib.data.innovations import (
 )
 from deal_hw.calib.data.problem import Problem, measurements
 from deal_hw.calib.fit.intervals import kinks_of, uncertainty
-from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
+from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
@@ -84,7 +84,7 @@ class Innovations:
                     linearise(problem, around, data, whitening.next_offset(data.measured))
                     for data, whitening in zip(self.windows, self._whitenings, strict=True)
                 ]
-        steps = np.append(np.full(len(problem.space), DIFFERENCES.parameter), DIFFERENCES.latency_s)
+        steps = np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)
         self._steps = steps[: len(steps) - (problem.fixed_latency_s is not None)]
         mean, std = problem.space.prior
         self._expected = np.flatnonzero(np.isfinite(std))

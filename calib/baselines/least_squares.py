@@ -26,7 +26,7 @@ from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
-from deal_hw.calib.fit.residual import DIFFERENCES
+from deal_hw.calib.fit.residual import PARAMETER_STEP
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
 from deal_hw.calibration import Alarm, CalibrationResult
@@ -208,7 +208,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
     space = error.space
     mean, std = space.prior
     expected = np.isfinite(std) & (weight > 0)
-    step = DIFFERENCES.parameter * np.eye(len(space))
+    step = PARAMETER_STEP * np.eye(len(space))
 
     def rows(values: FloatArray) -> FloatArray:
         found = error.residual(values)
@@ -220,7 +220,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
 
     def jacobian(value: FloatArray) -> FloatArray:
         r = rows(np.concatenate([value[None], value + step]))
-        return np.asarray((r[1:] - r[0]).T / DIFFERENCES.parameter)
+        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
 
     bounds = space.to_scale(space.low), space.to_scale(space.high)
     return least_squares(residual, start, jac=jacobian, bounds=bounds, **ends)

@@ -23,7 +23,7 @@ from deal_hw.calib.design.experiment_design import (
     Prior,
     information,
 )
-from deal_hw.calib.fit.intervals import SETTINGS as INTERVALS
+from deal_hw.calib.fit.intervals import IDENTIFIABLE_STD, WEAK_SHARE
 from deal_hw.calibration import CalibrationResult, std_words
 from deal_hw.control.excitation_plan import (
     OF_FAMILY,
@@ -233,7 +233,7 @@ def _advice(
     if after > worth * before:
         how = (
             "measure it by other means (scale, ruler, stall torque), or give what it is bound to as known"
-            if before > INTERVALS.weak_share * prior
+            if before > WEAK_SHARE * prior
             else "record for longer, or measure it by other means"
         )
         sentence = (
@@ -242,7 +242,7 @@ def _advice(
         )
         return Advice(name, before, after, "", sentence)
     unit = 1.0 if space.log_scale[k] else float(space.width[k])
-    rest = "" if after <= INTERVALS.identifiable_std * unit else _STILL_WEAK
+    rest = "" if after <= IDENTIFIABLE_STD * unit else _STILL_WEAK
     sentence = f"{_record(best)}{name} goes from {now} to {std_words(space.free[k], after)}{rest}"
     return Advice(name, before, after, best, sentence)
 

@@ -24,25 +24,17 @@ import numpy.typing as npt
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.types import FloatArray
 
+FEWEST_BLOCKS = 8
+"""Fewest blocks that show how residuals are correlated."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClusterSettings:
-    """Settings of :func:`clustered`.
+ENOUGH_BLOCKS = 24
+"""Blocks are as long as this number of them allows."""
 
-    Attributes:
-        fewest_blocks: Fewest blocks that show how residuals are correlated.
-        enough_blocks: Blocks are as long as this number of them allows.
-        parts: Parts into which a window is cut first.
-        shortest: Fewest samples of a part.
-    """
+PARTS = (8, 4, 2)
+"""Parts into which a window is cut first."""
 
-    fewest_blocks: int = 8
-    enough_blocks: int = 24
-    parts: tuple[int, ...] = (8, 4, 2)
-    shortest: int = 4
-
-
-SETTINGS = ClusterSettings()
+SHORTEST_PART = 4
+"""Fewest samples of a part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +93,11 @@ def clustered(
     found: Clustered | None = None
     for parts, group in _levels(rows, samples):
         length = group * samples // parts
-        if length < max(SETTINGS.shortest, 2 * correlation_samples) and parts > 1:
+        if length < max(SHORTEST_PART, 2 * correlation_samples) and parts > 1:
             continue
         level = _level(rows, bread, samples, parts, group)
         settled = found is not None and not found.autocorrelated
-        if level.blocks < (SETTINGS.enough_blocks if settled else SETTINGS.fewest_blocks):
+        if level.blocks < (ENOUGH_BLOCKS if settled else FEWEST_BLOCKS):
             break
         found = level
     return found
@@ -114,7 +106,7 @@ def clustered(
 def _levels(rows: Sequence[WindowRows], samples: int) -> list[tuple[int, int]]:
     """Return (parts of a window, windows in a group) from the shortest block to the longest."""
     longest = max((len(r.residual) for r in rows), default=0)
-    levels = [(parts, 1) for parts in (*SETTINGS.parts, 1) if samples // parts >= 1]
+    levels = [(parts, 1) for parts in (*PARTS, 1) if samples // parts >= 1]
     group = 2
     while group <= longest:
         levels.append((1, group))

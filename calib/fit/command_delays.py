@@ -27,23 +27,14 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.residual import WindowRows
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CommandDelaySettings:
-    """Settings of this module.
+EARLIER_COMMANDS = 8
+"""Commands before a window whose delays still count [-]: a slewing set-point is behind until it arrives."""
 
-    Attributes:
-        earlier: Commands before a window whose delays still count [-]: a slewing set-point is behind until it
-            arrives.
-        most: Most commands in a window; with more, delays of single commands cannot be told from noise.
-        std_s: Least and largest standard deviation of delays that is looked for [s].
-    """
+MOST_COMMANDS = 120
+"""Most commands in a window; with more, delays of single commands cannot be told from noise."""
 
-    earlier: int = 8
-    most: int = 120
-    std_s: tuple[float, float] = (1e-5, 0.1)
-
-
-SETTINGS = CommandDelaySettings()
+DELAY_STD_S = (1e-5, 0.1)
+"""Least and largest standard deviation of delays that is looked for [s]."""
 
 
 def with_command_delays(problem: Problem, windows: Sequence[WindowData]) -> list[WindowData]:
@@ -82,8 +73,8 @@ def delay_columns(
     episode = problem.episodes[data.episode]
     begins = command_begins(episode)
     count = _in_window(episode.sample[data.windows.start], data.windows.length * data.windows.stride, begins)
-    P = min(count + SETTINGS.earlier, len(begins))
-    if not count or P > SETTINGS.most:
+    P = min(count + EARLIER_COMMANDS, len(begins))
+    if not count or P > MOST_COMMANDS:
         return None
     targets = np.repeat(episode.target[None], 1 + P, axis=0)
     for k in range(P):
@@ -172,7 +163,7 @@ def likely_std(
         left = power - float(by[:, K] @ shrunk[:, K]) - float(g @ np.linalg.solve(H, g))
         return float(count * np.log(left / count) + np.sum(np.log1p(gain)) + np.linalg.slogdet(H)[1])
 
-    least, most = np.log(SETTINGS.std_s)
+    least, most = np.log(DELAY_STD_S)
     best = minimize_scalar(deviance, bounds=(least, most), method="bounded")
     return float(np.exp(best.x)), deviance(-np.inf) - float(best.fun)
 

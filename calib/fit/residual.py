@@ -16,32 +16,27 @@ from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.calib.fit.command_delays import with_command_delays
 from deal_hw.types import FloatArray
 
+PARAMETER_STEP = 1e-4
+"""Step of the differences that linearise predictions: of a parameter, in its own scale."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DifferenceSettings:
-    """Steps of the differences that linearise predictions.
+CONTACT_PARAMETER_STEP = 2e-2
+"""The same with feet on the floor. Sticking and slipping make kinks on every scale, and a secant describes
+them better than a derivative."""
 
-    Attributes:
-        parameter: Of a parameter, in its own scale.
-        contact_parameter: The same with feet on the floor. Sticking and slipping make kinks on every scale,
-            and a secant describes them better than a derivative.
-        noise_free_parameter: The same for noise-free states, where no noise hides a secant's error.
-        latency_s: Of the latency [s].
-        position: Of a start position [rad or m].
-        velocity: Of a start velocity [rad/s or m/s].
-        contact_state: Of start states with feet on the floor, in standard deviations of the smoothed ones.
-    """
+NOISE_FREE_PARAMETER_STEP = 1e-5
+"""The same for noise-free states, where no noise hides a secant's error."""
 
-    parameter: float = 1e-4
-    contact_parameter: float = 2e-2
-    noise_free_parameter: float = 1e-5
-    latency_s: float = 2e-4
-    position: float = 1e-6
-    velocity: float = 1e-4
-    contact_state: float = 0.5
+LATENCY_STEP_S = 2e-4
+"""The same of the latency [s]."""
 
+POSITION_STEP = 1e-6
+"""The same of a start position [rad or m]."""
 
-DIFFERENCES = DifferenceSettings()
+VELOCITY_STEP = 1e-4
+"""The same of a start velocity [rad/s or m/s]."""
+
+CONTACT_STATE_STEP = 0.5
+"""The same of start states with feet on the floor, in standard deviations of the smoothed ones."""
 
 States = list[tuple[FloatArray, FloatArray]]
 """Positions and velocities at every sample of each episode, (T, C) each."""
@@ -161,15 +156,11 @@ class Shooting:
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
         self.start_information = [1 / d.prior_std**2 for d in self.data]
-        self._parameter_step = (
-            DIFFERENCES.noise_free_parameter if problem.noise_free else DIFFERENCES.parameter
-        )
-        self._state_step = np.concatenate(
-            [np.full(C, DIFFERENCES.position), np.full(C, DIFFERENCES.velocity)]
-        )
+        self._parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
+        self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
         if self.contacts:
-            self._parameter_step = DIFFERENCES.contact_parameter
-            self._state_step = np.maximum(DIFFERENCES.contact_state * self.state_std, self._state_step)
+            self._parameter_step = CONTACT_PARAMETER_STEP
+            self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
 
     @property
     def device_periods(self) -> int:
@@ -245,7 +236,7 @@ class Shooting:
         moved = 0 if self.given else C
         members = K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
-        steps = np.concatenate([np.full(K, self._parameter_step), [DIFFERENCES.latency_s], self._state_step])
+        steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
         steps = stretch * steps[:members]
         # A negative latency or friction is no model: there, differences are taken inwards.
         low, high = value_bounds(self.problem)

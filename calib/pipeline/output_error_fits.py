@@ -26,7 +26,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import (
-    MISMATCH,
+    MISMATCH_CHI2,
     Uncertainty,
     mismatch,
     names_at_bound,
@@ -42,8 +42,7 @@ from deal_hw.calib.fit.output_error import (
     prediction_rmse,
     standing_rmse,
 )
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import at_parameters
+from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.no_data import nominal
@@ -192,7 +191,7 @@ class OutputErrorFits(Fits):
         with run.check(AFTER_FIT):
             if local is not None and left is not None:
                 # A local fit that diverged has seen only a part of the recordings.
-                lost = local.chi2 >= REFINEMENT.local_hopeless
+                lost = local.chi2 >= LOCAL_HOPELESS
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
                 if judged[1] is not None and unexplained(judged[1]):
                     causes = diagnose(judged[0], judged[1], run.play, run.allows)
@@ -221,7 +220,7 @@ class OutputErrorFits(Fits):
             "split_half": split.to_json(),
             "confounded": [dataclasses.asdict(pair) for pair in found],
         }
-        if chi2 > MISMATCH.chi2:
+        if chi2 > MISMATCH_CHI2:
             seconds = settings.mismatch_s or settings.long_s
             kind = "fitted" if settings.mismatch_s else "smoothed"
             window = f" over {seconds:g} s from {kind} start states"

@@ -18,7 +18,9 @@ from scipy.stats import norm
 
 from deal_hw.calib.data.problem import Member, Problem, taken
 from deal_hw.calib.fit.intervals import (
-    MISMATCH,
+    CORRELATION_SAMPLES,
+    MISMATCH_CHI2,
+    NEGLIGIBLE_CHI2,
     Uncertainty,
     correlation_time,
     names_at_bound,
@@ -110,11 +112,11 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
     )
 
 
-def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
+def unexplained(refined: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
     """Return whether the residual exceeds noise, or is autocorrelated over more than ``longest`` samples."""
-    if refined.chi2 <= MISMATCH.negligible_chi2:
+    if refined.chi2 <= NEGLIGIBLE_CHI2:
         return False
-    if refined.chi2 > MISMATCH.chi2:
+    if refined.chi2 > MISMATCH_CHI2:
         return True
     return correlation_time(refined.normal.residual) > longest
 
@@ -220,7 +222,7 @@ def with_causes(
     Where there is none, the alarm says so, and where the residual lies.
     """
     alarms = [f.alarm for f in found[: SETTINGS.causes]]
-    if not found and refined.chi2 > MISMATCH.chi2:
+    if not found and refined.chi2 > MISMATCH_CHI2:
         alarms = [unexplained_alarm(problem, refined)]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
 

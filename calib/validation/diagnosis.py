@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
@@ -165,7 +165,7 @@ class Play:
     @property
     def explains(self) -> bool:
         """Whether it leaves only noise of motion that was not fitted, and less than half of the residual."""
-        return self.chi2 < MISMATCH.chi2 and self.diagnosis.share >= SETTINGS.decisive
+        return self.chi2 < MISMATCH_CHI2 and self.diagnosis.share >= SETTINGS.decisive
 
 
 @dataclass(frozen=True)
@@ -435,7 +435,7 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     while groups and len(found) < SETTINGS.most:
         groups = [group for group in groups if _possible(known, taken, group)]
         gains = [known.gain(taken, group) for group in groups]
-        if not gains or max(gains) <= MISMATCH.evidence:
+        if not gains or max(gains) <= EVIDENCE:
             break
         group = groups[int(np.argmax(gains))]
         share = 1 - float(np.exp(-max(gains) / known.count))
@@ -555,7 +555,7 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
 def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
     """Return whether commands seem to have delays of their own beside other causes; see `.random_delay`."""
     found = random_delay(known.without(taken), known.answers, known.period_s)
-    if found is None or not (found.gain > MISMATCH.evidence and found.share > SETTINGS.noticed):
+    if found is None or not (found.gain > EVIDENCE and found.share > SETTINGS.noticed):
         return None
     seen = (
         f"{percent(found.share)} of the squared residual comes where commands change fast, as if each "

@@ -25,8 +25,7 @@ from deal_hw.calib.fit.command_delays import (
     moved_commands,
 )
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.validation.signatures import SignatureResponse, answers
 from deal_hw.errors import InsufficientDataError
@@ -143,7 +142,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
     delayed = _with(problem.with_command_delays(none), refined, std_s)
     best: Refined | None = None
     fit = refined
-    for seconds in REFINEMENT.stages_s:
+    for seconds in STAGES_S:
         states = None if best is None else best.shooting.states(best.point)
         for _ in range(SETTINGS.rounds):
             try:
@@ -160,7 +159,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
                 break
             delayed = _with(delayed, fit, std_s, shift, moved)
             states = fit.shooting.states(fit.point)
-        if best is not None and fit.chi2 > REFINEMENT.worse * max(best.chi2, 1.0):
+        if best is not None and fit.chi2 > WORSE * max(best.chi2, 1.0):
             break
         best = fit
     if best is None or best.shooting.problem.command_delays is None:

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, measurements, samples_in
-from deal_hw.calib.fit.intervals import MISMATCH
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calibration import Alarm
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -345,11 +345,11 @@ def _decides(before: float, after: float, count: int) -> bool:
     Only noise may remain: from a fit that explains neither, no cause can be named. Residuals far below the
     noise need no explanation.
     """
-    if before <= MISMATCH.negligible_chi2 or not after <= MISMATCH.chi2:
+    if before <= NEGLIGIBLE_CHI2 or not after <= MISMATCH_CHI2:
         return False
     if not after < (1 - SETTINGS.noticed) * before:
         return False
-    return not np.isfinite(before) or count * math.log(before / after) > MISMATCH.evidence
+    return not np.isfinite(before) or count * math.log(before / after) > EVIDENCE
 
 
 def _samples(test: Problem, length: int) -> int:
