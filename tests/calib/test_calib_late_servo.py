@@ -13,13 +13,13 @@ from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.validation.diagnosis import diagnose
 from deal_hw.calib.validation.signatures import signatures
-from deal_hw.drivers.cartpole.controller import Controller
+from deal_hw.drivers.cartpole.chips.controller import Controller
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.chips.servo import Servo
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.mechanics import Mechanics
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, unique_id
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate

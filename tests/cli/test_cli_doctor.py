@@ -16,9 +16,9 @@ import pytest
 from deal_hw.cli import doctor as verb
 from deal_hw.cli.doctor import Doctor, doctor
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Level

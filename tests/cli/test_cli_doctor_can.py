@@ -11,10 +11,10 @@ import pytest
 
 from deal_hw.cli.doctor import Doctor, doctor
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers.cartpole.can_emulator import can_devices
-from deal_hw.drivers.cartpole.faults import CanFaults
-from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.emulator.can_emulator import can_devices
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults
+from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport

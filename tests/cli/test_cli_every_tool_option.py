@@ -300,7 +300,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     )
     for path in CARTPOLE_EMULATORS.values():
         monkeypatch.setattr(path.replace(":", "."), note("emulator", emulator))
-    from deal_hw.drivers.cartpole.truth import nominal_truth as nominal_cartpole
+    from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
 
     for target, truth in (("cartpole.oracle", nominal_cartpole), ("go2.emulator.truth", nominal_go2)):

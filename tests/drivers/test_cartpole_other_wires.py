@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from deal_hw.clock import Clock, VirtualClock
-from deal_hw.drivers.cartpole.can_emulator import can_device
-from deal_hw.drivers.cartpole.device import EmulatedDevice
+from deal_hw.drivers.cartpole.chips.device import EmulatedDevice
+from deal_hw.drivers.cartpole.chips.firmwares import device_of
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
-from deal_hw.drivers.cartpole.faults import CanFaults
-from deal_hw.drivers.cartpole.firmwares import device_of
-from deal_hw.drivers.cartpole.other_wires import name_other_wire
-from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.emulator.can_emulator import can_device
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults
+from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.wire.other_wires import name_other_wire
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import PortBusyError
 from deal_hw.findings import Finding, Level

@@ -26,12 +26,12 @@ from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole.dynamixel.connect import dynamixel_robot, parse_port
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS
 from deal_hw.drivers.cartpole.dynamixel.emulator import ServoEmulator, dynamixel_emulator
 from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.faults import Hazards, ServoFaults
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.emulator.faults import Hazards, ServoFaults
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError

@@ -23,7 +23,7 @@ from deal_hw.data.importing.columns import read_column_map
 from deal_hw.data.importing.grid import common_period, to_trajectories
 from deal_hw.data.importing.load import load_tables
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.compiling import problem_of
 from deal_hw.sim.parameters.template import template

@@ -133,7 +133,7 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
         if config.robot == "cartpole":
-            from deal_hw.drivers.cartpole.other_wires import name_other_wire
+            from deal_hw.drivers.cartpole.wire.other_wires import name_other_wire
 
             yield from name_other_wire(config.port, name, clock)
 

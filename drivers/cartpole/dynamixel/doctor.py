@@ -8,10 +8,11 @@ from typing import Final
 
 from deal_hw.clock import Clock
 from deal_hw.documentation import page
-from deal_hw.drivers.cartpole.dynamixel.bus import Answer, Bus
 from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
 from deal_hw.drivers.cartpole.dynamixel.examine import model_name
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.servo_bus.bus import Answer, Bus
+from deal_hw.drivers.servo_bus.registers import (
     BAUD_RATES,
     HARDWARE_ERROR,
     OPERATING_MODE,
@@ -23,7 +24,6 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     Register,
     explain_hardware_error,
 )
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
 from deal_hw.findings import Finding, Level
