@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from deal_hw.calib.data.noise import Mask
+from deal_hw.calib.data.noise import FLOOR_STD, Mask
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import EXPLAINED, STAGES_S, Refined, refine
 from deal_hw.calib.fit.solver import channel_scale
@@ -63,7 +63,7 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
         problem: The problem.
         fit: A fit whose residual is above the noise.
     """
-    noisy = np.any(problem.noise.position_std > LEAST_NOISE * problem.settings.floor)
+    noisy = np.any(problem.noise.position_std > LEAST_NOISE * FLOOR_STD)
     if problem.known_std is not None or problem.robot.base is not None or not noisy:
         return None
     left = _rms(fit)

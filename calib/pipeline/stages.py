@@ -52,7 +52,7 @@ from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, une
 from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
-from deal_hw.calib.validation.time_steps import STEP, averaged, check_step, halved, scan_latency
+from deal_hw.calib.validation.time_steps import HALVINGS, averaged, check_step, halved, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     EXPLAINED_CHI2,
@@ -332,7 +332,7 @@ def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun
     problem, fit = run.problem, local
     if problem.noise_free or not local.chi2 < LOCAL_HOPELESS:
         return None
-    for _ in range(STEP.halvings):
+    for _ in range(HALVINGS):
         step = check_step(problem, with_rows(fit))
         # Residuals grow with the step, so half of it removes three quarters of what it adds to chi2.
         if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH_CHI2:

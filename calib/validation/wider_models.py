@@ -20,27 +20,19 @@ from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.template import left_at_zero
 from deal_hw.types import FloatArray
 
+WINDOW_S = 0.2
+"""Windows of the fits [s]."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WiderSettings:
-    """Settings of :func:`fit_wider` and :func:`gain_of`.
+NOTICED = 0.03
+"""Least share of the held-out squared residual that more parameters explain [-]."""
 
-    Attributes:
-        window_s: Windows of the fits [s].
-        noticed: Least share of the held-out squared residual that more parameters explain [-].
-        most_inertia: Largest armature that is tried where the model has 0, in inertias of the joint [-]. A
-            real cart has six times its mass.
-        most_force: The same of dry friction, and of damping at the joint's rms speed, in rms forces that its
-            inertia needed [-].
-    """
+MOST_INERTIA = 20.0
+"""Largest armature that is tried where the model has 0, in inertias of the joint [-]. A real cart has six
+times its mass."""
 
-    window_s: float = 0.2
-    noticed: float = 0.03
-    most_inertia: float = 20.0
-    most_force: float = 5.0
-
-
-SETTINGS = WiderSettings()
+MOST_FORCE = 5.0
+"""The same of dry friction, and of damping at the joint's rms speed, in rms forces that its inertia needed
+[-]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +93,8 @@ def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
     seen = [e.usable for e in part.episodes]
     rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
     try:
-        fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.window_s,))
-        length = samples_in(problem, SETTINGS.window_s)
+        fit = refine(part, wide.space.nominal, problem.first_latency_s, (WINDOW_S,))
+        length = samples_in(problem, WINDOW_S)
         prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
@@ -136,7 +128,7 @@ def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
     def gained(without: Refined) -> Gain | None:
         share = 1 - prediction.chi2 / without.chi2
         deviance = -without.normal.count * float(np.log(prediction.chi2 / without.chi2))
-        enough = deviance > EVIDENCE and share > SETTINGS.noticed
+        enough = deviance > EVIDENCE and share > NOTICED
         return Gain(share, deviance, without.chi2) if enough else None
 
     try:
@@ -144,7 +136,7 @@ def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
         if gained(without) is None:
             return None
         # The wider fit may have left another minimum; a fit from there without more then predicts as well.
-        bare = refine(seen, fit.theta[: len(problem.space)], fit.latency_s, (SETTINGS.window_s,))
+        bare = refine(seen, fit.theta[: len(problem.space)], fit.latency_s, (WINDOW_S,))
         again = at_parameters(unseen, bare.theta, bare.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
@@ -166,9 +158,9 @@ def zero_parameters(problem: Problem) -> list[Parameter]:
         accelerations = [np.gradient(v, e.period_s) for v, e in zip(moved, problem.episodes, strict=True)]
         push[j] = inertia[j] * np.std(np.concatenate(accelerations))
     most = {
-        "dof_armature": SETTINGS.most_inertia * inertia,
-        "dof_frictionloss": SETTINGS.most_force * push,
-        "dof_damping": SETTINGS.most_force * push / np.maximum(speed, 1e-9),
+        "dof_armature": MOST_INERTIA * inertia,
+        "dof_frictionloss": MOST_FORCE * push,
+        "dof_damping": MOST_FORCE * push / np.maximum(speed, 1e-9),
     }
     found = []
     for kind, elements in left_at_zero(robot.model).items():

@@ -21,8 +21,7 @@ from deal_hw.calib.validation.cause_words import SearchedKinds
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
-from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
-from deal_hw.calib.validation.random_delay import random_delay
+from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
 from deal_hw.calib.validation.residual_place import densest_stretch
 from deal_hw.calib.validation.signatures import (
     Cause,
@@ -375,7 +374,7 @@ def test_few_windows_end_in_an_answer_or_none(windows: int) -> None:
         answer, response=answer.response[:, :windows], change=answer.change[:windows]
     )
     found = random_delay([few], [answers], PERIOD_S)
-    assert (found is None) == (windows < RANDOM_DELAY.fewest)
+    assert (found is None) == (windows < FEWEST_WINDOWS)
 
 
 @pytest.mark.parametrize("slow", [False, True])
@@ -519,7 +518,7 @@ def test_play_is_found_and_measured(
     cause = found.diagnosis
     assert cause.cause == "backlash" and cause.joints == ("pivot",)
     assert "0.06 rad at pivot" in cause.alarm.seen and "servo_play" in cause.alarm.do
-    assert cause.share > diagnosis.SETTINGS.decisive
+    assert cause.share > diagnosis.DECISIVE
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.checks import check_excitation
-from deal_hw.calib.data.noise import DataSettings, noise_model, white_noise_std
+from deal_hw.calib.data.noise import HELD_STD, noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
@@ -317,7 +317,7 @@ def test_a_joint_at_rest_has_no_vote() -> None:
     assert white_noise_std([held, moved])[0] == found
     assert white_noise_std([_encoder(10.0, rest_s=60.0)])[0] == pytest.approx(found, rel=0.1)
     # Alone it shows nothing: it has the noise of a coarse encoder.
-    assert white_noise_std([held])[0] == DataSettings().held_std
+    assert white_noise_std([held])[0] == HELD_STD
 
 
 def test_timing_jitter_is_told_from_noise() -> None:
