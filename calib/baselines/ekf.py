@@ -83,6 +83,10 @@ class ExtendedKalman:
         self.covariance[:n, :n] = np.diag(std**2)
 
 
+DIVERGED = 3.0
+"""Ratio of the innovations to their own variance above which the filter does not follow the recording."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfSettings:
     """Settings of `ekf`.
@@ -91,19 +95,13 @@ class EkfSettings:
         passes: Runs along all recordings, at most the budget's generations. Each starts at the last one's
             parameters and with the first one's covariance, so that no sample counts twice.
         parameter_drift: Standard deviation of a parameter's drift in one second, in parts of its range.
-        velocity_noise: Standard deviation of the model's error in a velocity per sample, in parts of the
-            start states' uncertainty.
         first_noise_factor: Factor on the sensors' standard deviations in the first pass. It falls by equal
             ratios to 1 in the last. Far from the truth, nonlinearity outweighs the noise.
-        diverged: Ratio of the innovations to their own variance above which the filter does not follow the
-            recording.
     """
 
     passes: int = 8
     parameter_drift: float = 1e-3
-    velocity_noise: float = 0.0
     first_noise_factor: float = 30.0
-    diverged: float = 3.0
 
 
 class _Passes(Stepper):
@@ -176,8 +174,8 @@ class _Passes(Stepper):
             ]
         )
         drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)
-        model = settings.velocity_noise * problem.starts[0].typical_std[C:]
-        noise = np.concatenate([np.zeros(C), model, drift]) ** 2
+        # Q: the simulation of one sample counts as exact, so only the parameters drift.
+        noise = np.append(np.zeros(n), drift) ** 2
         return ExtendedKalman(np.append(np.zeros(n), self._value[:P]), covariance, n, steps, noise)
 
     def _along(self, filter_: ExtendedKalman, data: WindowData, factor: float) -> Iterator[float]:
@@ -223,7 +221,7 @@ class _Passes(Stepper):
         covariance = self._covariance[:K, :K]
         latency, clip = float(self._value[-1]), self.coordinates.clip_latency
         alarms = []
-        if not self._misfit < self.settings.diverged:
+        if not self._misfit < DIVERGED:
             alarms.append(
                 Alarm(
                     f"The filter's innovations are {self._misfit:.1f} times their own variance.",

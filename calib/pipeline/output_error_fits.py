@@ -70,6 +70,13 @@ from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
+SEARCH_S = 12.0
+"""Length of data for the search, spread evenly over the recordings [s]. The search only has to find the
+neighbourhood."""
+
+FOLDS = 3
+"""Number of folds over the motions; a single motion is split in time."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputErrorSettings:
@@ -80,10 +87,7 @@ class OutputErrorSettings:
             each window length differently.
         search_always: Search whatever the fits explain; otherwise only where their predictions over
             ``compared_s`` are no better than a robot whose state stays as it is.
-        search_s: Length of data for the search, spread evenly over the recordings [s]. The search only has to
-            find the neighbourhood.
         stretch_s: Recordings are divided into stretches of this length for the search [s].
-        folds: Number of folds over the motions; a single motion is split in time.
         compared_s: Window in which start points are compared [s]; short, so that poor ones do not diverge.
         half_iterations: Most steps of the fit of each half.
         mismatch_s: Windows with fitted start states in which the residual is compared with the sensors' noise
@@ -100,9 +104,7 @@ class OutputErrorSettings:
 
     windows_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
     search_always: bool = True
-    search_s: float = 12.0
     stretch_s: float = 2.5
-    folds: int = 3
     compared_s: float = 0.4
     half_iterations: int = 5
     mismatch_s: float = 0.4
@@ -250,7 +252,7 @@ class OutputErrorFits(Fits):
     def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
         """Return the search's problem: part of the recordings, and the first fit's residuals as scale."""
         std = first.expected_std if problem.known_std is None else problem.known_std
-        return problem.on(self._spread(problem, self.settings.search_s), std)
+        return problem.on(self._spread(problem, SEARCH_S), std)
 
     def _spread(self, problem: Problem, seconds: float) -> list[SampledEpisode]:
         """Return stretches of the recordings, spread evenly over them, of this total length [s]."""
@@ -274,11 +276,7 @@ class OutputErrorFits(Fits):
         """
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
-        masks = (
-            time_masks(problem, settings.folds)
-            if motions == 1
-            else fold_masks(problem, min(motions, settings.folds))
-        )
+        masks = time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
 
         def fits(train: Problem, fold: int) -> dict[str, Member]:
             question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"

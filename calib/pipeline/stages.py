@@ -67,6 +67,9 @@ from deal_hw.calibration import (
 )
 from deal_hw.types import FloatArray
 
+CONTACT_DRAWN = 0
+"""Refinements from drawn points with feet on the floor, where each takes as long as a search."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RestartSettings:
@@ -82,7 +85,6 @@ class RestartSettings:
             population, half drawn in the ranges. On cart-poles whose nominal values lead to another minimum,
             about one in four of the latter leads to the truth. Where none of 8 did (1 to 4 s of balancing,
             noise-free), one of the first three members did.
-        contact_drawn: The same with feet on the floor, where a refinement takes as long as a search.
     """
 
     restarts: int = 2
@@ -90,11 +92,10 @@ class RestartSettings:
     fewest_generations: int = 15
     explained: float = MISMATCH_CHI2
     drawn: int = 8
-    contact_drawn: int = 0
 
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
-        return self.drawn if problem.robot.base is None else self.contact_drawn
+        return self.drawn if problem.robot.base is None else CONTACT_DRAWN
 
 
 RESTARTS = RestartSettings()
