@@ -5,7 +5,12 @@ unknown, not many. Least squares that takes them as noise of the sensors follows
 too narrow. Here each delay is an unknown with a normal prior. Around the likeliest delays predictions are
 straight in them, so they are eliminated: the residuals of a window have the covariance
 1 + sum_k s^2 d_k d_k^T, where d_k is the change of the whitened predictions by a delay of command k and s the
-delays' standard deviation. Residuals are whitened by its symmetric root (generalised least squares).
+delays' standard deviation. Residuals are whitened by its symmetric root (generalised least squares, Aitken
+1936).
+
+Symbols: C, the columns d_k of a window, (H M, P) [1/s]; s [s]; V = 1 + s^2 C C^T, (H M, H M). With the
+singular vectors U of C and g = s^2 (singular values)^2: V^-1 = 1 - U diag(g / (1 + g)) U^T and
+V^(-1/2) = 1 - U diag(1 - (1 + g)^(-1/2)) U^T.
 """
 
 from __future__ import annotations
@@ -54,7 +59,7 @@ def with_command_delays(problem: Problem, windows: Sequence[WindowData]) -> list
             continue
         moved = (columns @ shifts(problem, data, columns.shape[2])[..., None])[..., 0]
         std = np.where(data.reported, data.std, 0.0)
-        # Thin: a window has fewer commands than measurements.
+        # V^(-1/2) = 1 - late late^T. Thin: a window has fewer commands than measurements.
         root, size, _ = np.linalg.svd(known.std_s * columns, full_matrices=False)
         late = root * np.sqrt(1.0 - 1.0 / np.sqrt(1.0 + size**2))[:, None]
         measured = data.measured + std * moved.reshape(data.measured.shape)
@@ -156,6 +161,10 @@ def likely_std(
     size2, by = np.concatenate(sizes) ** 2, np.concatenate(along)
 
     def deviance(log_std: float) -> float:
+        # Residuals r = J x + C d + e, (n,), with e of an unknown variance and K fitted values x. Minus twice
+        # the restricted log-likelihood without constants, that variance profiled out:
+        # (n - K) ln(q / (n - K)) + ln|V| + ln|H|, with H = J^T V^-1 J + prior, g = J^T V^-1 r and
+        # q = r^T V^-1 r - g^T H^-1 g.
         gain = np.exp(2 * log_std) * size2
         shrunk = by * (gain / (1 + gain))[:, None]
         H = information - by[:, :K].T @ shrunk[:, :K]
@@ -210,6 +219,7 @@ def moved_commands(
         before = shifts(problem, data, P)
         normal = np.einsum("wdp,wdq->wpq", row.columns, row.columns) + np.eye(P) / std_s**2
         pull = np.einsum("wdp,wd->wp", row.columns, row.residual) + before / std_s**2
+        # The likeliest delays minimise |r + C (d - d_before)|^2 + |d|^2 / s^2.
         wanted = before - np.linalg.solve(normal, pull[..., None])[..., 0]
         begins, numbers = command_begins(episode), _numbers(problem, data, P)
         # A command is judged by the window that shows it best.

@@ -1,4 +1,19 @@
-"""Uncertainty of a fit: intervals, identifiability, null directions in words, signs of a wrong model."""
+"""Uncertainty of a fit: intervals, identifiability, null directions in words, signs of a wrong model.
+
+Symbols, for K parameters in their own scale (ln of positive ones) and the latency [s]:
+    H, g: half the Hessian, (K + 1, K + 1), and half the gradient, (K + 1,), of the cost at the estimate,
+        start states eliminated; from :class:`~deal_hw.calib.fit.residual.Normal`.
+    P: information of the parameters' priors, (K + 1,).
+    F: information of the range, 12 / width^2 as of a uniform law, (K + 1,).
+    a: inflation of the noise's variance, kinks^2 max(1, chi2) tau [-], with tau the residuals' integrated
+        autocorrelation time [samples].
+    V = ((H - P) / a + P + F)^-1: covariance, as of generalised least squares with the noise's variance times a.
+Then each standard deviation is multiplied by a factor for clusters (:func:`_factor`). Intervals are 90 %:
+estimate +- z V_kk^(1/2), z = 1.645.
+
+Sources: tau, Madras and Sokal (1988); chi2 as the variance of the residuals, Seber and Wild, Nonlinear
+Regression (1989), section 2.1; clusters, :mod:`deal_hw.calib.fit.cluster_robust`.
+"""
 
 from __future__ import annotations
 
@@ -191,7 +206,8 @@ def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = N
                 break
             total, used = total + 2 * rho, used + 1
         count = max(sum(map(np.count_nonzero, channel)), 1)
-        # Standard error of a time summed up to a lag: Madras and Sokal (1988).
+        # tau = 1 + 2 sum_k rho_k, up to the first rho that white residuals would have. Its relative variance
+        # with n samples and m lags is 2 (2 m + 1) / n: Madras and Sokal (1988). Bonferroni over the channels.
         worst = max(worst, total * (1 - below * np.sqrt(2 * (2 * used + 1) / count)))
     return worst
 
@@ -229,6 +245,7 @@ def uncertainty(
     blind = unseen.std > IDENTIFIABLE_STD * _unit(space)
     bound = _at_bound(space, theta, slope[:K]) * ~blind
     free = np.append(bound == 0, not fixed_latency)
+    # V of the module's text, with the entries at bounds and a given latency held.
     precision = data / inflation + np.diag(belief)
     covariance = _covariance(precision, free)
     cluster = clustered(normal.rows, covariance / inflation, normal.residual[0].shape[1], tau)
@@ -287,6 +304,8 @@ def _bound_std(
     Its likelihood is cut off at the bound. Inside, it falls with the slope and with the curvature that is
     left when the others follow.
     """
+    # At a distance x from the bound the cost grows by 2 |s| x + c x^2: a normal law of mean -|s| / c and
+    # variance 1 / c, cut off outside [0, width]. c is the information left when the others follow.
     others = free.copy()
     others[k] = True
     curvature = 1.0 / _covariance(precision, others)[k, k]
@@ -306,6 +325,8 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
     """
     if cluster is None:
         return np.ones(1)
+    # With rho the clustered variance over the uniform one and n0 = PRIOR_BLOCKS: factor^2 =
+    # (n0 + nu rho) / (n0 + nu) (t_95(n0 + nu) / z_95)^2 where rho > chi2_95(nu) / nu, otherwise 1.
     degrees = cluster.degrees
     ratio = cluster.ratio * inflation / uniform
     drawn = (PRIOR_BLOCKS * inflation + degrees * ratio) / (PRIOR_BLOCKS + degrees)

@@ -56,6 +56,8 @@ class NullSpace:
 
 def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
     """Return the directions in which the data have less information, (K, K), than the range."""
+    # In units of the range's own standard deviation, w / sqrt(12), the range has information 1 in each
+    # direction: an eigenvalue below 1 is a direction that the data determine less than the range does.
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
     blind = values < max(LEAST_INFORMATION, ROUNDING * float(values[-1]))
@@ -76,7 +78,8 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
     D, K = vectors.shape
     if D < 2:
         return vectors
-    # Unknowns: D weights, then K bounds of |entries|.
+    # min |v|_1 for v = u^T vectors with v_k = 1 (basis pursuit: Chen, Donoho and Saunders 1998).
+    # Unknowns: D weights u, then K bounds b of |entries|, -b <= v <= b.
     cost = np.concatenate([np.zeros(D), np.ones(K)])
     below = np.block([[vectors.T, -np.eye(K)], [-vectors.T, -np.eye(K)]])
     found: list[tuple[float, FloatArray]] = []
@@ -198,5 +201,6 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
 
 def _free_std(precision: FloatArray, free: list[int]) -> dict[int, float]:
     """Return standard deviations of the free entries, the others fixed."""
+    # Entries that are left out are known: their rows and columns go before the inverse, not after.
     variance = np.diag(np.linalg.inv(precision[np.ix_(free, free)]))
     return {i: float(np.sqrt(v)) for i, v in zip(free, variance, strict=True)}

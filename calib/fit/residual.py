@@ -2,6 +2,19 @@
 
 Each window's start state is eliminated (Schur complement). The remaining small system in the parameters and
 the latency has their covariance as inverse, with the start states' uncertainty included.
+
+Symbols, with S = 2 C unknowns of a start state (0 where start states are given):
+    p: parameters in their own scale (ln of positive ones), then the latency [s], (K + 1,).
+    s_w: start state of window w, positions then velocities, (S,); m_w, L_w: its prior mean and information.
+    r_w: whitened residuals of window w, (predicted - measured) / std, (R,) [-].
+    J_p, J_s: their derivatives by p, (R, K + 1), and by s_w, (R, S).
+    q, P: mean and information of the parameters' prior, (K + 1,) each; P is diagonal.
+    cost: f(p, s) = (p - q)^T P (p - q) + sum_w [r_w^T r_w + (s_w - m_w)^T L_w (s_w - m_w)].
+Gradients and Hessians here are half of those of f; f is twice a negative log-likelihood.
+
+Sources: Gauss-Newton, Bjorck, Numerical Methods for Least Squares Problems (1996), chapter 9; multiple
+shooting, Bock (1983); start states that follow are variable projection (Golub and Pereyra 1973) with the
+simplified derivative of Kaufman (1975).
 """
 
 from __future__ import annotations
@@ -78,6 +91,7 @@ class WindowRows:
 
     def without_starts(self, columns: FloatArray) -> FloatArray:
         """Return columns, (W, R, n), without their projection on the start states."""
+        # (1 - J_s (J_s^T J_s)^-1 J_s^T) columns: the projection beside the span of J_s.
         moved = np.linalg.solve(self.start_normal, np.einsum("wrs,wri->wsi", self.start, columns))
         return np.asarray(columns - np.einsum("wrs,wsi->wri", self.start, moved))
 
@@ -152,6 +166,7 @@ class Shooting:
         own, around = 1 / std**2, 1 / (prior_share * space.width) ** 2
         # The latency has no prior.
         self.prior_information = np.append(own + around, 0.0)
+        # Product of two normal laws: informations add, and the mean is weighted with them.
         centre = own * space.to_scale(mean) + around * space.to_scale(space.nominal)
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
@@ -245,6 +260,7 @@ class Shooting:
         before = point.value - steps[: K + 1]
         one_sided = np.concatenate([outside | (before < low) | (before > high), np.zeros(2 * moved, bool)])
         values[: K + 1] += np.diag(steps[: K + 1])
+        # The prior's part: H = P, g = P (p - q).
         expected = point.value - self.prior_mean
         hessian, gradient = np.diag(self.prior_information), self.prior_information * expected
         cost, count = float(np.sum(self.prior_information * expected**2)), 0
@@ -258,6 +274,8 @@ class Shooting:
             for c in range(moved):
                 x[K + 1 + c, :, c] += steps[K + 1 + c]
                 v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
+            # Row n of `values`, `x` and `v` has entry n of (p, s_w) changed by its step, in all windows at
+            # once: windows do not share start states.
             predicted = self._predict(values, data, x, v).observed
             r = data.whitened(base[e] - data.measured)
             difference = predicted - base[e]
@@ -265,6 +283,7 @@ class Shooting:
                 here_x, here_v = point.position[e], point.velocity[e]
                 other = self._predict(2 * point.value - values, data, 2 * here_x - x, 2 * here_v - v).observed
                 two = ~one_sided
+                # (y(p + h) - y(p - h)) / 2; divided by h below, as y(p + h) - y(p) is.
                 difference[two] = (predicted - other)[two] / 2
             jac = np.moveaxis(data.whitened(difference), 0, -1) / steps
             if np.isfinite(r).all():
@@ -274,6 +293,7 @@ class Shooting:
             r_flat, jac = r.reshape(W, -1), jac.reshape(W, -1, len(steps))
             jp, js = jac[..., : K + 1], jac[..., K + 1 :]
             residuals.append(r)
+            # H += J_p^T J_p, g += J_p^T r: Gauss-Newton, without the residuals' second derivatives.
             hessian += np.einsum("wri,wrj->ij", jp, jp)
             gradient += np.einsum("wri,wr->i", jp, r_flat)
             cost += float(np.sum(r_flat**2))
@@ -287,6 +307,9 @@ class Shooting:
             information = self.start_information[e]
             if keep:
                 rows.append(_rows(r_flat, jp, js, np.sqrt(information), start))
+            # The blocks of window w: H_ss = J_s^T J_s + L, g_s = J_s^T r + L (s - m), H_sp = J_s^T J_p.
+            # Their elimination leaves the Schur complement H -= H_sp^T H_ss^-1 H_sp, g -= H_sp^T H_ss^-1 g_s.
+            # A step dp takes the start state along by ds = -H_ss^-1 (g_s + H_sp dp); `back` has both parts.
             mss = np.einsum("wri,wrj->wij", js, js) + information[:, :, None] * np.eye(2 * C)
             gs = np.einsum("wri,wr->wi", js, r_flat) + information * start
             msp = np.einsum("wri,wrj->wij", js, jp)
@@ -353,6 +376,7 @@ class Shooting:
         """
         found = []
         for rows, (gain, _) in zip(normal.rows, normal.back, strict=True):
+            # J_p - J_s H_ss^-1 H_sp. The change of H_ss^-1 with p is left out (Kaufman 1975).
             by = rows.parameter
             if not self.given:
                 by = by - np.einsum("wrs,wsp->wrp", rows.start, gain)

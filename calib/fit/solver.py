@@ -5,7 +5,16 @@ Each step is the exact minimum of the linear model in a box: the bounds cut by t
 Of 92 parameters one always does at once: 9 such steps left 1.7 % of the cost, 9 exact ones 2e-11.
 
 Unknown start states of windows follow the parameters (variable projection, Golub and Pereyra 1973), so the
-solver sees the parameters alone. A robust loss is a weight per residual, computed from the previous fit.
+solver sees the parameters alone. A robust loss is a weight per residual, computed from the previous fit
+(iteratively reweighted least squares, Holland and Welsch 1977).
+
+Symbols of :func:`minimise`, for n free unknowns:
+    x: step from the start in units of the first trust region, (n,) [-].
+    r(x), J: whitened residuals, (M + n,), with those of the hold last, and their derivatives, (M + n, n).
+    D: half side of the trust region around the present x, a box [-] (``radius``).
+    f(x) = |r(x)|^2, and its model m(d) = |r + J d|^2 for a step d.
+The rule for D is algorithm 4.1 of Nocedal and Wright, Numerical Optimization (2006), with a box instead of a
+ball; the bounded linear problem is solved by BVLS (Stark and Parker 1995).
 """
 
 from __future__ import annotations
@@ -106,6 +115,8 @@ def minimise(
         start = np.where(free & (np.abs(start - bound) < 1e-9 * (high - low)), bound, start)
     if settings.iterations < 1 or not free.any():
         return start, 0
+    # The hold: x has a normal prior around 0 whose standard deviation is ``reach`` in the parameters' own
+    # scale, reach / FIRST_RADIUS in x. So x adds the residuals FIRST_RADIUS / reach * x.
     unit = np.full(len(value), FIRST_RADIUS)
     unit[-1] *= LATENCY_UNIT_S
     hold = FIRST_RADIUS / settings.reach
@@ -133,15 +144,18 @@ def minimise(
     for _ in range(settings.iterations):
         if triangle is None:
             used += 1
+            # [J, -r] = Q R: |r + J d|^2 = |R_J d - R_r|^2, with n + 1 rows instead of M + n.
             triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian(here), -left]), mode="r"))
         rows, wanted = triangle[:, :-1], triangle[:, -1]
         box = np.maximum(lower - here, -radius), np.minimum(upper - here, radius)
         step = lsq_linear(rows, wanted, box, method="bvls", max_iter=10 * len(here)).x
+        # The decrease that the model predicts, f(x) - m(d), against the one that comes, f(x) - f(x + d).
         expected = cost - float(np.sum((rows @ step - wanted) ** 2))
         if not expected > 0:
             break
         new, moved = residual(here + step), float(np.abs(step).max())
         gained = cost - float(new @ new) if np.isfinite(new).all() else -np.inf
+        # A step that uses nearly all of the box may be cut by it: the box grows only then.
         if gained < POOR * expected:
             radius = SHRUNK * moved
         elif gained > GOOD * expected and moved > 0.95 * radius:
@@ -233,6 +247,7 @@ def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
     costs = shooting.window_costs(point)
     freedom = [np.maximum(d.freedom, 1) for d in shooting.data]
     size = max(float(np.median(np.concatenate([c / f for c, f in zip(costs, freedom, strict=True)]))), 1.0)
+    # A window's cost over its size is chi-square with its degrees of freedom; Bonferroni over the windows.
     chance = FALSE_RESTARTS / sum(map(len, costs))
     return [c > size * chi2_law.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
 
@@ -296,6 +311,7 @@ def huber_weights(residual: FloatArray) -> FloatArray:
     Their spread is the scaled median, and at least that of the noise: small noise in a model that explains
     nothing is no outlier.
     """
+    # w = min(1, k s / |r|), s = 1.4826 median |r| (Huber 1964).
     size = np.abs(residual)
     spread = max(MAD_TO_STD * float(np.median(size)), 1.0)
     return np.asarray(np.minimum(1.0, HUBER * spread / np.maximum(size, 1e-300)))
@@ -304,6 +320,7 @@ def huber_weights(residual: FloatArray) -> FloatArray:
 def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) -> list[WindowData]:
     """Return windows with less weight the more their residual, (W, H, M), exceeds the median's (Cauchy)."""
     costs = [np.sum(r**2, axis=(1, 2)) for r in residuals]
+    # Cauchy's weight of a window with cost c is 1 / (1 + c / median); a standard deviation has its root.
     median = max(float(np.median(np.concatenate(costs))), 1e-12)
     return [
         dataclasses.replace(d, std=d.std * np.sqrt(1.0 + c / median)[:, None, None])
