@@ -26,7 +26,8 @@ from deal_hw.calib.fit.residual import (
     value_bounds,
 )
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calibration import Z90, Alarm, CalibrationResult
+from deal_hw.calibration import Z90, CalibrationResult
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 
@@ -223,7 +224,7 @@ class _Passes(Stepper):
         alarms = []
         if not self._misfit < DIVERGED:
             alarms.append(
-                Alarm(
+                Finding.alarm(
                     f"The filter's innovations are {self._misfit:.1f} times their own variance.",
                     "The filter diverged: its covariance is not valid.",
                     "Use another method, or narrower ranges (--range NAME LOW HIGH).",
