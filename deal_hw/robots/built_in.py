@@ -98,7 +98,7 @@ CARTPOLE: Final = RobotEntry(
         ),
     ),
     spaces="deal_hw.drivers.cartpole.description:SPACES",
-    balance="deal_hw.control.balance:recorded_balance",
+    balance="deal_hw.motions.scores.balance:recorded_balance",
     other_wires="deal_hw.drivers.cartpole.wire.other_wires:name_other_wire",
     task="deal_hw.policies.tasks:CARTPOLE",
     environment="deal_hw/CartPole-v0",

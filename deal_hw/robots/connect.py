@@ -27,8 +27,8 @@ from deal_hw.transport import TopicTransport, Transport, WireOptions
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.control.balance import BalanceResult
-    from deal_hw.control.velocity_error import Track
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.velocity_error import Track
     from deal_hw.policies.tasks import TrainingTask
 
 

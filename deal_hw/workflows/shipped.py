@@ -7,9 +7,9 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
-from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.robots import is_known, robot_entry
 
 

@@ -303,7 +303,10 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
 
-    for target, truth in (("cartpole.oracle", nominal_cartpole), ("go2.emulator.truth", nominal_go2)):
+    for target, truth in (
+        ("cartpole.emulator.oracle", nominal_cartpole),
+        ("go2.emulator.truth", nominal_go2),
+    ):
         drawn = note("drawn", truth("sensor", 0))
         monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
