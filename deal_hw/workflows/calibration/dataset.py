@@ -10,8 +10,8 @@ import numpy as np
 
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
 from deal_hw.calibration import listed
+from deal_hw.data.checks.spikes import SpikeSettings
 from deal_hw.data.recording.episode_info import motion_of
-from deal_hw.data.recording.spikes import SpikeSettings
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import parameter_spaces
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
@@ -135,8 +135,8 @@ def sound_recordings(
     Raises:
         InsufficientDataError: An episode cannot be used.
     """
-    from deal_hw.data.recording.spikes import without_spikes
-    from deal_hw.data.recording.telemetry_checks import check
+    from deal_hw.data.checks.spikes import without_spikes
+    from deal_hw.data.checks.suite import check
     from deal_hw.findings import Severity
 
     verdicts = {index: check(trajectory, spikes) for index, trajectory in trajectories.items()}

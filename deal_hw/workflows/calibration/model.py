@@ -89,7 +89,7 @@ def prepare_model(
         InsufficientDataError: The recordings are too short.
     """
     try:
-        from deal_hw.data.checks.plausibility import despiked
+        from deal_hw.data.checks.suite import despiked
         from deal_hw.data.importing.columns import read_column_map
         from deal_hw.sim.engine.compiling import compile_mjcf
         from deal_hw.sim.engine.model import load_model
