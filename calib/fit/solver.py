@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy
 from scipy.optimize import lsq_linear
-from scipy.stats import chi2 as chi2_law
 
 from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
 from deal_hw.calib.data.problem import WindowData, taken
@@ -227,7 +227,7 @@ def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
     freedom = [np.maximum(d.freedom, 1) for d in shooting.data]
     size = max(float(np.median(np.concatenate([c / f for c, f in zip(costs, freedom, strict=True)]))), 1.0)
     chance = SOLVER.false_restarts / sum(map(len, costs))
-    return [c > size * chi2_law.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
+    return [c > size * scipy.stats.chi2.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
 
 
 class _Following:
