@@ -15,7 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 SOURCES := deal_hw calib drivers policies
-SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw/control/passive.py,deal_hw/control/supervisor.py,deal_hw/control/vigil.py,deal_hw/control/claim.py,deal_hw/signals.py
+SAFETY_FILES := deal_hw/control/safety/*.py,deal_hw/control/process/supervisor.py,deal_hw/control/process/vigil.py,deal_hw/control/process/claim.py,deal_hw/signals.py
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
@@ -67,7 +67,7 @@ arm-tools: ## install gcc-arm-none-eabi and qemu-system-arm (60 MB to fetch, 490
 	@tools/install_arm_tools.sh
 
 # The file and not the module: the package around it needs numpy, and a board needs no environment of 3 GB.
-BUILD_FIRMWARE := PYTHONPATH=. $(PYTHON) drivers/cartpole/native.py
+BUILD_FIRMWARE := PYTHONPATH=. $(PYTHON) drivers/cartpole/chips/native.py
 firmware: avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
 	@$(BUILD_FIRMWARE) avr build/firmware
 

@@ -20,12 +20,12 @@ from deal_hw.transport import TopicTransport, Transport, WireOptions
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.control.balance import BalanceResult
-    from deal_hw.control.velocity_error import Track
     from deal_hw.drivers.go2.claim import WireClaim
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.velocity_error import Track
 
 ROBOTS: Final = {
-    "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
+    "cartpole": "deal_hw.drivers.cartpole.robots.robot:CartpoleRobot",
     "go2": "deal_hw.drivers.go2.robot:Go2Robot",
     "go2_on_stand": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
 }
@@ -51,7 +51,7 @@ SPACES: Final = {
 """Tables of parameter sets, name -> function; the first of each is the default."""
 ODOMETRY: Final = {"go2": "deal_hw.drivers.go2.odometry:walked"}
 """Robots with odometry -> function that returns the walked track of a recording."""
-BALANCE: Final = {"cartpole": "deal_hw.control.balance:recorded_balance"}
+BALANCE: Final = {"cartpole": "deal_hw.motions.scores.balance:recorded_balance"}
 """Robots whose policies balance a pole -> function that judges a recording."""
 TRANSPORTS: Final = {
     "serial": "deal_hw.drivers.transports.serial_transport:SerialTransport",
@@ -66,8 +66,8 @@ WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """The fields of :class:`~deal_hw.transport.WireOptions` that each transport takes."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
-    ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
-    ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
+    ("cartpole", "can"): "deal_hw.drivers.cartpole.robots.can_robot:can_robot",
+    ("cartpole", "odrive"): "deal_hw.drivers.cartpole.robots.odrive_robot:odrive_robot",
     ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.connect:dynamixel_robot",
 }
 """Robots with another driver on one wire than in :data:`ROBOTS`, (robot, wire) -> "module:function".
@@ -80,8 +80,8 @@ SIMULATED: Final[Mapping[tuple[str, str], str]] = {
 }
 """Drivers for a third-party simulator in place of a robot, (robot, simulator) -> "module:class"."""
 CAN_BUSES: Final[Mapping[str, str]] = {
-    "can": "deal_hw.drivers.cartpole.can_robot:can_bus",
-    "odrive": "deal_hw.drivers.cartpole.odrive_robot:odrive_bus",
+    "can": "deal_hw.drivers.cartpole.robots.can_robot:can_bus",
+    "odrive": "deal_hw.drivers.cartpole.robots.odrive_robot:odrive_bus",
 }
 """Transports over a CAN bus -> function that returns a port's bus and nodes."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members, explained
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.fitness import FitnessSettings, make_fitness
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})
@@ -20,7 +21,7 @@ CHANGING = frozenset({"critic"})
 class ScoredStepper(Stepper):
     """A run whose search sees one number per member.
 
-    The settings name the fitness and its own settings; its window is also that of the stated residual.
+    The settings name the fitness; its window is also that of the stated residual.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
@@ -34,7 +35,7 @@ class ScoredStepper(Stepper):
 
     def scoring(self) -> FitnessSettings:
         """Return how the fitness scores."""
-        return cast("FitnessSettings", self.settings.scoring)
+        return FitnessSettings()
 
     @abc.abstractmethod
     def found(self) -> tuple[Members, Members]:
@@ -63,7 +64,7 @@ class ScoredStepper(Stepper):
         centre, population = self.found()
         scored = sum(row["scored"] for row in self.log.trace)
         lost = sum(row["diverged"] for row in self.log.trace)
-        alarm = Alarm(
+        alarm = Finding.alarm(
             f"{lost:.0f} of {scored:.0f} members diverged and had no score.",
             "Simulations diverge over much of the search range, and nothing was searched there.",
             "Narrow the ranges (--range NAME LOW HIGH), or shorten the physics step.",
@@ -71,7 +72,7 @@ class ScoredStepper(Stepper):
         return self.log.result(
             centre,
             population,
-            chi2=explained(self.problem, centre, self.settings.scoring.window_ticks),
+            chi2=explained(self.problem, centre, self.scoring().window_ticks),
             alarms=(alarm,) if lost > 0.5 * scored else (),
             extra={"interval": self.INTERVAL, **self.facts()},
         )

@@ -24,13 +24,17 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.intervals import (
-    MISMATCH,
+    CORRELATION_SAMPLES,
+    EVIDENCE,
+    MISMATCH_CHI2,
+    WHITE_SAMPLES,
     mismatch,
     uncertainty_at,
     with_rows,
 )
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import (
+    LOCAL_HOPELESS,
+    LOCAL_S,
     Refined,
     local_fit,
     part_of,
@@ -44,15 +48,15 @@ from deal_hw.calib.pipeline.calibration_run import (
     FitOutcome,
 )
 from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
-from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
+from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
-from deal_hw.calib.validation.time_steps import STEP, averaged, check_step, halved, scan_latency
+from deal_hw.calib.validation.time_steps import HALVINGS, averaged, check_step, halved, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     EXPLAINED_CHI2,
-    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -61,7 +65,11 @@ from deal_hw.calibration import (
     StateStore,
     listed,
 )
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
+
+CONTACT_DRAWN = 0
+"""Refinements from drawn points with feet on the floor, where each takes as long as a search."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,19 +86,17 @@ class RestartSettings:
             population, half drawn in the ranges. On cart-poles whose nominal values lead to another minimum,
             about one in four of the latter leads to the truth. Where none of 8 did (1 to 4 s of balancing,
             noise-free), one of the first three members did.
-        contact_drawn: The same with feet on the floor, where a refinement takes as long as a search.
     """
 
     restarts: int = 2
     same: float = 0.2
     fewest_generations: int = 15
-    explained: float = MISMATCH.chi2
+    explained: float = MISMATCH_CHI2
     drawn: int = 8
-    contact_drawn: int = 0
 
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
-        return self.drawn if problem.robot.base is None else self.contact_drawn
+        return self.drawn if problem.robot.base is None else CONTACT_DRAWN
 
 
 RESTARTS = RestartSettings()
@@ -168,7 +174,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
         # Another minimum can leave a residual as small as noise, but with a pattern.
-        white = local is not None and conclusive(problem, local, MISMATCH.white_samples)
+        white = local is not None and conclusive(problem, local, WHITE_SAMPLES)
         if local is not None and not white and conclusive(problem, local):
             local = lower_minimum(run, local, RESTARTS) or local
             white = conclusive(problem, local)
@@ -281,7 +287,7 @@ def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
 
 def clearly_lower(a: Refined, b: Refined) -> bool:
     """Return whether ``a`` has less residual than ``b``, by more than noise makes, on the same windows."""
-    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > MISMATCH.evidence)
+    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > EVIDENCE)
 
 
 def lower_minimum(
@@ -295,7 +301,7 @@ def lower_minimum(
     """
     if not settings.draws(run.problem):
         return None
-    part, shortest = part_of(run.problem, REFINEMENT.local_s), window_stages(run.problem)[:1]
+    part, shortest = part_of(run.problem, LOCAL_S), window_stages(run.problem)[:1]
     run_part = dataclasses.replace(run, problem=part)
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
@@ -308,7 +314,7 @@ def lower_minimum(
         near = rng.permutation(searched.population)[: len(starts) // 2]
         starts = [(theta, searched.latency_s) for theta in near] + starts[: len(starts) - len(near)]
     for theta, latency_s in starts:
-        if (again or best is not same) and conclusive(part, best, MISMATCH.white_samples):
+        if (again or best is not same) and conclusive(part, best, WHITE_SAMPLES):
             break
         tried = refined_from(run_part, theta, latency_s, shortest)
         if clearly_lower(tried, best):
@@ -326,12 +332,12 @@ def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun
     step explains a part of the residual, fits with it come before a search.
     """
     problem, fit = run.problem, local
-    if problem.noise_free or not local.chi2 < REFINEMENT.local_hopeless:
+    if problem.noise_free or not local.chi2 < LOCAL_HOPELESS:
         return None
-    for _ in range(STEP.halvings):
+    for _ in range(HALVINGS):
         step = check_step(problem, with_rows(fit))
         # Residuals grow with the step, so half of it removes three quarters of what it adds to chi2.
-        if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH.chi2:
+        if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH_CHI2:
             break
         problem = halved(problem)
         window_s = fit.shooting.length * problem.episodes[0].period_s
@@ -363,9 +369,9 @@ def conclude_fit(
     """
     late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
-    if unexplained(refined, MISMATCH.white_samples):
+    if unexplained(refined, WHITE_SAMPLES):
         # Not before: in another minimum delays seem to explain what no parameters there do.
-        late = fit_delays(run.problem, refined, MISMATCH.evidence)
+        late = fit_delays(run.problem, refined, EVIDENCE)
         refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
@@ -391,7 +397,7 @@ def conclude_fit(
         known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
-        known = known.with_alarms(cause.alarm)
+        known = known.with_alarms(cause)
         checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
     facts: dict[str, Any] = {
         "restarts": restarts,
@@ -420,7 +426,7 @@ def conclude_fit(
 def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
     """Return random delays of commands as a cause of the residual, which the fit has allowed for."""
     found = late.found
-    alarm = Alarm(
+    alarm = Finding.alarm(
         f"Each command acts after its own delay: {1e3 * latency_s:.3g} ms on average, with a standard "
         f"deviation of {1e3 * found.std_s:.2g} ms.",
         "The latency is their mean. Each command's own delay was an unknown of the fit, so the intervals "
@@ -428,7 +434,7 @@ def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
         "To measure more exactly: end other programs on the computer that sends, send at an even pace, or "
         "time-stamp commands where they are received.",
     )
-    return Diagnosis("delay", found.share, found.deviance, (), alarm)
+    return Diagnosis.of("delay", found.share, found.deviance, (), alarm)
 
 
 def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
@@ -460,9 +466,9 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     fit = refined_from(wide, play.theta, play.latency_s)
     if not conclusive(play.problem, fit):
         return None
-    added = play.problem.space.names[-len(play.diagnosis.joints) :]
+    added = play.problem.space.names[-len(play.diagnosis.subject) :]
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
-    alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
+    alarm = dataclasses.replace(play.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
     return conclude_fit(wide, None, fit).but(alarm, diagnosis=[play.diagnosis.to_json()])
 
@@ -476,7 +482,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     """
     problem, local = run.problem, run.local
     asked = run.settings.diagnosis and run.settings.local_first
-    if not asked or (local is not None and not unexplained(local, MISMATCH.white_samples)):
+    if not asked or (local is not None and not unexplained(local, WHITE_SAMPLES)):
         return fits.best(run)
     # The search that follows is a part of the fits.
     most = math.inf if run.settings.thorough else run.check_steps_left + run.search_steps
@@ -515,7 +521,7 @@ def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCa
         progress(Progress(BEFORE_SEARCH, 1, 1, f"the data do not determine: {'; '.join(words)}"))
 
 
-def conclusive(problem: Problem, fit: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
+def conclusive(problem: Problem, fit: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
     """Return whether noise explains the residual of a fit, so that no other check is needed.
 
     A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the

@@ -8,8 +8,9 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from deal_hw.calibration import Alarm, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
+from deal_hw.findings import Finding
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
@@ -87,7 +88,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     from rich.text import Text
 
     from deal_hw.calib.design.advice import next_step
-    from deal_hw.calib.fit.intervals import MISMATCH
+    from deal_hw.calib.fit.intervals import MISMATCH_CHI2
 
     table = Table(
         title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}",
@@ -127,7 +128,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         console.print(f"the data do not determine: {words}")
     dataset = result.provenance.get("dataset", "runs/first/dataset")
     # What a recording would tell was predicted by a model that does not explain this one.
-    first = "next, after the causes that alarms name" if result.chi2 > MISMATCH.chi2 else "next"
+    first = "next, after the causes that alarms name" if result.chi2 > MISMATCH_CHI2 else "next"
     for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
         console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))
@@ -173,7 +174,7 @@ def print_verdict(result: CalibrationResult) -> None:
         console.print(escape(line), highlight=False, soft_wrap=True)
 
 
-def other_alarms(alarms: Sequence[Alarm], width: int, room: int) -> list[str]:
+def other_alarms(alarms: Sequence[Finding], width: int, room: int) -> list[str]:
     """Return what alarms saw in at most ``room`` lines, the most important one last.
 
     Alarms with the same remedy are one entry. What finds no room is counted, and stands in the report.

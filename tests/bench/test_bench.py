@@ -17,8 +17,8 @@ from deal_hw.bench.scores import check_truth
 from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
 from deal_hw.drivers.cartpole.description import SPACES
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.workflows.shipped import shipped_policy

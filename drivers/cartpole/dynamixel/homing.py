@@ -8,17 +8,17 @@ import math
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.behaviours import position_command
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.servos import PoleAngle, Servos
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
+from deal_hw.drivers.servo_bus.registers import (
     PULSES,
     WATCHDOG_TRIPPED,
     Block,
     explain_hardware_error,
 )
-from deal_hw.drivers.cartpole.dynamixel.servos import PoleAngle, Servos
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.errors import SafetyError, TransportTimeoutError
+from deal_hw.motions.behaviours import position_command
 
 _PERIOD_NS = 10_000_000
 """Time between two requests; short enough for the belt servo's watchdog."""
