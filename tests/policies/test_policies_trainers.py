@@ -323,6 +323,6 @@ def test_every_task_has_settings_for_every_trainer(robot: str, name: str) -> Non
 )
 def test_settings_that_mean_nothing_are_refused(name: str, settings: dict[str, Any], message: str) -> None:
     """The message names the setting, what was given and what is allowed."""
-    _, known = TASKS["cartpole"].trainer_and_config(name, 200_000)
+    _, known = training_task("cartpole").trainer_and_config(name, 200_000)
     with pytest.raises(ConfigurationError, match=message):
         type(known)(**settings)
