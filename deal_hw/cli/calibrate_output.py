@@ -10,7 +10,7 @@ from pathlib import Path
 
 from deal_hw.calibration import Alarm, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
-from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
+from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
 ALARM_LINES = 20
