@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from verb_options import Option, options, sub_verb
+from verb_options import Option, kind_of, options
 
 from deal_hw.cli.main import VERBS, main, parse
 from deal_hw.errors import DealHwError
@@ -171,7 +171,7 @@ def cases() -> Iterator[Any]:
     for line in LINES:
         verb, *words = line.split()
         config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
-        for option in options(sub_verb(config, words[0] if words else ""), VALUES):
+        for option in options(kind_of(config, *words), VALUES):
             if option.name not in TOLD_ELSEWHERE and not {option.flag, *option.words[:1]} & set(words):
                 yield pytest.param(line, option, id=f"{line} {option.name}")
 

@@ -84,7 +84,7 @@ def read_files(
         sample_hz=None,
         feet=config.feet,
         telemetry=[
-            f"{name}: {verdict.severity} {verdict.name}: {verdict.message}"
+            f"{name}: {verdict.severity} {verdict.code}: {verdict.message}"
             for name, found in verdicts.items()
             for verdict in found
         ],

@@ -12,7 +12,7 @@ from deal_hw.drivers.cartpole.wire.link import SerialLink
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.drivers.transports.slcan_transport import TTY_BAUD_RATE
 from deal_hw.errors import DealHwError, TransportTimeoutError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Message, Transport
 
 _LISTEN_S: Final = 0.3
@@ -56,7 +56,7 @@ def name_other_wire(
     ways = " or ".join(f"--transport {name} --port {found.port}" for name in found.transports)
     yield Finding(
         "link",
-        Level.FAIL,
+        Severity.FAIL,
         f"{path} answers as {found.name}, so --transport {transport} is the wrong wire for it",
         f"use {ways}",
     )
