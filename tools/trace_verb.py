@@ -122,7 +122,7 @@ def traced(until: Sequence[str], words: Sequence[str]) -> Trace:
         pass
     finally:
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]
+        threading.setprofile(None)
     return trace
 
 

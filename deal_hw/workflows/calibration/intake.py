@@ -18,7 +18,8 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
 from deal_hw.workflows.calibration.dataset import read_driver_dataset, read_own_dataset
-from deal_hw.workflows.calibration.files import Recorded, read_files
+from deal_hw.workflows.calibration.files import read_files
+from deal_hw.workflows.calibration.recordings import Recorded
 from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.calibration.source import Division, Source
 from deal_hw.workflows.calibration.walking import (
