@@ -11,7 +11,7 @@ from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
-    from deal_hw.control.behaviours import Behaviour
+    from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
 
 Named = tuple[str, Trajectory]
