@@ -10,9 +10,9 @@ import numpy as np
 
 from deal_hw.calibration import listed
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import parameter_spaces
 from deal_hw.errors import ConfigurationError, UnknownNameError, short
 from deal_hw.parameters import ParameterSpace
+from deal_hw.robots import parameter_spaces
 from deal_hw.types import Trajectory
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 from deal_hw.workflows.options import File
