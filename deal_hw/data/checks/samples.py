@@ -1,7 +1,7 @@
 """Checks of any recording's stamps and values: length, numbers, clock, rate, gaps, frozen positions.
 
 Our own recorder and the logs of others are checked by the same functions. What differs between the two is a
-field of :class:`Rules`, with its reason.
+field of :class:`RecordingLimits`, with its reason.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOVES: Final[Mapping[str, float]] = {"rad": 0.02, "m": 0.002}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rules:
+class RecordingLimits:
     """Limits that differ between recordings of our recorder and those of others."""
 
     shortest_s: float
@@ -81,7 +81,7 @@ class Rules:
     """What to do about gaps."""
 
 
-OURS: Final = Rules(
+OURS: Final = RecordingLimits(
     shortest_s=SHORTEST_S,
     needed=("position", "velocity"),
     most_missing=0.0,
@@ -97,7 +97,7 @@ OURS: Final = Rules(
     few_equal="check that the device measures",
     repair_gaps="check the cable",
 )
-OTHERS: Final = Rules(
+OTHERS: Final = RecordingLimits(
     shortest_s=0.0,
     needed=("position",),
     most_missing=0.01,
@@ -115,7 +115,7 @@ OTHERS: Final = Rules(
 )
 
 
-def check_length(table: Table, rules: Rules) -> Finding:
+def check_length(table: Table, rules: RecordingLimits) -> Finding:
     """Check that there are enough samples, over enough time."""
     count = table.time_s.size
     stamps = table.time_s[np.isfinite(table.time_s)]
@@ -126,7 +126,7 @@ def check_length(table: Table, rules: Rules) -> Finding:
     return Finding("length", Severity.OK, text)
 
 
-def check_finite(table: Table, rules: Rules) -> Finding:
+def check_finite(table: Table, rules: RecordingLimits) -> Finding:
     """Check that stamps and values are numbers."""
     stamps = int(np.sum(~np.isfinite(table.time_s)) + np.sum(~np.isfinite(table.command_s)))
     if stamps:
@@ -155,7 +155,7 @@ def check_finite(table: Table, rules: Rules) -> Finding:
     return Finding("finite", Severity.WARN, text, remedy)
 
 
-def check_clock(stamps: Mapping[str, FloatArray], rules: Rules) -> Finding:
+def check_clock(stamps: Mapping[str, FloatArray], rules: RecordingLimits) -> Finding:
     """Check that stamps increase.
 
     Args:
@@ -211,7 +211,7 @@ def check_rate(clock: FloatArray) -> Finding:
     return Finding("rate", Severity.OK, text)
 
 
-def check_gaps(clock: FloatArray, period_s: float, rules: Rules) -> Finding:
+def check_gaps(clock: FloatArray, period_s: float, rules: RecordingLimits) -> Finding:
     """Check for pauses between samples.
 
     Args:
@@ -238,7 +238,7 @@ def check_gaps(clock: FloatArray, period_s: float, rules: Rules) -> Finding:
     return Finding("gaps", Severity.WARN, text, rules.repair_gaps)
 
 
-def check_frozen(table: Table, rules: Rules) -> Finding:
+def check_frozen(table: Table, rules: RecordingLimits) -> Finding:
     """Check for positions that stand still although their commands, or other joints, move."""
     names, spans = np.array(table.joint_names), _spans(table)
     moves = spans >= np.array([MOVES[unit] for unit in table.units])
