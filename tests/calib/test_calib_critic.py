@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from deal_hw.calib.search.critic import (
+from deal_hw.calib.paper.critic import (
     ClippedCritic,
     Critic,
     CriticSettings,

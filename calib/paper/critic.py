@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.search.resume import State, Stateful
+from deal_hw.calib.data.resume import State, Stateful
 from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray
 

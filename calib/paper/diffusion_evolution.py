@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import logsumexp, softmax
 
-from deal_hw.calib.search.resume import Stateful
+from deal_hw.calib.data.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
