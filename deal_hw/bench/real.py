@@ -25,7 +25,7 @@ from deal_hw.workflows.calibration.model import HELDOUT_PART
 from deal_hw.workflows.calibration.prepare import prepare as prepare_recordings
 from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings
-from deal_hw.workflows.say import aloud, silent
+from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
@@ -56,7 +56,7 @@ def prepare(
         )
     settings = dataclasses.replace(source, range_ratio=range_ratio)
     settings.check()
-    return prepare_recordings(settings, say=silent if quiet else aloud)
+    return prepare_recordings(settings, say=silent if quiet else to_stderr)
 
 
 def split_name(source: CalibrateSettings) -> str:

@@ -29,7 +29,7 @@ from deal_hw.control.process_channel import (
     StatusReceiver,
     socket_pair,
 )
-from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
+from deal_hw.control.realtime import SUPERVISOR_PRIORITY, priority, raise_priority
 from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
 from deal_hw.signals import held_back, name, reason, taken
 
@@ -220,7 +220,7 @@ class Supervisor:
         # SIGKILL also ends a process stopped by SIGSTOP.
         self._killed = self._killed or why
         child.kill()
-        hurry(child.pid)
+        raise_priority(child.pid)
 
     def _reap(self, child: subprocess.Popen[bytes]) -> int:
         """Return the exit code of the control process, which sends no more messages."""

@@ -15,7 +15,7 @@ SUPERVISOR_SILENCE_S = 1.0
 real-time priority a busy machine may delay it by about 0.4 s."""
 
 
-class SupervisorVigil:
+class SupervisorWatchdog:
     """Listens to the supervisor in a thread, because the control process may wait seconds for the robot.
 
     Args:
@@ -50,7 +50,7 @@ class SupervisorVigil:
         while True:
             left_ns = heard_ns + self._silence_ns - self._clock.now_ns()
             ready = select.select([self._status], [], [], max(left_ns, 0) * 1e-9)[0]
-            if words := self._status.heard():
+            if words := self._status.received():
                 heard_ns = self._clock.now_ns()
                 self._words.extend(word for word in words if word != HEARTBEAT)
             elif ready:

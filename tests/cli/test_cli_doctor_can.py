@@ -48,7 +48,7 @@ def test_foreign_nodes_and_a_wrong_number_are_told() -> None:
     # 5 frames of 111 bits in 50 ms are 11 100 bit/s, 2 % of 500 kbit/s.
     assert f"virtual:{channel}: 100 frames a second at 500000 bit/s, at least 2% of 500000 bit/s" in findings
     assert "other nodes on the bus: 3 (100 frames a second)" in findings
-    missing = findings["no frame from node 1; heard: 3"]
+    missing = findings["no frame from node 1; received: 3"]
     assert missing.do.endswith(f"virtual:{channel}?node=NUMBER")
 
 

@@ -443,12 +443,12 @@ class Child:
 
 def test_every_pair_of_signals_asks_once_and_kills_only_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGTERM and SIGHUP of an ending session are one request: the control process is damping then."""
-    monkeypatch.setattr("deal_hw.control.supervisor.hurry", lambda pid: None)
+    monkeypatch.setattr("deal_hw.control.supervisor.raise_priority", lambda pid: None)
     for first in SENT:
         for second in SENT:
             clock, child = VirtualClock(0), Child()
             supervisor = Supervisor(
-                module="m", plan={}, port_fd=None, passive=lambda phase, in_vain: True, clock=clock
+                module="m", plan={}, port_fd=None, passive=lambda phase, already_tried: True, clock=clock
             )
             supervisor._child = child  # type: ignore[assignment]
             with signals.taken(supervisor._signalled):
@@ -469,7 +469,7 @@ def test_no_signal_ends_the_supervisors_own_damping() -> None:
     """Hundreds, while the robot does not confirm for 2 s; no number of them ends the passive command."""
     bench = FakeBench(Go2OnStandRobot, mode="")
     robot = bench.armed()
-    supervisor = Supervisor(module="m", plan={}, port_fd=None, passive=lambda phase, in_vain: True)
+    supervisor = Supervisor(module="m", plan={}, port_fd=None, passive=lambda phase, already_tried: True)
     bench.device.command, bench.device.hears = decode_low_command(STIFF), False
     bench.device.pose += 0.1  # Without a load a stiff robot looks damped.
     begin_ns = bench.clock.now_ns()

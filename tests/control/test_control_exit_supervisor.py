@@ -62,7 +62,7 @@ class Run:
     """A supervisor over a control process that does as it is told.
 
     Attributes:
-        passive: What the supervisor was asked for once the process was dead: phase, tried in vain.
+        passive: What the supervisor was asked for once the process was dead: phase, tried already.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class Run:
             **settings,
         )
 
-    def _passive(self, phase: str, in_vain: bool) -> bool:
+    def _passive(self, phase: str, already_tried: bool) -> bool:
         child = self.supervisor._child
         assert child is None or child.returncode is not None, "the control process is dead first"
-        self.passive.append((phase, in_vain))
+        self.passive.append((phase, already_tried))
         return True
 
     def _on_beat(self, beat: Beat) -> None:
@@ -117,7 +117,7 @@ def test_a_process_that_ends_well_leaves_nothing_to_do() -> None:
 
 
 @pytest.mark.parametrize(
-    ("do", "phase", "in_vain", "code"),
+    ("do", "phase", "already_tried", "code"),
     [
         ("sys.exit(7)", "starting", False, 7),
         ("beat('connecting'); os.kill(os.getpid(), 9)", "connecting", False, -9),
@@ -127,12 +127,12 @@ def test_a_process_that_ends_well_leaves_nothing_to_do() -> None:
     ],
 )
 def test_who_makes_passive_is_told_when_it_died_and_whether_it_tried(
-    do: str, phase: str, in_vain: bool, code: int
+    do: str, phase: str, already_tried: bool, code: int
 ) -> None:
-    """The last phase that was heard; a report without the word is a try in vain."""
+    """The last received phase; a report without the word means that the process tried without success."""
     run = Run(do)
     end = run.end()
-    assert run.passive == [(phase, in_vain)]
+    assert run.passive == [(phase, already_tried)]
     assert (end.passive_confirmed, end.exit_code, end.killed) == (True, code, "")
 
 
@@ -405,7 +405,7 @@ def test_what_is_killed_is_hurried_and_waited_for_without_a_limit(
 ) -> None:
     """The robot is stiff meanwhile: no time is lost on a busy machine, nor by a wait that polls."""
     hurried: list[int] = []
-    monkeypatch.setattr(module, "hurry", hurried.append)
+    monkeypatch.setattr(module, "raise_priority", hurried.append)
     run = Run("beat('homing', 0.02); time.sleep(600)")
     assert run.end().exit_code == -9
     assert run.supervisor._child is not None and hurried == [run.supervisor._child.pid]

@@ -17,7 +17,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control.claim import LocalClaim
 from deal_hw.control.process_channel import HEARTBEAT, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.realtime import priority
-from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
+from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorWatchdog
 from deal_hw.errors import PortBusyError
 
 pytestmark = pytest.mark.real_time
@@ -35,7 +35,7 @@ class Rig:
         self.supervisor = StatusReceiver(self._ends[1])
         self.silent = threading.Event()
         self.calls = 0
-        self.vigil = SupervisorVigil(StatusSender(self._ends[0]), self.clock, self._on_silence, SILENCE_S)
+        self.vigil = SupervisorWatchdog(StatusSender(self._ends[0]), self.clock, self._on_silence, SILENCE_S)
 
     def _on_silence(self) -> None:
         self.calls += 1
@@ -161,7 +161,7 @@ def test_the_vigil_keeps_nobody_alive() -> None:
 def test_the_limit_is_the_one_that_the_docs_name() -> None:
     """docs/explanation/safety.md says 1 s."""
     rig = Rig()
-    vigil = SupervisorVigil(rig.vigil._status, rig.clock, rig._on_silence)
+    vigil = SupervisorWatchdog(rig.vigil._status, rig.clock, rig._on_silence)
     assert vigil._silence_ns == round(SUPERVISOR_SILENCE_S * 1e9) == 10**9
     rig.vigil.start()
     rig.close()

@@ -304,7 +304,7 @@ def test_an_unconfirmed_robot_is_not_handed_back() -> None:
         rig.device.begin_fault("freeze")
         loop.request_stop()
 
-    # Long enough that the wire is opened again in vain.
+    # Long enough that the wire is opened again without success.
     loop = rig.loop(At(3, end), hand_back=True, passive=PassiveConfig(timeout_s=4.0))
     report = loop.run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, False)

@@ -96,7 +96,7 @@ class Run:
             on_beat=self._on_beat,
         )
 
-    def _passive(self, phase: str, in_vain: bool) -> bool:
+    def _passive(self, phase: str, already_tried: bool) -> bool:
         self.passive_calls += 1
         return True
 

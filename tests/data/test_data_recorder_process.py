@@ -102,7 +102,7 @@ def test_ctrl_c_does_not_end_the_recorder(
     outcome = recorder.finish()
     assert outcome.complete and outcome.cycles == 2
     (told,) = outcome.errors
-    assert told.startswith("it was told to end by SIG")
+    assert told.startswith("it was ended by SIG")
 
 
 def test_sigterm_ends_it_with_a_whole_file(

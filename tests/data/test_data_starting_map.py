@@ -76,7 +76,7 @@ def test_a_guess_that_was_printed_is_not_printed_again(tmp_path: Path) -> None:
     known: dict[str, str] = {}
     for name, text in (("a.csv", one), ("b.csv", one), ("c.csv", other)):
         (tmp_path / name).write_text(text)
-        load_tables(tmp_path / name, joints=("boom",), say=told.append, said=known)
+        load_tables(tmp_path / name, joints=("boom",), say=told.append, printed=known)
     assert told.count("b.csv: the same column map as a.csv") == 1
     assert [line.partition(":")[0] for line in told if "was guessed" in line] == ["a.csv", "c.csv"]
 

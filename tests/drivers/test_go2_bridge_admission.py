@@ -235,13 +235,13 @@ def test_a_restarted_bridge_knows_no_old_stream(bench: Bench) -> None:
 
 
 def test_a_client_without_stamps_is_refused(bench: Bench) -> None:
-    """Neither order nor age of its messages is known; one that has heard no state is told so."""
+    """Neither order nor age of its messages is known; one that has received no state gets that message."""
     payload = ENCODER.encode(DAMPING)
     for attachment in (b"", b"\x01", Stamp(SESSION, bench.now_ns).encode(), b"\x02" * 40):
         assert bench.take(Message(topics.LOW_COMMAND, payload, 0, attachment)) is None
         assert "neither sequence nor age" in bench.why()
     assert bench.send(DAMPING, session=0) is None
-    assert "heard no state" in bench.why()
+    assert "received no state" in bench.why()
     assert bench.judge.refused == {"unstamped": 4, "session": 1}
 
 

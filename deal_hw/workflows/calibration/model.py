@@ -116,9 +116,9 @@ def prepare_model(
     space = searched_space(settings, model, say)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
-    said: dict[str, str] = {}
+    printed: dict[str, str] = {}
     fitted, held = (
-        read_tables(sources, columns, facts, say, name, said)
+        read_tables(sources, columns, facts, say, name, printed)
         for name, sources in (("data", data), ("holdout", holdout))
     )
     if settings.policy is not None:

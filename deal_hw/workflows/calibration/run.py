@@ -29,7 +29,7 @@ from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.best_so_far import SO_FAR, BestSoFar, keeping_best, saying_how_to_resume
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
-from deal_hw.workflows.say import Say, aloud, silent
+from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
@@ -324,7 +324,7 @@ def finish(
             checkpoint.unlink(missing_ok=True)
             shutil.rmtree(folder / SO_FAR, ignore_errors=True)
     except KeyboardInterrupt:
-        aloud(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
+        to_stderr(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
         raise
     return CalibrateReport(result=result, files=files)
 

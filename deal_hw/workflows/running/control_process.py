@@ -24,7 +24,7 @@ from deal_hw.control.realtime import (
     kill_self_after,
     parent_is_gone,
 )
-from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
+from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorWatchdog
 
 _START_SILENCE_S = 30.0
 _ORPHAN_S = 5.0
@@ -138,7 +138,7 @@ def _run(
         stopper.supervisor_silent = True
         signal.pthread_kill(main, _SUPERVISOR_SILENT)
 
-    vigil = SupervisorVigil(status, clock, supervisor_is_silent)
+    vigil = SupervisorWatchdog(status, clock, supervisor_is_silent)
 
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)

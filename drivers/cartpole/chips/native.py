@@ -177,8 +177,8 @@ def write_stm32_image(folder: Path) -> str:
         shutil.copy(stm32_image(program), elf)
         subprocess.run(["arm-none-eabi-objcopy", "-O", "binary", str(elf), str(code)], check=True)
         size = ["arm-none-eabi-size", str(elf)]
-        said = subprocess.run(size, check=True, capture_output=True, text=True).stdout
-        code_bytes, data, zero = (int(text) for text in said.splitlines()[1].split()[:3])
+        sizes = subprocess.run(size, check=True, capture_output=True, text=True).stdout
+        code_bytes, data, zero = (int(text) for text in sizes.splitlines()[1].split()[:3])
         lines.append(
             f"{code.name} for the STM32F103C8: flash {code_bytes + data} bytes of 65536, "
             f"RAM {data + zero} bytes of 20480 (the stack has the rest of the first 8192)"

@@ -33,7 +33,7 @@ from deal_hw.transport import Message
 _STREAMS: Final = 64
 """Number of streams whose newest sequences are remembered; messages of older streams are too old anyway."""
 _TOLD: Final = 8
-"""Number of streams that the status names, those heard last."""
+"""Number of streams that the status names, those received last."""
 _REQUESTS: Final = {topics.request(name): name for name in topics.SERVICES}
 
 
@@ -204,7 +204,7 @@ class Admission:
         if echo.heard.session != self._session:
             raise RefusedMessageError(
                 "session",
-                "its sender has heard no state of this bridge yet"
+                "its sender has received no state of this bridge yet"
                 if not echo.heard.session
                 else "it answers states of another bridge, or of this one before its restart",
             )
