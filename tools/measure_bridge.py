@@ -143,11 +143,11 @@ def _side(name: str, link: str, end_point: str, config: MeasureBridge, keys: Pat
         yield process
 
 
-def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any]:
+def _one_way(sent: Mapping[str, int], received: Mapping[str, int]) -> dict[str, Any]:
     """Return statistics of the times from sending to arrival, and the number of lost messages."""
-    ages_ms = np.array([heard[number] - sent[number] for number in heard if number in sent]) * 1e-6
-    first, last = min(map(int, heard)), max(map(int, heard))
-    lost = sum(1 for number in sent if first <= int(number) <= last and number not in heard)
+    ages_ms = np.array([received[number] - sent[number] for number in received if number in sent]) * 1e-6
+    first, last = min(map(int, received)), max(map(int, received))
+    lost = sum(1 for number in sent if first <= int(number) <= last and number not in received)
     p50, p99 = np.percentile(ages_ms, (50, 99))
     return {
         "p50_ms": round(float(p50), 4),

@@ -96,7 +96,7 @@ class Takeover:
         """Check that neither the robot's own controller nor another program commands the motors.
 
         Services that do not answer are no proof of a controller: an active one sends commands, which are
-        heard.
+        received.
 
         Raises:
             SafetyError: One of them does; the text names it.

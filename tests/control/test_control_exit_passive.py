@@ -62,8 +62,8 @@ class Wire(VirtualTransport):
     Attributes:
         sent: When which message left the host [ns, payload], lost ones included.
         opened: When it was opened [ns].
-        silent: Whether what is sent is lost and nothing is heard.
-        deaf: Whether nothing is heard.
+        silent: Whether what is sent is lost and nothing is received.
+        deaf: Whether nothing is received.
         error: Raised by reading, where there is one.
     """
 
@@ -157,7 +157,7 @@ def test_a_robot_that_hears_is_passive_at_the_first_attempt() -> None:
 
 @pytest.mark.parametrize("wanted", [1, 3])
 def test_one_state_that_looks_passive_is_no_proof(wanted: int) -> None:
-    """A stiff robot without load looks damped as the link returns, before it heard a command: told again."""
+    """A stiff robot without load looks damped as the link returns, before it got a command: asked again."""
     armed = Armed()
     state = armed.robot.read_state(1.0)
     shown = iter([Status(0), Status(0), Status.ARMED, Status(0), Status(0), Status(0), Status(0)])
@@ -262,7 +262,7 @@ def test_opening_may_take_longer_than_the_time_that_is_left() -> None:
 
 
 def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
-    """The robot is heard and does not obey: a new path would not help, and would cost the old one."""
+    """The robot is received and does not obey: a new path would not help, and would cost the old one."""
     armed = Armed()
 
     class Deaf(CartpoleDevice):
@@ -414,7 +414,7 @@ class Hung:
 
     @property
     def kinds(self) -> list[str]:
-        """The kinds of command that the robot heard, each change once."""
+        """The kinds of command that the robot received, each change once."""
         return [kind for *_, kind in self.device.log.changes]
 
 
@@ -467,11 +467,11 @@ def test_a_go2_whose_link_is_lost_in_the_run_trips_at_once_and_is_damped_once_it
 def test_a_go2_that_was_not_commanded_yet_is_left_alone(phase: str) -> None:
     """Stopped while its own controller may still have it: not one motor command."""
     rig = Hung()
-    heard: list[str] = []
+    received: list[str] = []
     receive = rig.device.receive
 
     def overheard(topic: str, payload: bytes, stamp_ns: int = 0) -> None:
-        heard.append(topic)
+        received.append(topic)
         receive(topic, payload, stamp_ns)
 
     rig.device.receive = overheard  # type: ignore[method-assign]
@@ -483,5 +483,5 @@ def test_a_go2_that_was_not_commanded_yet_is_left_alone(phase: str) -> None:
     rig.at = at
     report = rig.run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, True)
-    assert topics.LOW_COMMAND not in heard
+    assert topics.LOW_COMMAND not in received
     assert "making passive" not in dict(rig.beats)

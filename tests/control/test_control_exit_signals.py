@@ -294,7 +294,7 @@ class Controlled:
     def kinds(self) -> list[str]:
         """The kinds of command that the robot got, each change once."""
         found: list[str] = []
-        for _, command in self.bench.device.heard:
+        for _, command in self.bench.device.received:
             kind = "stiff" if command.stiffness.any() else "damping"
             if found[-1:] != [kind]:
                 found.append(kind)

@@ -257,7 +257,7 @@ def test_words_reach_a_process_that_is_there_and_nobody_else() -> None:
     def speak(run: Run, beat: Beat) -> None:
         run.supervisor.tell("w")
 
-    do = "beat('running'); heard = [];\nwhile 'w' not in heard: heard.append(channel.recv(64).decode())\n"
+    do = "beat('running'); got = [];\nwhile 'w' not in got: got.append(channel.recv(64).decode())\n"
     run = Run(do + "result(passive_confirmed=True)", speak)
     run.supervisor.tell("too early")
     assert run.end().passive_confirmed
@@ -279,7 +279,7 @@ def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None
     """Three heartbeats reach the process; what it inherits is what was named, and the channel."""
     do = (
         "heard = [channel.recv(64) for _ in range(3)]; "
-        "result(passive_confirmed=True, heard=[h.decode() for h in heard], "
+        "result(passive_confirmed=True, received=[h.decode() for h in received], "
         "opened=os.path.exists(f'/proc/self/fd/{orders[\"keep\"]}'), parent=orders['parent_pid'])"
     )
     with (tmp_path / "claim").open("w") as claim:
@@ -288,7 +288,7 @@ def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None
         end = run.end()
     assert end.result == {
         "passive_confirmed": True,
-        "heard": ["\0"] * 3,
+        "received": ["\0"] * 3,
         "opened": True,
         "parent": os.getpid(),
     }
@@ -325,13 +325,13 @@ def test_heartbeats_go_by_the_clock() -> None:
     """A clock that stands still makes one, at once, however often the supervisor wakes up."""
     do = (
         "[(beat('running'), time.sleep(0.02)) for _ in range(10)]; channel.setblocking(False); "
-        "result(passive_confirmed=True, heard=channel.recv(64).decode()); "
+        "result(passive_confirmed=True, received=channel.recv(64).decode()); "
         "time.sleep(0.1); n = 0\n"
         "try:\n    channel.recv(64); n = 1\nexcept BlockingIOError:\n    pass\n"
         "sys.exit(n)"
     )
     end = Run(do, clock=VirtualClock(0)).end()
-    assert end.result == {"passive_confirmed": True, "heard": "\0"}
+    assert end.result == {"passive_confirmed": True, "received": "\0"}
     assert end.exit_code == 0
 
 

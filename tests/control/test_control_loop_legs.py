@@ -44,7 +44,7 @@ class Tap:
 
     def __init__(self, device: Go2Device) -> None:
         self._device = device
-        self.heard: list[tuple[int, str, bytes]] = []
+        self.received: list[tuple[int, str, bytes]] = []
         self.heights: list[float] = []
         self.deaf_to: set[str] = set()
         self.state: Callable[[LowState], LowState] | None = None
@@ -56,7 +56,7 @@ class Tap:
 
     def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
         """Note what the host sent, and pass it on."""
-        self.heard.append((stamp_ns, topic, payload))
+        self.received.append((stamp_ns, topic, payload))
         if topic not in self.deaf_to:
             self._device.receive(topic, payload, stamp_ns)
 
@@ -122,10 +122,10 @@ class LegRig:
 
     @property
     def commands(self) -> list[tuple[int, str, bytes]]:
-        """When which kind of motor command was heard."""
+        """When which kind of motor command was received."""
         return [
             (stamp_ns, kind_of(decode_low_command(payload)), payload)
-            for stamp_ns, topic, payload in self.tap.heard
+            for stamp_ns, topic, payload in self.tap.received
             if topic == topics.LOW_COMMAND
         ]
 
@@ -253,7 +253,7 @@ def test_a_finished_run_hands_the_robot_back_after_damping(stood: Stood) -> None
     assert rig.device.sport_name == "normal"
     assert ("handed back", "the robot's own controller has the robot again") in rig.events
     last_command = max(stamp for stamp, *_ in rig.commands)
-    asked = [stamp for stamp, topic, _ in rig.tap.heard if topic == SWITCHER]
+    asked = [stamp for stamp, topic, _ in rig.tap.received if topic == SWITCHER]
     assert asked[-1] > last_command
     assert rig.records[-1].events[-1].kind == "ended"
 
@@ -310,7 +310,7 @@ def test_an_unconfirmed_robot_is_not_handed_back() -> None:
     assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, False)
     assert "handing back" not in dict(rig.beats)
     assert rig.commands[-1][1] == DAMPING
-    assert not any(t == SWITCHER for stamp, t, _ in rig.tap.heard if stamp >= rig.tripped_ns)
+    assert not any(t == SWITCHER for stamp, t, _ in rig.tap.received if stamp >= rig.tripped_ns)
 
 
 def test_a_robot_that_cannot_be_handed_back_is_a_warning() -> None:
@@ -368,7 +368,7 @@ def test_a_dry_run_sends_nothing_at_all() -> None:
     rig = LegRig()
     report = rig.loop(dry_run=True, hand_back=True, duration_s=0.5).run()
     assert (report.outcome, report.cycles_sent) == (Outcome.FINISHED, 0)
-    assert rig.tap.heard == []
+    assert rig.tap.received == []
     assert "handing back" not in dict(rig.beats), "nothing was taken"
     assert rig.device.sport_name == "normal"
     assert all(record.requested is not None and record.sent is None for record in rig.records[:-1])

@@ -114,7 +114,7 @@ def control_pid() -> int:
 
 
 def kinds(report: dict[str, Any]) -> list[str]:
-    """Return the kinds of command that the emulator heard, in order, each change once."""
+    """Return the kinds of command that the emulator received, in order, each change once."""
     return [kind for _, _, kind in report["commands"]["changes"]]
 
 
@@ -151,7 +151,7 @@ def test_a_go2_stands_up_holds_and_lies_down(
     assert kinds(told)[-3:] == [DAMPING, STIFF, DAMPING]
     assert told["commands"]["last_kind"] == DAMPING
     assert told["commands"]["refused"] == 0
-    # Repeats in between: far more commands are heard than cycles were run.
+    # Repeats in between: far more commands are received than cycles were run.
     assert told["commands"]["accepted"] > 5 * episode.cycles_sent
     assert told["sport"] == ""
 

@@ -154,7 +154,7 @@ def test_the_port_vanishes_on_request() -> None:
 
 
 def test_the_wire_is_cut_for_a_time() -> None:
-    """0.3 s after arming nothing is heard or said for 0.4 s; the device's watchdog acts meanwhile."""
+    """0.3 s after arming nothing is received or said for 0.4 s; the device's watchdog acts meanwhile."""
     bench = Bench(Hazards(cut_after_s=0.3, cut_s=0.4))
     try:
         bench.arm()

@@ -275,8 +275,8 @@ def test_a_frozen_peer_that_must_confirm_holds_no_send_up(domain: int) -> None:
     message = Message("rt/lowcmd", payload("rt/lowcmd", 1), 0)
     with make(domain, publish=("rt/lowcmd",)) as wire, child(RELIABLE_READER, domain) as frozen:
         assert frozen.stdout is not None
-        heard = frozen.stdout
-        patiently(wire, lambda: select.select([heard], [], [], 0)[0], lambda: wire.send(message))
+        received = frozen.stdout
+        patiently(wire, lambda: select.select([received], [], [], 0)[0], lambda: wire.send(message))
         frozen.send_signal(signal.SIGSTOP)
         for _ in range(10_000):
             wire.send(message)

@@ -114,7 +114,7 @@ def test_an_observer_reads_and_cannot_command(rig: BridgeRig, controller: Bridge
 
 
 def test_a_run_with_an_observers_certificate_is_refused(rig: BridgeRig) -> None:
-    """It waited for a minute for services that never heard it, and blamed sport mode."""
+    """It waited for a minute for services that never received it, and blamed sport mode."""
     clock = MonotonicClock()
     with BridgeClient(rig.port, rig.options("observer")) as observer:
         # The controller of the test before counts as live until its last command is 0.5 s old.

@@ -44,7 +44,7 @@ def frame() -> LowStateFrame:
 
 
 class Bench:
-    """A judge, and controllers that write to it; each message is heard 5 ms after the state it answers."""
+    """A judge, and controllers that write to it; each message is received 5 ms after the state it answers."""
 
     def __init__(self, frame: LowStateFrame, **settings: float) -> None:
         config = BridgeConfig(**{"margin_s": 0.006, **settings})
@@ -224,7 +224,7 @@ def test_a_replay_is_refused(bench: Bench) -> None:
 
 
 def test_a_restarted_bridge_knows_no_old_stream(bench: Bench) -> None:
-    """Stamps of the session before do not count; nor does a stream that goes on once it heard the new."""
+    """Stamps of the session before do not count; nor does a stream that goes on once it received the new."""
     bench.judge.take_charge("restarted")
     assert bench.send(HOLD, session=SESSION + 1) is None
     assert "before its restart" in bench.why()

@@ -217,7 +217,7 @@ def test_a_wire_that_cannot_be_opened_leaves_nothing_open(bus: Bus) -> None:
 
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_claim_or_none(payload: bytes) -> None:
-    """Nothing that is heard raises."""
+    """Nothing that is received raises."""
     assert read_note(payload, CLAIM_TEXTS) is None or isinstance(read_note(payload, CLAIM_TEXTS), dict)
 
 

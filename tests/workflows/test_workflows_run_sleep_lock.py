@@ -38,14 +38,14 @@ def test_both_locks_are_held_for_the_run_and_released_after_it(bus: Path) -> Non
 def test_a_sleep_that_comes_all_the_same_is_reported_before_it(bus: Path) -> None:
     """Over ssh only the delay is granted: the robot is made passive in it, and the operator knows."""
     said: list[str] = []
-    heard = threading.Event()
+    received = threading.Event()
     with FakeLogind(bus, refuse=("block",)) as logind:
-        with awake(heard.set, said.append):
+        with awake(received.set, said.append):
             (rule,) = logind.matches
             assert "member='PrepareForSleep'" in rule
             logind.prepare_for_sleep(begins=False)
             logind.prepare_for_sleep()
-            assert heard.wait(WAIT_S)
+            assert received.wait(WAIT_S)
             assert not logind.released("delay", 0.0), "the run is not over yet"
         assert logind.released("delay")
     assert said == [
@@ -56,10 +56,10 @@ def test_a_sleep_that_comes_all_the_same_is_reported_before_it(bus: Path) -> Non
 
 def test_the_end_of_a_sleep_is_none(bus: Path) -> None:
     """The same signal says that the computer is awake again."""
-    heard: list[bool] = []
-    with FakeLogind(bus) as logind, awake(lambda: heard.append(True), lambda text: None):
+    received: list[bool] = []
+    with FakeLogind(bus) as logind, awake(lambda: received.append(True), lambda text: None):
         logind.prepare_for_sleep(begins=False)
-    assert heard == []
+    assert received == []
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,8 @@ def _accusation(names: Sequence[str], *, servo: bool) -> str:
         )
     return (
         f"commands that look like positions ({names_text}): the joints follow them, but the model has "
-        "motors, which would take them as torques. Replace <motor> by <position joint=... kp=... kv=...> in a "
-        "copy of the MJCF, with the gains of the drives; or name the column of torques as `target`"
+        "motors, which would take them as torques. Replace <motor> by <position joint=... kp=... kv=...> in "
+        "a copy of the MJCF, with the gains of the drives; or name the column of torques as `target`"
     )
 
 

@@ -201,14 +201,14 @@ class Admission:
         self._heard.move_to_end(echo.stream)
         if len(self._heard) > _TOLD:
             self._heard.popitem(last=False)
-        if echo.heard.session != self._session:
+        if echo.received.session != self._session:
             raise RefusedMessageError(
                 "session",
                 "its sender has received no state of this bridge yet"
-                if not echo.heard.session
+                if not echo.received.session
                 else "it answers states of another bridge, or of this one before its restart",
             )
-        age_ns = now_ns - echo.heard.time_ns
+        age_ns = now_ns - echo.received.time_ns
         if not 0 <= age_ns <= self._age_ns:
             raise RefusedMessageError(
                 "age",
