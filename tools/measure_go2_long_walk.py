@@ -42,7 +42,7 @@ def repeated(seconds: float) -> Script:
 
 
 class Memory(threading.Thread):
-    """Takes the resident set of this process and its children until it is told to stop."""
+    """Takes the resident set of this process and its children until :meth:`stop`."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)

@@ -82,7 +82,7 @@ def test_gravity_turning_and_command_by_hand() -> None:
 
 
 def test_a_command_beyond_the_training_is_clipped_to_it() -> None:
-    """Trained for -0.2 to 0.5 m/s ahead: asked for -1, it is told -0.2; what lies inside passes."""
+    """Trained for -0.2 to 0.5 m/s ahead: asked for -1, it gets -0.2; what lies inside passes."""
     ear = Ear(*SENSED)
     ear.spec = dataclasses.replace(ear.spec, command_range=((-0.2, 0.5), (-0.3, 0.3), (-1.0, 1.0)))
     behaviour = PolicyBehaviour(ear, DRIVER, FixedVelocity((-1.0, 0.1, 1.0)))

@@ -169,8 +169,8 @@ def test_a_child_that_starts_is_not_ended_before_it_can_act() -> None:
     assert signal.SIGTERM not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGABRT):
         child.send_signal(number)
-    said, _ = child.communicate("go on")
-    assert said.split() == ["[1,", "6,", "15]"]
+    printed, _ = child.communicate("go on")
+    assert printed.split() == ["[1,", "6,", "15]"]
 
 
 # The last resort of an orphan.
@@ -473,10 +473,10 @@ def test_no_signal_ends_the_supervisors_own_damping() -> None:
     bench.device.command, bench.device.hears = decode_low_command(STIFF), False
     bench.device.pose += 0.1  # Without a load a stiff robot looks damped.
     begin_ns = bench.clock.now_ns()
-    told: list[str] = []
+    reported: list[str] = []
 
     def progress(text: str, silence_s: float) -> None:
-        told.append(text)
+        reported.append(text)
         for number in SENT:
             signal.raise_signal(number)
         bench.device.hears = bench.clock.now_ns() - begin_ns > 2 * 10**9
@@ -484,7 +484,7 @@ def test_no_signal_ends_the_supervisors_own_damping() -> None:
 
     with signals.taken(supervisor._signalled):
         assert make_passive(robot, bench.clock, PassiveConfig(), progress=progress)
-    assert len(told) > 10
+    assert len(reported) > 10
     assert bench.device.command is not None and not bench.device.command.stiffness.any()
     assert supervisor._signal == "SIGHUP"
 

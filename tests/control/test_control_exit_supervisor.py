@@ -59,7 +59,7 @@ exec(orders["do"])
 
 
 class Run:
-    """A supervisor over a control process that does as it is told.
+    """A supervisor over a control process that follows a script.
 
     Attributes:
         passive: What the supervisor was asked for once the process was dead: phase, tried already.

@@ -27,7 +27,7 @@ PATIENCE_S = 20.0
 
 
 class Rig:
-    """A vigil, its supervisor's end of the channel, and a clock that moves when told."""
+    """A vigil, its supervisor's end of the channel, and a clock that moves on request."""
 
     def __init__(self) -> None:
         self.clock = VirtualClock(10**12)
@@ -303,7 +303,7 @@ def test_other_errors_of_the_kernel_come_out(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("children", [True, False])
 def test_a_priority_holds_inside_its_block_only(children: bool) -> None:
-    """Where it is granted; whether threads get it, too, is said."""
+    """Where it is granted; whether threads get it, too, is reported."""
     before = os.sched_getscheduler(0)
     found: list[int] = []
     with priority(7, children=children, lock=True):

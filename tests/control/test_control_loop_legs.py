@@ -74,18 +74,18 @@ class Tap:
 
 
 class Spy(Safety):
-    """The safety module, with a copy of what it was told."""
+    """The safety module, with a copy of its inputs."""
 
     def __init__(self) -> None:
         super().__init__(DRIVER)
-        self.told: list[CycleInput] = []
-        self.said: list[SafetyDecision] = []
+        self.inputs: list[CycleInput] = []
+        self.decisions: list[SafetyDecision] = []
 
     def step(self, cycle: CycleInput, wanted: JointCommand | None) -> SafetyDecision:
         """Judge as ever."""
-        self.told.append(cycle)
-        self.said.append(super().step(cycle, wanted))
-        return self.said[-1]
+        self.inputs.append(cycle)
+        self.decisions.append(super().step(cycle, wanted))
+        return self.decisions[-1]
 
 
 class LegRig:
@@ -200,10 +200,10 @@ def test_commands_are_repeated_between_cycles(stood: Stood) -> None:
 
 def test_the_safety_module_knows_when_a_command_was_last_sent(stood: Stood) -> None:
     """Not known in the first cycle; then the command was repeated as the cycle began."""
-    ages = [cycle.command_age_ns for cycle in stood[0].safety.told]
+    ages = [cycle.command_age_ns for cycle in stood[0].safety.inputs]
     assert ages[0] == -1
     assert set(ages[1:]) == {0}
-    assert {cycle.fault for cycle in stood[0].safety.told} == {""}
+    assert {cycle.fault for cycle in stood[0].safety.inputs} == {""}
 
 
 def test_the_heartbeat_is_as_short_as_the_robot_asks_for(stood: Stood) -> None:
@@ -282,9 +282,9 @@ def test_another_program_on_the_wire_trips_with_the_drivers_words(stood: Stood) 
     report = rig.loop().run()
     assert report.outcome is Outcome.TRIPPED
     assert "another program commands the robot's motors" in report.reason
-    assert rig.safety.said[-1].flags[0] == "device_fault"
-    assert rig.safety.told[-1].fault == report.reason
-    assert rig.safety.told[-2].fault == ""
+    assert rig.safety.decisions[-1].flags[0] == "device_fault"
+    assert rig.safety.inputs[-1].fault == report.reason
+    assert rig.safety.inputs[-2].fault == ""
 
 
 def test_the_remote_stops_the_run(stood: Stood) -> None:
@@ -314,7 +314,7 @@ def test_an_unconfirmed_robot_is_not_handed_back() -> None:
 
 
 def test_a_robot_that_cannot_be_handed_back_is_a_warning() -> None:
-    """Its services do not answer any more: the run still finished, and the operator is told."""
+    """Its services do not answer any more: the run still finished, and the operator is informed."""
     rig = LegRig()
     report = rig.loop(
         At(3, lambda: rig.tap.deaf_to.add(SWITCHER)), hand_back=True, hand_back_timeout_s=1.0

@@ -1,4 +1,4 @@
-"""Channels out of the control process: nothing waits, refusals are counted, a dead peer is said."""
+"""Channels out of the control process: nothing waits, refusals are counted, a dead peer is reported."""
 
 from __future__ import annotations
 

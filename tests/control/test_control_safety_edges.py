@@ -227,7 +227,7 @@ def test_nothing_is_sent_where_nothing_is_asked() -> None:
 
 
 def test_a_loop_that_does_not_say_when_it_sent_has_not_sent() -> None:
-    """The age of the last command must be told."""
+    """The age of the last command must be given."""
     now = T0 + 3 * S
     verdict = armed_with(robot(legs=LEGS)).step(cycle(now, state(now, body=body())), command())
     assert verdict.flags == ("command_stale",)

@@ -34,7 +34,7 @@ status.result({"got": received, "port_fd": orders["port_fd"], "opened": opened, 
 
 
 def test_words_arrive_in_order_between_heartbeats() -> None:
-    """Both directions share one channel; nothing waits where nothing was said."""
+    """Both directions share one channel; nothing waits where nothing was sent."""
     ends = socket_pair()
     sender, receiver = StatusSender(ends[0]), StatusReceiver(ends[1])
     assert sender.received() == []
@@ -113,7 +113,7 @@ class Run:
             self.supervisor.tell(word)
 
     def result(self) -> tuple[ChildEnd, dict[str, Any]]:
-        """Run to the end; return how it ended and what the process said."""
+        """Run to the end; return how it ended and what the process printed."""
         end = self.supervisor.run()
         assert end.result is not None
         return end, end.result

@@ -83,7 +83,7 @@ def test_a_decompression_bomb_is_refused_before_it_is_read(tmp_path: Path) -> No
 
 
 def test_what_is_not_wanted_is_not_read(tmp_path: Path) -> None:
-    """Pictures, objects and archives inside are left out by their headers, and told."""
+    """Pictures, objects and archives inside are left out by their headers, and reported."""
     path = tmp_path / "a.npz"
     np.savez(
         path, time=np.arange(3.0), picture=np.zeros((2, 2, 3), np.uint8), thing=np.array([{}], dtype=object)

@@ -237,7 +237,7 @@ sys.stdin.read()
 
 
 def test_another_writer_is_named_until_it_is_killed(domain: int) -> None:
-    """Process and host are told; a killed process of this computer does not haunt us for the 10 s of DDS."""
+    """Process and host are named; a killed process of this computer does not haunt us for the 10 s of DDS."""
     with make(domain, subscribe=("rt/lowcmd",)) as wire, child(WRITER, domain) as other:
         patiently(wire, lambda: wire.writers("rt/lowcmd"))
         (writer,) = wire.writers("rt/lowcmd")
@@ -331,7 +331,7 @@ def test_messages_of_several_topics_come_in_the_order_of_writing(domain: int) ->
 
 @pytest.mark.parametrize(("code", "error"), [(-10, TransportTimeoutError), (-1, TransportError)])
 def test_what_dds_refuses_is_an_error(domain: int, code: int, error: type[Exception]) -> None:
-    """A full queue is a time-out at once; anything else is told with its code."""
+    """A full queue is a time-out at once; anything else is reported with its code."""
     with make(domain, publish=("rt/lowcmd",)) as wire:
         assert wire._live is not None
         wire._live.write = lambda *_: code

@@ -175,7 +175,7 @@ def test_a_second_controller_is_refused_and_the_first_goes_on(bench: Bench) -> N
 
 
 def test_why_commands_stayed_away_is_said(bench: Bench) -> None:
-    """The refusals of the stream that had the robot, and not what another one was told."""
+    """The refusals of the stream that had the robot, and not the messages to another one."""
     bench.walk()
     for _ in range(30):
         bench.send(HOLD, stream=2)

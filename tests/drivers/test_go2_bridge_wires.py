@@ -55,13 +55,13 @@ class Bench:
         self.go2 = FakeGo2(mode)
         self.wire = FakeTopics(self.go2, self.clock)
         self.network = Network(self.clock)
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.bridge = Go2Bridge(
-            self.wire, self.network, self.clock, BridgeConfig(leave_s=0.02), tell=self.told.append
+            self.wire, self.network, self.clock, BridgeConfig(leave_s=0.02), tell=self.reported.append
         )
 
     def run(self, milliseconds: int) -> None:
-        """Let the bridge look every 2 ms and pass on what the robot said."""
+        """Let the bridge look every 2 ms and pass on what the robot reported."""
         for _ in range(milliseconds // 2):
             self.bridge.step()
             # More than the robot says in that time.
@@ -73,10 +73,10 @@ class Bench:
         return [message for message in self.network.sent if message.channel == topic]
 
     def status(self) -> str:
-        """Return who controls the robot, as clients are told."""
-        told = read_note(self.received(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
-        assert told is not None
-        return told["control"]
+        """Return who controls the robot, as the status for clients has it."""
+        reported = read_note(self.received(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
+        assert reported is not None
+        return reported["control"]
 
     def say(self, topic: str, payload: bytes, sequence: int) -> None:
         """Send as a client does that has received the newest state."""
@@ -93,7 +93,7 @@ def make_bench(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Bench]:
 
 
 def kinds(go2: FakeGo2) -> list[bool]:
-    """Return whether each command that the robot was told is stiff."""
+    """Return whether each command to the robot is stiff."""
     return [bool(command.stiffness.any()) for _, command in go2.received]
 
 
@@ -101,7 +101,7 @@ def test_it_leaves_a_robot_alone_that_sport_mode_has(make_bench: Callable[[str],
     """From its start to its end no motor command goes out; what sport mode commands is passed on."""
     bench = make_bench("normal")
     bench.bridge.open()
-    assert bench.told == ["idle: the robot's own controller 'normal' has it"]
+    assert bench.reported == ["idle: the robot's own controller 'normal' has it"]
     bench.run(500)
     bench.bridge.close()
     assert bench.go2.received == []
@@ -123,7 +123,7 @@ def test_it_yields_at_its_start_to_another_program(make_bench: Callable[[str], B
     bench = make_bench("")
     bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.05)
     bench.bridge.open()
-    assert bench.told == ["idle: another program on the robot's side commands the motors"]
+    assert bench.reported == ["idle: another program on the robot's side commands the motors"]
     assert kinds(bench.go2) == [True], "the other program's command alone"
 
 
@@ -137,7 +137,7 @@ def test_it_yields_later_too_and_says_so(make_bench: Callable[[str], Bench]) -> 
     count = len(bench.go2.received)
     bench.run(100)
     assert len(bench.go2.received) == count
-    assert bench.told[-1] == "idle: another program on the robot's side commands the motors"
+    assert bench.reported[-1] == "idle: another program on the robot's side commands the motors"
 
 
 def test_it_takes_charge_again_after_a_stray_command(make_bench: Callable[[str], Bench]) -> None:
@@ -152,8 +152,8 @@ def test_it_takes_charge_again_after_a_stray_command(make_bench: Callable[[str],
     assert kinds(bench.go2)[-1]
     bench.run(520)
     assert bench.status() == "damping"
-    assert bench.told[-1].startswith("damping: nobody has commanded the motors for")
-    assert bench.told[-1].endswith("and no mode is active")
+    assert bench.reported[-1].startswith("damping: nobody has commanded the motors for")
+    assert bench.reported[-1].endswith("and no mode is active")
     count = len(bench.go2.received)
     bench.run(100)
     assert kinds(bench.go2)[count:] == [False] * 50
@@ -230,7 +230,7 @@ def test_without_an_answer_it_damps_later(make_bench: Callable[[str], Bench]) ->
     assert bench.status() == "idle"
     bench.run(40)
     assert bench.status() == "damping"
-    assert bench.told[-1].endswith("and motion_switcher does not answer")
+    assert bench.reported[-1].endswith("and motion_switcher does not answer")
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
@@ -255,12 +255,12 @@ def test_a_robot_that_is_handed_back_keeps_its_damping_until_a_mode_has_it(
 
 
 def test_a_robot_that_does_not_answer_is_not_damped(make_bench: Callable[[str], Bench]) -> None:
-    """Sport mode may hold it, and then damping would throw it down; the operator is told."""
+    """Sport mode may hold it, and then damping would throw it down; the operator is informed."""
     bench = make_bench("")
     bench.go2.deaf.add("motion_switcher")
     bench.bridge.open()
     assert bench.go2.received == []
-    assert "is unknown, so it is not damped yet" in bench.told[0]
+    assert "is unknown, so it is not damped yet" in bench.reported[0]
     bench.run(5000)
     assert bench.go2.received == []
     bench.go2.deaf.clear()
@@ -277,9 +277,9 @@ def test_clients_hear_states_with_stamps_and_who_has_the_robot(make_bench: Calla
     stamps = [read_stamp(message.attachment) for message in states]
     assert [stamp.time_ns for stamp in stamps if stamp] == [message.stamp_ns for message in states]
     assert len({stamp.session for stamp in stamps if stamp}) == 1
-    told = [read_note(message.payload, STATUS_TEXTS) for message in bench.received(topics.BRIDGE)]
-    assert 5 <= len(told) <= 7
-    before = len(told)
+    reported = [read_note(message.payload, STATUS_TEXTS) for message in bench.received(topics.BRIDGE)]
+    assert 5 <= len(reported) <= 7
+    before = len(reported)
     bench.say(topics.LOW_COMMAND, DAMPING, 0)
     bench.run(4)
     status = read_note(bench.received(topics.BRIDGE)[before].payload, STATUS_TEXTS)

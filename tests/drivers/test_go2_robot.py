@@ -104,7 +104,7 @@ def test_a_standing_clock_is_no_robot() -> None:
 
 
 def test_two_robots_on_one_network_are_refused() -> None:
-    """Half of what comes is old news of the other; who they are is told where discovery knows."""
+    """Half of what comes is old news of the other; who they are is reported where discovery knows."""
     wire = FakeBench()
     wire.topics.others = {topics.LOW_STATE: ("robot one", "robot two")}
     other = FakeGo2()
@@ -471,7 +471,7 @@ def status(control: str, reason: str = "no admissible command") -> bytes:
 
 
 def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:
-    """What it said before the arming, or just after it, is from before; its own hand-over is none."""
+    """What it reported before the arming, or just after it, is from before; its own hand-over is none."""
     wire = FakeBench(mode="")
     robot = wire.armed()
     wire.topics.say(topics.BRIDGE, status("damping"), 0.05)
@@ -485,7 +485,7 @@ def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:
 
 
 def test_a_robot_that_another_controls_through_the_bridge_is_not_taken_over() -> None:
-    """It is said before sport mode is asked for anything; one that only listens does not mind."""
+    """It is reported before sport mode is asked for anything; one that only listens does not mind."""
     wire = FakeBench()
     wire.robot.connect()
     wire.topics.say(topics.BRIDGE, status("controlled"), 0.001)
@@ -520,8 +520,8 @@ def test_the_robot_on_a_stand_is_another_description() -> None:
 
 def test_a_lost_connection_speaks_of_no_watchdog() -> None:
     """The Go2 has none: it holds its last command, and only somebody beside it can stop it."""
-    said = FakeBench(mode="").robot.if_cut
-    assert "watchdog" not in said and "still holds its last command" in said and "remote" in said
+    printed = FakeBench(mode="").robot.if_cut
+    assert "watchdog" not in printed and "still holds its last command" in printed and "remote" in printed
 
 
 def test_recorded_bytes_can_be_decoded_again() -> None:

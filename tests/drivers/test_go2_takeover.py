@@ -194,9 +194,9 @@ def test_a_bridge_that_does_not_hear_us_is_told_from_a_robot_without_services(
     wire = FakeBench()
     wire.device.deaf, wire.topics.our_stream = set(topics.SERVICES), 0xAA
     wire.robot.connect()
-    told = {"control": "idle", "reason": "nobody", **({} if received is None else {"heard": received})}
+    reported = {"control": "idle", "reason": "nobody", **({} if received is None else {"heard": received})}
     for i in range(100):
-        wire.topics.say(topics.BRIDGE, encode_note(told), 0.2 * i)
+        wire.topics.say(topics.BRIDGE, encode_note(reported), 0.2 * i)
     began_ns = wire.clock.now_ns()
     with pytest.raises(TransportTimeoutError, match=words):
         wire.robot.home(30.0)
@@ -215,7 +215,7 @@ def test_a_short_silence_of_the_switcher_is_no_older_firmware() -> None:
 
 
 def test_refusals_are_put_into_words() -> None:
-    """An error code is told with what to do; a busy switcher is asked again."""
+    """An error code is reported with what to do; a busy switcher is asked again."""
     wire = FakeBench()
     wire.device.codes = {("motion_switcher", 1001): [7002, 0], ("motion_switcher", 1003): [7008]}
     wire.robot.connect()

@@ -345,7 +345,7 @@ def test_a_pause_of_the_physics_trips_within_the_limit_of_a_states_age() -> None
 
 
 def test_a_robot_in_the_air_is_not_stood_up() -> None:
-    """Floor and stand are told apart as on the robot."""
+    """Floor and stand are distinguished as on the robot."""
     rig = Rig(held=True)
     floor = UnitreeMujocoRobot(rig.wire, rig.clock)
     floor.connect()

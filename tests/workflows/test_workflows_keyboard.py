@@ -133,7 +133,7 @@ def test_without_a_terminal_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_run_without_a_terminal_does_not_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It is said before the port is opened, and before there is a recorder or a dataset."""
+    """It is reported before the port is opened, and before there is a recorder or a dataset."""
     monkeypatch.setattr("sys.stdin", io.StringIO("w"))
     plan = RunPlan(robot="cartpole", motion="hold", velocity="keyboard")
     with pytest.raises(ConfigurationError, match="needs a terminal"):

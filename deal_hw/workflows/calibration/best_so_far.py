@@ -43,13 +43,13 @@ def check_resume(path: Path, resume: bool) -> None:
 
 
 class BestSoFar:
-    """The best fit of a running calibration: each better fit is kept for an interrupt; clear gains are said.
+    """The best fit of a running calibration: better fits are kept for an interrupt; clear gains are reported.
 
     Args:
         space: The parameters.
         judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
         and "null"; None without held-out data.
-        say: Called with a sentence on each fit whose error is 5 % lower than the one said before.
+        say: Called with a sentence on each fit whose error is 5 % lower than the one reported before.
     """
 
     def __init__(
