@@ -25,7 +25,9 @@ from deal_hw.calib.design.experiment_design import (
 )
 from deal_hw.calib.fit.intervals import IDENTIFIABLE_STD, WEAK_SHARE
 from deal_hw.calibration import CalibrationResult, std_words
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.errors import DealHwError
+from deal_hw.motions.excitation.plan import (
     OF_FAMILY,
     ExcitationDesign,
     ExcitationPlan,
@@ -33,8 +35,6 @@ from deal_hw.control.excitation_plan import (
     largest_factor,
     make_plan,
 )
-from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode

@@ -11,7 +11,9 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, MakeBehaviour
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription
+from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.motions.excitation.plan import (
     FAMILIES,
     ExcitationDesign,
     ExcitationPlan,
@@ -19,8 +21,6 @@ from deal_hw.control.excitation_plan import (
     largest_factor,
     make_plan,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import CalibrationError, ConfigurationError
 
 Criterion = Literal["determinant", "mean"]
 

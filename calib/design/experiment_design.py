@@ -16,10 +16,10 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, longest_windows
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.fit.residual import Shooting, States
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationPlan
 from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.excitation.plan import ExcitationBehaviour, ExcitationPlan
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode

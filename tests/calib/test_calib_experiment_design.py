@@ -24,13 +24,13 @@ from deal_hw.calib.design.experiment_design import (
 )
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, Identifiability
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.cartpole.description import k9_space
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.excitation.plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldoutErrors
-    from deal_hw.control.behaviours import Behaviour
+    from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
 

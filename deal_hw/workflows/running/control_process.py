@@ -16,21 +16,21 @@ from typing import Any
 
 from deal_hw import signals
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.process_channel import LOADING, RecordSender, StatusSender
-from deal_hw.control.realtime import (
+from deal_hw.control.process.channel import LOADING, RecordSender, StatusSender
+from deal_hw.control.process.realtime import (
     Granted,
     become_realtime,
     die_with_parent,
     kill_self_after,
     parent_is_gone,
 )
-from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorWatchdog
+from deal_hw.control.process.watchdog import SUPERVISOR_SILENCE_S, SupervisorWatchdog
 
 _START_SILENCE_S = 30.0
 _ORPHAN_S = 5.0
 """Time an orphaned control process may take beyond that of repeating the passive command [s]."""
 _SUPERVISOR_SILENT = signal.SIGUSR2
-"""Sent by the vigil's thread to the main thread, which may be waiting for the robot."""
+"""Sent by the watchdog's thread to the main thread, which may be waiting for the robot."""
 
 
 class _Stopper:
@@ -41,7 +41,7 @@ class _Stopper:
         self.loop: Any = None
         self.passive_s = 0.0
         self.supervisor_silent = False
-        """Whether the vigil found so: another program may send its signal, too."""
+        """Whether the watchdog found so: another program may send its signal, too."""
         self.reason = ""
         """Of the first signal; "" before it."""
         signals.take(self._handle)
@@ -105,13 +105,13 @@ def _run(
     orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper
 ) -> dict[str, Any]:
     # Imported here, so that a stop signal during these imports is handled, too.
-    from deal_hw.control.loop import ControlLoop, LoopConfig
-    from deal_hw.control.passive import PassiveConfig
-    from deal_hw.control.planned_end import PlannedEnd
-    from deal_hw.control.safety import Safety
-    from deal_hw.control.velocity import END_KEY, KeyboardVelocity, NotedVelocity
-    from deal_hw.control.velocity_error import VELOCITY_EVENT, velocity_data
-    from deal_hw.drivers import adopt_robot, make_robot
+    from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+    from deal_hw.control.safety.passive import PassiveConfig
+    from deal_hw.control.safety.safety import Safety
+    from deal_hw.motions.planned_end import PlannedEnd
+    from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, velocity_data
+    from deal_hw.motions.velocity import END_KEY, KeyboardVelocity, NotedVelocity
+    from deal_hw.robots import adopt_robot, make_robot
     from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
     plan = RunPlan.from_json(orders)
@@ -138,11 +138,11 @@ def _run(
         stopper.supervisor_silent = True
         signal.pthread_kill(main, _SUPERVISOR_SILENT)
 
-    vigil = SupervisorWatchdog(status, clock, supervisor_is_silent)
+    watchdog = SupervisorWatchdog(status, clock, supervisor_is_silent)
 
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)
-        for key in vigil.messages():
+        for key in watchdog.messages():
             if key == END_KEY and plan.stand:
                 end.request("ended by the operator's key")
             elif key == END_KEY:
@@ -176,7 +176,7 @@ def _run(
     if stopper.reason:
         # Its exception was lost in a callback of a library.
         loop.request_stop(stopper.reason)
-    vigil.start()
+    watchdog.start()
     return {**loop.run().to_json(), "warnings": list(granted.warnings)}
 
 

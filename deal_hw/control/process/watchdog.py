@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 
 from deal_hw.clock import Clock
-from deal_hw.control.process_channel import HEARTBEAT, StatusSender
+from deal_hw.control.process.channel import HEARTBEAT, StatusSender
 
 SUPERVISOR_SILENCE_S = 1.0
 """A supervisor without a heartbeat for this long counts as stopped [s]. It sends one every 50 ms; without
@@ -35,7 +35,7 @@ class SupervisorWatchdog:
         self._status, self._clock, self._on_silence = status, clock, on_silence
         self._silence_ns = round(silence_s * 1e9)
         self._words: deque[str] = deque(maxlen=256)
-        self._thread = threading.Thread(target=self._listen, name="supervisor vigil", daemon=True)
+        self._thread = threading.Thread(target=self._listen, name="supervisor watchdog", daemon=True)
 
     def start(self) -> None:
         """Start to listen; the thread has the caller's priority."""
