@@ -218,13 +218,13 @@ def test_a_return_is_the_time_upright_near_the_middle(base: Path) -> None:
     assert shipped["return"] > row["return"]
 
 
-def test_the_walk_follows_growing_speeds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_walk_follows_growing_speeds() -> None:
     """The shipped policy on the nominal Go2: ahead while it shall go ahead, aside while aside; no push."""
-    monkeypatch.setattr(transfer_target, "AHEAD_M_S", (0.5,))
-    monkeypatch.setattr(transfer_target, "ASIDE_M_S", (0.3,))
     distribution = nominal_distribution("go2")
     truth = ParameterDistribution.point(distribution.space, distribution.mean, 0.0)
-    row = transfer_target.speed_profile(truth, OnnxPolicy(required_policy("go2")), 0, count=2)
+    profile = transfer_target.commands(ahead_m_s=(0.5,), aside_m_s=(0.3,))
+    policy = OnnxPolicy(required_policy("go2"))
+    row = transfer_target.speed_profile(truth, policy, 0, count=2, profile=profile)
     speed = row["speed"]
     assert row["falls"] == 0
     assert speed["wanted_x_m_s"] == [0.5] * 5 + [0.0] * 5

@@ -71,11 +71,10 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "waitpid", lambda pid, options: (pid, 256))
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda which: (8 << 20, 8 << 20))
-    monkeypatch.setattr(machine, "PACKAGES", (("no-such", "dds"),))
     monkeypatch.setattr(
         machine, "_read", lambda path: {"rmem_max": "1000"}.get(path.rpartition("/")[2], "acpi_pm")
     )
-    findings = tuple(machine.examine_machine())
+    findings = tuple(machine.examine_machine([("no-such", "dds")]))
     assert levels(findings, "scheduling") == levels(findings, "memory") == {Severity.WARN}
     assert levels(findings, "packages") == {Severity.NOTE}
     assert levels(findings, "network") == {Severity.WARN}

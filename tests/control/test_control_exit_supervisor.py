@@ -25,7 +25,10 @@ from deal_hw.signals import OPERATOR, SUSPENDED
 
 pytestmark = pytest.mark.real_time
 
-GRACE_S = module._GRACE_S
+LONG_S = 300.0
+"""Time for the control process to end after its last message. It has an ordinary priority, and closing its
+channel wakes up a supervisor that has a higher one, in the middle of its end: on a busy machine it may get
+the processor back after more than the 3 s of a real run."""
 CHILD = """
 import json, os, signal, socket, struct, sys, time
 
@@ -77,7 +80,7 @@ class Run:
             port_fd=None,
             passive=self._passive,
             on_beat=self._on_beat,
-            **settings,
+            **{"grace_s": LONG_S, **settings},
         )
 
     def _passive(self, phase: str, already_tried: bool) -> bool:
@@ -97,12 +100,7 @@ class Run:
 
 @pytest.fixture(autouse=True)
 def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The control process's module, which has minutes to end after its last word.
-
-    It has an ordinary priority, and closing its channel wakes up a supervisor that has a higher one, in the
-    middle of its end: on a busy machine it may get the processor back after more than the 3 s of a real run.
-    """
-    monkeypatch.setattr(module, "_GRACE_S", 300.0)
+    """The control process's module."""
     (tmp_path / "deal_hw_obedient_child.py").write_text(CHILD)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
@@ -153,10 +151,9 @@ def test_a_process_that_falls_silent_is_killed() -> None:
     assert run.passive == [("homing", False)]
 
 
-def test_a_process_that_lingers_after_its_last_word_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_lingers_after_its_last_word_is_killed() -> None:
     """Its report counts, though it never read our heartbeats: the kernel then reports a reset first."""
-    monkeypatch.setattr(module, "_GRACE_S", 0.05)
-    run = Run("result(passive_confirmed=True); channel.close(); time.sleep(600)")
+    run = Run("result(passive_confirmed=True); channel.close(); time.sleep(600)", grace_s=0.05)
     end = run.end()
     assert (end.killed, end.exit_code) == ("it did not end after its last message", -9)
     assert end.result == {"passive_confirmed": True}
@@ -203,16 +200,14 @@ def test_the_operators_signals_ask_once_and_are_named(number: signal.Signals, ca
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP])
-def test_the_operators_late_second_wish_kills(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_operators_late_second_wish_kills(number: signal.Signals) -> None:
     """The process does not end by its passive route: the robot is the supervisor's then."""
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
 
     def twice(run: Run, beat: Beat) -> None:
         os.kill(os.getpid(), number)
 
-    run = Run("on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)", twice)
+    do = "on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)"
+    run = Run(do, twice, patience_s=0.0)
     end = run.end()
     assert (end.killed, end.exit_code) == ("it did not end when it was asked, and was asked again", -9)
     assert run.passive == [("running", False)]
@@ -229,14 +224,14 @@ def test_requests_at_once_are_one_request() -> None:
     assert (end.killed, end.exit_code, end.signal) == ("", 0, "SIGTERM")
 
 
-def test_the_first_signal_is_the_one_that_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_signal_is_the_one_that_is_named() -> None:
     """Ctrl-Z, then Ctrl-C."""
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
 
     def both(run: Run, beat: Beat) -> None:
         os.kill(os.getpid(), signal.SIGTSTP if len(run.beats) == 1 else signal.SIGINT)
 
-    run = Run("on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)", both)
+    do = "on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)"
+    run = Run(do, both, patience_s=0.0)
     end = run.end()
     assert (end.signal, end.stop_cause, end.killed != "") == ("SIGTSTP", SUSPENDED, True)
 
@@ -278,7 +273,7 @@ def test_in_another_thread_signals_are_left_alone() -> None:
 def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None:
     """Three heartbeats reach the process; what it inherits is what was named, and the channel."""
     do = (
-        "heard = [channel.recv(64) for _ in range(3)]; "
+        "received = [channel.recv(64) for _ in range(3)]; "
         "result(passive_confirmed=True, received=[h.decode() for h in received], "
         "opened=os.path.exists(f'/proc/self/fd/{orders[\"keep\"]}'), parent=orders['parent_pid'])"
     )
@@ -391,12 +386,9 @@ def limits(monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
     return found
 
 
-def test_a_process_has_three_seconds_to_end_after_its_last_word(
-    limits: list[float | None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_has_three_seconds_to_end_after_its_last_word(limits: list[float | None]) -> None:
     """It still has its files to close."""
-    monkeypatch.setattr(module, "_GRACE_S", GRACE_S)
-    assert Run("result(passive_confirmed=True)").end().exit_code == 0
+    assert Run("result(passive_confirmed=True)", grace_s=module.GRACE_S).end().exit_code == 0
     assert limits == [3.0]
 
 

@@ -265,7 +265,7 @@ participant = DomainParticipant(domain)
 topic = Topic(participant, "rt/lowcmd", load_types()["unitree_go::msg::dds_::LowCmd_"])
 reader = DataReader(participant, topic, qos=Qos(Policy.Reliability.Reliable(10**8), Policy.History.KeepAll))
 next(iter(reader.take_iter()))
-print("heard", flush=True)
+print("received", flush=True)
 sys.stdin.read()
 """
 

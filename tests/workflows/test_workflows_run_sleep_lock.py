@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from fakes.logind import FakeLogind
 
-from deal_hw.workflows.running import sleep_lock
 from deal_hw.workflows.running.sleep_lock import awake
 
 WAIT_S = 20.0
@@ -71,16 +70,16 @@ def test_the_end_of_a_sleep_is_none(bus: Path) -> None:
     ],
 )
 def test_without_a_lock_the_run_says_so_and_goes_on(
-    bus: Path, monkeypatch: pytest.MonkeyPatch, refuse: tuple[str, ...], hangs: bool, exists: bool, why: str
+    bus: Path, refuse: tuple[str, ...], hangs: bool, exists: bool, why: str
 ) -> None:
     """In one line, whoever refuses; a bus that hangs holds nobody up."""
-    monkeypatch.setattr(sleep_lock, "ANSWER_S", 0.1 if hangs else WAIT_S)
+    answer_s = 0.1 if hangs else WAIT_S
     printed: list[str] = []
     if exists:
-        with FakeLogind(bus, refuse, hangs=hangs), awake(lambda: None, printed.append):
+        with FakeLogind(bus, refuse, hangs=hangs), awake(lambda: None, printed.append, answer_s):
             pass
     else:
-        with awake(lambda: None, printed.append):
+        with awake(lambda: None, printed.append, answer_s):
             pass
     assert printed == [
         f"note: nothing keeps this computer from sleeping (logind: {why}); the robot then holds "
