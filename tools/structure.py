@@ -160,7 +160,7 @@ def count(root: Path, folder: str = "calib", verb: str = "calibrate") -> dict[st
     constants = numeric_constants(inside, sources)
     candidates = solve_loops(inside, sources)
     settings = settings_classes(inside, sources, root)
-    replaced = replaced_by_tests(root)
+    replaced = replaced_by_tests(sources, root)
     return {
         "format": FORMAT,
         "folder": folder,
