@@ -38,7 +38,7 @@ from deal_hw.testing.plain_robots import (
     shared_words,
     write,
 )
-from deal_hw.workflows.calibration.prepare import prepare, usual_method
+from deal_hw.workflows.calibration.intake import calibration_input, usual_method
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -100,7 +100,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         model, fit, held_out = write(robot, Path(name))
         config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
         try:
-            work = prepare(config, say=messages.append)
+            work = calibration_input(config, say=messages.append)
             if why := outside_range(work.space, robot.truth):
                 return row | {"error": f"ConfigurationError: {why}"}
             method = usual_method(config, work)

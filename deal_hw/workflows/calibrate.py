@@ -15,10 +15,15 @@ from typing import Any, Literal
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
-from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
-from deal_hw.workflows.calibration.recordings import Source
-from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S, CalibrationInputs, judged
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings, check_source
+from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
+from deal_hw.workflows.calibration.recordings import Recorded
+from deal_hw.workflows.calibration.run import calibrate_input, judged
+from deal_hw.workflows.calibration.settings import (
+    HELDOUT_WINDOW_S,
+    CalibrateSettings,
+    Recordings,
+    check_source,
+)
 from deal_hw.workflows.say import Say, html_table, silent, text_table
 
 _HEAD = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
@@ -35,7 +40,7 @@ class Calibration:
     """
 
     result: CalibrationResult
-    inputs: CalibrationInputs
+    inputs: CalibrationInput
     threads: int | None = None
 
     @property
@@ -148,10 +153,10 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def calibrate(
     model: Any = None,
-    data: Source | Sequence[Source] = (),
+    data: Recorded | Sequence[Recorded] = (),
     *,
     dataset: Path | str | None = None,
-    holdout: Source | int | Sequence[Source | int] = (),
+    holdout: Recorded | int | Sequence[Recorded | int] = (),
     episodes: Sequence[int] = (),
     columns: Path | str | None = None,
     parameters: Path | str | None = None,
@@ -295,10 +300,9 @@ def calibrate(
             seed=seed,
             threads=threads,
         )
-        settings.check(fit)
-        inputs = prepare(settings, data=fit, holdout=judges, say=say)
+        inputs = calibration_input(settings, data=fit, holdout=judges, say=say)
         chosen = usual_method(settings, inputs, say)
-        result = calibrate_inputs(settings, inputs, chosen, progress=progress, say=say)
+        result = calibrate_input(settings, inputs, chosen, progress=progress, say=say)
         result, _ = judged(inputs, result, settings.provenance, page=False, advise=False, threads=threads)
         found = Calibration(result=result, inputs=inputs, threads=threads)
         # Writing the calibrated model reads the model's file again.

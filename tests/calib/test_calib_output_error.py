@@ -36,7 +36,7 @@ from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 HINGE = """
@@ -94,7 +94,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    work = prepare(CalibrateSettings(recordings=source, threads=1))
+    work = calibration_input(CalibrateSettings(recordings=source, threads=1))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

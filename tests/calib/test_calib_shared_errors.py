@@ -32,7 +32,7 @@ from deal_hw.calib.validation.shared_errors import (
 from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -107,7 +107,7 @@ def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds:
     """Return the problem of a simulated robot's recordings."""
     robot = make_robot(kind, 3, fault)
     model, paths, held_out = write(robot, folder, seconds=seconds)
-    work = prepare(
+    work = calibration_input(
         CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
     )
     return Problem(work.robot, work.space, work.episodes, threads=1)

@@ -20,9 +20,10 @@ from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
-from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.dataset import choose_episodes
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import Recordings
+from deal_hw.workflows.calibration.space import without_speed_limits
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 
@@ -84,13 +85,15 @@ def test_a_file_adds_parameters_to_a_robots_own_set(dataset: Path, tmp_path: Pat
     extra = tmp_path / "extra.yaml"
     extra.write_text("parameters:\n  - {kind: encoder_bias, elements: cart}\n")
     chosen = Recordings(parameters=extra)
-    space = prepare(settings(dataset, free=(), recordings=chosen)).space
+    space = calibration_input(settings(dataset, free=(), recordings=chosen)).space
     assert space.names == (*k9_space().names, "cart.encoder_bias")
-    freed = prepare(settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)).space
+    freed = calibration_input(
+        settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)
+    ).space
     assert freed.names == ("cart.mass", "cart.encoder_bias")
     extra.write_text("parameters:\n  - {kind: dof_damping, elements: pole, name: twice}\n")
     with pytest.raises(ConfigurationError, match="both set dof_damping of 'pole'"):
-        prepare(settings(dataset, free=(), recordings=chosen))
+        calibration_input(settings(dataset, free=(), recordings=chosen))
 
 
 def test_writes_everything_a_user_needs(
@@ -235,8 +238,8 @@ def test_dataset_of_held_out_episodes_only_is_refused(tmp_path: Path) -> None:
 
 def test_parameter_sets_and_known_values(dataset: Path) -> None:
     """k11 frees everything; a weighed cart is known; an unknown set lists the sets."""
-    assert len(prepare(settings(dataset, free=(), space="k11")).space) == 11
-    space = prepare(settings(dataset, free=(), known=(("cart.mass", 0.41),))).space
+    assert len(calibration_input(settings(dataset, free=(), space="k11")).space) == 11
+    space = calibration_input(settings(dataset, free=(), known=(("cart.mass", 0.41),))).space
     assert space.known["cart.mass"] == 0.41 and len(space) == 8
     with pytest.raises(UnknownNameError, match=r"k7.*k9, k11"):
-        prepare(settings(dataset, free=(), space="k7"))
+        calibration_input(settings(dataset, free=(), space="k7"))

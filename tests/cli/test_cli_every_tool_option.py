@@ -327,7 +327,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
     """Note all that a calibration is called with, and what its result goes into."""
     from deal_hw.cli import calibrate
-    from deal_hw.workflows.calibration import prepare
+    from deal_hw.workflows.calibration import run as run_calibration
 
     def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
         rest.pop("progress"), rest.pop("say")
@@ -344,7 +344,7 @@ def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
         yield None
 
     monkeypatch.setattr(calibrate, "watching", watching)
-    monkeypatch.setattr(prepare, "calibrate_episodes", search)
+    monkeypatch.setattr(run_calibration, "calibrate_episodes", search)
     monkeypatch.setattr(calibrate, "finish", finish)
 
 

@@ -15,8 +15,8 @@ import deal_hw
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, PolicyError, UnknownNameError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import searched_space
 from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.space import searched_space
 
 Arrays = dict[str, FloatArray]
 T = np.arange(400) * 0.01

@@ -13,8 +13,8 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands
-from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
@@ -165,8 +165,8 @@ def test_a_file_of_states_is_prepared_with_its_policy(table: Table, policy: Path
     np.savetxt(file, columns, delimiter=",", header="time,cart.pos,pole.pos,cart.vel,pole.vel", comments="")
     settings = CalibrateSettings(recordings=Recordings(model=DESCRIPTION.mjcf, data=(file,)))
     with pytest.raises(DatasetError, match="--policy"):
-        prepare(settings)
+        calibration_input(settings)
     printed: list[str] = []
-    work = prepare(dataclasses.replace(settings, policy=str(policy)), say=printed.append)
+    work = calibration_input(dataclasses.replace(settings, policy=str(policy)), say=printed.append)
     assert any("no commands, so they are those of" in line for line in printed)
     assert sum(len(np.unique(e.target)) for e in work.episodes) > 50
