@@ -115,7 +115,7 @@ def test_commands_of_a_robot_that_does_not_say_its_mode_are_nobodys() -> None:
         sport="ai",
         tamper=lambda topic, payload: () if topic == topics.response(topics.SERVICES[0]) else (payload,),
     )
-    found = only(findings, "commands", "did not say whether its sport mode")
+    found = only(findings, "commands", "did not report whether its sport mode")
     assert found.severity is Severity.WARN and "controller" in found.do
 
 
