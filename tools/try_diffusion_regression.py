@@ -16,18 +16,23 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 import numpy as np
-import torch
 from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
 from deal_hw.calib.search.critic import PenaltyCritic, Samples
 from deal_hw.calib.search.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
+from deal_hw.on_use import OnUse
 from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = OnUse("torch", "torch", "calib")
 
 GENERATIONS = 50
 

@@ -29,9 +29,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.special import ndtri
-from scipy.stats import rankdata
-from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
@@ -194,7 +193,7 @@ class GaussianProcessSearch(Stateful):
         seed = np.random.default_rng([self._seed, self._generation])
         # A power of two of points is balanced; a part of it is nearly so.
         power = max(int(np.ceil(np.log2(count))), 0)
-        return np.asarray(Sobol(self._count, rng=seed).random_base2(power)[:count])
+        return np.asarray(scipy.stats.qmc.Sobol(self._count, rng=seed).random_base2(power)[:count])
 
     def _kept(self, count: int) -> IntArray:
         """Return the indices of ``count`` points: the better half by rank, then the newest of the others."""
@@ -222,7 +221,7 @@ def _ranked(fitness: FloatArray) -> FloatArray:
 
 def _quantiles(fitness: FloatArray) -> FloatArray:
     """Return the normal quantiles of the ranks of scores, (n,); equal scores are equal."""
-    return np.asarray(ndtri((rankdata(_ranked(fitness)) - 0.5) / len(fitness)))
+    return np.asarray(ndtri((scipy.stats.rankdata(_ranked(fitness)) - 0.5) / len(fitness)))
 
 
 def _largest_improvement(

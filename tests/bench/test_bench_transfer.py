@@ -6,11 +6,10 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from deal_hw.bench import transfer, transfer_target
 from deal_hw.bench.rows import load_rows
@@ -24,7 +23,11 @@ from deal_hw.training import TrainingFiles
 from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import nominal_distribution, train_policy, udr_distribution
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 MEASURED = Path(__file__).resolve().parents[2] / "docs" / "measured"
+SAVE = "matplotlib.figure.Figure.savefig"
 STEPS = 1_500
 FIELDS = {
     "task",
@@ -254,7 +257,9 @@ def test_the_figure_has_a_panel_for_each_task_and_the_speeds_of_the_go2(
 ) -> None:
     """Methods from top to bottom, the base policy as a line, speeds in x and y of the first seed."""
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: figures.append(figure))
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig", lambda figure, path, **more: figures.append(figure)
+    )
     speed = {name: [0.1, 0.2] for name in ("time_s", "wanted_x_m_s", "wanted_y_m_s", "x_m_s", "y_m_s")}
     rows = [drawn_row("ant", seed, method, 9.0 + seed) for seed in (0, 1) for method in ("udr", "oracle")]
     rows += [drawn_row("go2", seed, "udr", 7.0, speed=speed) for seed in (0, 1)]
@@ -273,7 +278,9 @@ def test_the_figure_has_a_panel_for_each_task_and_the_speeds_of_the_go2(
 def test_published_figures_name_every_method(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the rows beside each: every axis has a name and a title, every method of its rows is at one."""
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: figures.append(figure))
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig", lambda figure, path, **more: figures.append(figure)
+    )
     rows = [one for one in load_rows(path.with_suffix(".json")) if not one["error"]]
     draw_transfer(path, rows)
     for axes in figures[0].axes:

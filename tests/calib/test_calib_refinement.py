@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy
 from fakes.fixed_search import FixedSearch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
@@ -63,7 +63,7 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
     found = refine(problem, problem.space.nominal, 0.0)
     white = np.random.default_rng(0).normal(size=(8, 400, 2))
     # The same power with a memory, x[t] = 0.2 x[t - 1] + sqrt(1 - 0.2 ** 2) w[t]: autocorrelation time 1.5.
-    pattern = lfilter([np.sqrt(1 - 0.2**2)], [1, -0.2], white, axis=1)
+    pattern = scipy.signal.lfilter([np.sqrt(1 - 0.2**2)], [1, -0.2], white, axis=1)
 
     def leaving(residual: FloatArray) -> Refined:
         normal = dataclasses.replace(found.normal, residual=(residual,))

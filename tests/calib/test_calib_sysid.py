@@ -29,12 +29,16 @@ from deal_hw.types import FloatArray
 TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5, "servo.speed_limit": 0.5}
 """Factors of the nominal values."""
 
-try:
-    require_sysid()
-except MissingExtraError as error:
-    needs_sysid = pytest.mark.skip(reason=str(error))
-else:
-    needs_sysid = pytest.mark.filterwarnings("error")
+needs_sysid = pytest.mark.usefixtures("sysid")
+
+
+@pytest.fixture(scope="module")
+def sysid() -> None:
+    """Skip what needs `mujoco.sysid` where that is not installed."""
+    try:
+        require_sysid()
+    except MissingExtraError as error:
+        pytest.skip(str(error))
 
 
 @functools.cache

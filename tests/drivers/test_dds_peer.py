@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import signal
 import subprocess
@@ -22,9 +23,11 @@ from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
 from deal_hw.transport import Message, WireOptions
 
-pytestmark = pytest.mark.real_time
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"),
+]
 
-pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 MESSAGES = 300
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 from pathlib import Path
@@ -10,10 +11,13 @@ import pytest
 
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
-pytestmark = pytest.mark.real_time
-
-pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
-pytest.importorskip("mujoco", reason="pip install 'deal-hw[sim]'")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(
+        any(importlib.util.find_spec(name) is None for name in ("cyclonedds", "mujoco")),
+        reason="pip install 'deal-hw[dds,sim]'",
+    ),
+]
 
 
 def test_a_0102_program_releases_sport_mode_stands_the_robot_up_and_lays_it_down(

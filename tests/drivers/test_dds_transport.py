@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import random
 import re
 import select
@@ -36,9 +37,10 @@ from deal_hw.install import install_line
 from deal_hw.testing.transport_suite import TopicPair, TopicTransportSuite
 from deal_hw.transport import Message, WireOptions
 
-pytestmark = pytest.mark.real_time
-
-pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"),
+]
 
 BYTES = {"rt/lowcmd": 812, "rt/lowstate": 1180, "rt/wirelesscontroller": 22}
 HEADER = bytes([0, 1, 0, 0])

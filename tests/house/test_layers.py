@@ -20,6 +20,7 @@ VOCABULARY = (
     "reading",
     "schema",
     "install",
+    "on_use",
     "documentation",
     "ranges",
     "child_process",
