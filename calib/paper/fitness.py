@@ -176,6 +176,7 @@ class TrajectoryFitness(Fitness):
         residual = whitened_residual(
             self._problem, members, self._midpoint, self._windows, whitenings=self._whitenings
         )
+        # f = -ln(mean_m r_m^2) over the M whitened innovations r.
         with np.errstate(over="ignore"):
             error = np.mean(residual**2, axis=1)
         return np.where(np.isfinite(error), -np.log(np.maximum(error, 1e-300)), -np.inf)

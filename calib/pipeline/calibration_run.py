@@ -48,7 +48,7 @@ class FitOutcome:
     known: Uncertainty
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def but(
+    def with_alarms(
         self, *first: Finding, last: Sequence[Finding] = (), chi2: float | None = None, **facts: Any
     ) -> FitOutcome:
         """Return it with more alarms, before and after its own, and with more facts."""

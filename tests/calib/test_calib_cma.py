@@ -84,7 +84,7 @@ def test_resumes_to_the_last_bit_through_a_restart() -> None:
 
 
 def test_another_generator_state_is_not_touched() -> None:
-    """Pycma seeds and draws from NumPy's global generator unless told otherwise."""
+    """Pycma seeds and draws from NumPy's global generator by default."""
     np.random.seed(5)
     before = np.random.get_state(legacy=False)
     search = RestartedCma(2, 6, CmaSettings(), seed=3)

@@ -259,5 +259,5 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     low, high = found.known.latency_interval_s
     assert low <= case.latency_s <= high and "latency_scan" not in found.facts
     json.dumps(found.facts)
-    # It is wide, and is said to be.
+    # It is wide, and is reported to be.
     assert high - low < 20e-3 and found.facts["split_half"]["scale"] > 1.5

@@ -69,11 +69,11 @@ def test_takes_no_latency_but_a_given_one(
     theta = recorded(latency_ticks=8)[1]
     rng = np.random.default_rng(0)
     ignorant = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=None), Budget(), rng)
-    told = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=8e-3), Budget(), rng)
+    reported = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=8e-3), Budget(), rng)
     assert ignorant.latency_s == 0.0
     assert ignorant.provenance["assumed_latency_s"] == 0.0
-    assert told.latency_s == 8e-3
-    assert np.mean(np.abs(np.log(told.estimate / theta))) < 1e-3
+    assert reported.latency_s == 8e-3
+    assert np.mean(np.abs(np.log(reported.estimate / theta))) < 1e-3
     assert np.mean(np.abs(np.log(ignorant.estimate / theta))) > 0.02
 
 

@@ -131,7 +131,7 @@ def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem
 
 
 def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
-    """What a search is told is the residual of a first fit; of what was not measured nothing is said."""
+    """A search gets the residual of a first fit; channels that were not measured have none."""
     std = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT).expected_std
     assert problem.noise_std[0] <= std[0] < 5e-3
 
@@ -244,7 +244,7 @@ def test_a_walks_search_runs_only_where_its_fits_explain_nothing(problem: Proble
         turned = [dataclasses.replace(e, position=-e.position) for e in problem.episodes]
         problem = dataclasses.replace(problem, episodes=turned)
     fit = fit_output_error(problem, TRUTH, LATE_S, Recipe(seconds=0.4, iterations=0))
-    told: list[str] = []
+    reported: list[str] = []
     rng = np.random.default_rng(0)
     run = CalibrationRun(
         problem=problem,
@@ -252,12 +252,12 @@ def test_a_walks_search_runs_only_where_its_fits_explain_nothing(problem: Proble
         rng=rng,
         attempts=Restarts(Eki(), rng, None),
         settings=Validation(local_first=False, cross_validation=False),
-        progress=lambda p: told.append(p.message) if p.stage == BEFORE_SEARCH else None,
+        progress=lambda p: reported.append(p.message) if p.stage == BEFORE_SEARCH else None,
     )
     found = OutputErrorFits(settings, (fit, fit)).best(run)
     assert found.searched.method == ("nominal" if explains else "eki")
     assert (
-        any("no better than a robot that stands still, so a search follows" in text for text in told)
+        any("no better than a robot that stands still, so a search follows" in text for text in reported)
         != explains
     )
 
