@@ -24,7 +24,7 @@ from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import HELDOUT_PART, CalibrateSettings
-from deal_hw.workflows.say import aloud, silent
+from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
@@ -53,7 +53,7 @@ def prepare(source: CalibrateSettings, range_ratio: float | None, *, quiet: bool
         )
     settings = dataclasses.replace(source, range_ratio=range_ratio)
     settings.check()
-    return calibration_input(settings, say=silent if quiet else aloud)
+    return calibration_input(settings, say=silent if quiet else to_stderr)
 
 
 def split_name(source: CalibrateSettings) -> str:

@@ -26,7 +26,7 @@ from deal_hw.workflows.calibration.run import CalibrateReport, calibrate_input, 
 from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.calibration.space import write_parameters
 from deal_hw.workflows.options import refuse
-from deal_hw.workflows.say import aloud, silent
+from deal_hw.workflows.say import silent, to_stderr
 
 __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_parameters"]
 
@@ -120,7 +120,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     config.check()
-    say = silent if config.quiet else aloud
+    say = silent if config.quiet else to_stderr
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)

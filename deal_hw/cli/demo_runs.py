@@ -62,7 +62,7 @@ def deployed(deploy: Callable[[int], RunReport], count: int, what: str) -> RunRe
     A deployment that trips for another reason is a result, and the last one, as in `deal-hw deploy`.
 
     Args:
-        deploy: Deploys as often as told.
+        deploy: Deploys as often as requested.
         count: Deployments.
         what: A deployment, in messages.
 

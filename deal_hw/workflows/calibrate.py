@@ -127,9 +127,9 @@ class Calibration:
         from deal_hw.calib.report.verdict import trust
 
         found = trust(self.result)
-        told = [f"the data do not determine: {words}" for words in self.result.null_directions]
+        unknown = [f"the data do not determine: {words}" for words in self.result.null_directions]
         alarms = [f"alarm: {alarm}" for alarm in self.result.alarms]
-        return [f"{found.colour}: {found.sentence}", *told, *alarms]
+        return [f"{found.colour}: {found.sentence}", *unknown, *alarms]
 
     def __repr__(self) -> str:
         return f"<Calibration of {len(self.result.space)} parameters, {self.colour}; table() shows them>"

@@ -100,11 +100,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         joints = robot.joint_names
     elif described is not None:
         joints = described["joint_names"]
-    told = columns is not None or described is not None or facts is not None
-    episodes, foreign = ([], list(config.paths)) if told else _as_recorded(config, say)
-    said: dict[str, str] = {}
+    mapped = columns is not None or described is not None or facts is not None
+    episodes, foreign = ([], list(config.paths)) if mapped else _as_recorded(config, say)
+    printed: dict[str, str] = {}
     kinds = None if facts is None else kinds_of(facts)
-    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, said, kinds)]
+    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, printed, kinds)]
     if facts is not None:
         tables = at_rest_without_commands(tables, facts, say)
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]

@@ -89,7 +89,7 @@ def test_methods_ratios_and_no_data_are_named(drawn: list[Figure], tmp_path: Pat
 
 
 def test_the_bar_reaches_from_the_smallest_to_the_largest(drawn: list[Figure], tmp_path: Path) -> None:
-    """1, 2 and 7: the mark is at 2, the bar from 1 to 7; less than the floor is drawn there, and said."""
+    """1, 2 and 7: the mark is at 2, the bar from 1 to 7; less than the floor is drawn there, and reported."""
     draw(tmp_path / "a.png", [row("eki", seed, value) for seed, value in enumerate((1.0, 7.0, 2.0))])
     middle, bar = marks(drawn[0].axes[0])
     assert middle == 2.0 and bar == [1.0, 7.0]

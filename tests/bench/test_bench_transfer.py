@@ -93,8 +93,8 @@ def test_every_row_is_a_fine_tune_of_one_policy_and_none_is_run_twice(
     assert {(record["seed"], record["training"]["config"]["steps"]) for record in records} == {(0, STEPS)}
     assert len({record["distribution_digest"] for record in records}) == 3
     assert out.with_suffix(".png").stat().st_size > 1000
-    said = capsys.readouterr().out
-    assert "cartpole seed 0 midpoint: estimating" in said and "share of oracle" in said
+    printed = capsys.readouterr().out
+    assert "cartpole seed 0 midpoint: estimating" in printed and "share of oracle" in printed
     kept = {path: path.read_bytes() for path in (tmp_path / "transfer_policies").glob("*oracle*.onnx")}
 
     trained: list[Path] = []
@@ -127,11 +127,11 @@ def test_a_base_policy_is_trained_once_and_a_stopped_training_goes_on(
 
     monkeypatch.setattr(transfer, "train_policy", short)
     one = transfer.Setting(task="cartpole", steps=STEPS, seconds=1.0, base=None, folder=tmp_path)
-    said: list[str] = []
-    path = transfer.base_policy(one, said.append)
+    printed: list[str] = []
+    path = transfer.base_policy(one, printed.append)
     assert path == tmp_path / "cartpole_udr.onnx" and path.with_suffix(".safetensors").exists()
-    assert not made[0].resume and "once" in said[0]
-    assert transfer.base_policy(one, said.append) == path and len(made) == 1
+    assert not made[0].resume and "once" in printed[0]
+    assert transfer.base_policy(one, printed.append) == path and len(made) == 1
 
     def resumed(*args: Any, **more: Any) -> OnnxPolicy:
         made.append(more["files"])
@@ -221,13 +221,13 @@ def test_a_return_is_the_time_upright_near_the_middle(base: Path) -> None:
     assert shipped["return"] > row["return"]
 
 
-def test_the_walk_follows_growing_speeds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_walk_follows_growing_speeds() -> None:
     """The shipped policy on the nominal Go2: ahead while it shall go ahead, aside while aside; no push."""
-    monkeypatch.setattr(transfer_target, "AHEAD_M_S", (0.5,))
-    monkeypatch.setattr(transfer_target, "ASIDE_M_S", (0.3,))
     distribution = nominal_distribution("go2")
     truth = ParameterDistribution.point(distribution.space, distribution.mean, 0.0)
-    row = transfer_target.speed_profile(truth, OnnxPolicy(required_policy("go2")), 0, count=2)
+    profile = transfer_target.commands(ahead_m_s=(0.5,), aside_m_s=(0.3,))
+    policy = OnnxPolicy(required_policy("go2"))
+    row = transfer_target.speed_profile(truth, policy, 0, count=2, profile=profile)
     speed = row["speed"]
     assert row["falls"] == 0
     assert speed["wanted_x_m_s"] == [0.5] * 5 + [0.0] * 5

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import with_finer_step
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.time_steps import (
     CLEARLY,
@@ -112,7 +112,7 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
 
 
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
-    """The finer step explains them worse: nothing is said, no interval is widened."""
+    """The finer step explains them worse: nothing is reported, no interval is widened."""
     problem, known, found = checked(tmp_path, STEP_S)
     assert found.gain < -CLEARLY and step_alarm(known, found) == ()
     assert counted(problem, known, found) is known

@@ -46,11 +46,11 @@ def test_a_drive_whose_set_points_the_host_moves_has_no_speed_limit(sent: float,
     recorded = dataclasses.replace(
         made, speed_limit=np.full_like(made.speed_limit, sent), position_target=steps
     )
-    said: list[str] = []
-    space = without_speed_limits(k9_space(), DESCRIPTION, [recorded], said.append)
+    output: list[str] = []
+    space = without_speed_limits(k9_space(), DESCRIPTION, [recorded], output.append)
     assert ("servo.speed_limit" in space.names) == searched
     assert space["servo.speed_limit"].nominal == pytest.approx(1.0 if searched else 20.0)
-    assert len(said) == (not searched)
+    assert len(output) == (not searched)
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +135,9 @@ def test_a_realistic_robot_is_searched_adversarially(
     """Friction, play and jitter that no parameter expresses: after the local fit the search is announced."""
     asked = {"free": (), "population": 10, "generations": 2, "quiet": False}
     report = calibrate(settings(realistic, **asked, search=search, out=tmp_path))
-    told = " ".join(capsys.readouterr().err.split())
+    reported = " ".join(capsys.readouterr().err.split())
     announced = f"before the search: the local fit leaves more than noise, so {words}"
-    assert told.index("local fit:") < told.index(announced)
+    assert reported.index("local fit:") < reported.index(announced)
     provenance = report.result.provenance
     assert provenance["search"] == (search or "deal")
     assert provenance["settings"].get("trained", False) == (search is None)
@@ -155,8 +155,8 @@ def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[s
     folder = Path("runs/arm/calibration")
     files = {name: folder / name for name in ("result.json", "report.html")}
     print_files(files)
-    told = capsys.readouterr().out.splitlines()
-    assert told == [
+    reported = capsys.readouterr().out.splitlines()
+    assert reported == [
         f"written to {folder}: result.json, report.html",
         f"see all results: open {folder / 'report.html'} in a browser",
     ]

@@ -66,7 +66,7 @@ def test_nan_fails_but_not_in_effort(make_trajectory: MakeTrajectory) -> None:
 
 
 def test_clock_faults_fail(make_trajectory: MakeTrajectory) -> None:
-    """A device clock that runs back, jumps or stands still is said."""
+    """A device clock that runs back, jumps or stands still is reported."""
     sound = make_trajectory()
     for shift, words in (
         (-1.0, "goes backwards 1 times, first after sample 400"),
@@ -144,7 +144,7 @@ def test_clamping_by_the_device_is_data_and_by_us_is_flagged(make_trajectory: Ma
 
 
 def test_watchdog_end_stop_and_hand_over_warn(make_trajectory: MakeTrajectory) -> None:
-    """Motors that were off, end stops and cycles that were not recorded are said."""
+    """Motors that were off, end stops and cycles that were not recorded are reported."""
     for flag in (Status.WATCHDOG, Status.FAULT, Status.AT_END_STOP):
         status = np.where(np.arange(800) > 700, int(flag), 0)
         assert verdict(make_trajectory(status=status), "stopped").severity is Severity.WARN

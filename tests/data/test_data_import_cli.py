@@ -148,7 +148,7 @@ def test_import_refuses_what_is_not_plausible(
     with pytest.raises(DatasetError, match=r"hip follows the command of knee.*--force"):
         data(Import(paths=(recording,), out=out, columns=columns))
     assert not out.exists()
-    # The error has it; a line before it said the same in full.
+    # The error has it; a line before it had the same in full.
     assert "fail assignment" not in capsys.readouterr().err
     assert data(Import(paths=(recording,), out=out, columns=columns, force=True, name="odd")) == 0
     facts = Dataset.open(out).episodes[0].facts["plausibility"]["rec.csv"]

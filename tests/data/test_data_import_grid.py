@@ -74,7 +74,7 @@ def test_align_gives_the_arrays_back(make_table: MakeTable, rate_hz: float, per_
 
 
 def test_uneven_stamps_within_two_percent_move_to_the_grid(make_table: MakeTable) -> None:
-    """Values stay, commands of the same stamp act with their sample, and the shift is told."""
+    """Values stay, commands of the same stamp act with their sample, and the shift is reported."""
     table = jittered(make_table(), 0.015)
     (part,) = to_trajectories(table, GAINS)
     facts = part.trajectory.metadata["import"]

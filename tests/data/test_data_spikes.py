@@ -168,7 +168,7 @@ def test_noise_and_sines_have_no_spikes(seed: int, size: float, frequency_hz: fl
 
 
 def test_check_of_an_imported_recording(make_table: Callable[..., Table]) -> None:
-    """Spikes are told, and the other checks, which they would upset, see the recording without them."""
+    """Spikes are reported, and the other checks, which they would upset, see the recording without them."""
     position = make_table().position.copy()
     position[300, 0], position[700, 2] = 300.0, -3.0
     table = make_table(position=position)

@@ -54,9 +54,9 @@ ROOMS = {
     ),
     "calib": (
         {"data"},
-        {"search", "fit"},
-        {"validation"},
-        {"design", "baselines"},
+        {"paper", "fit"},
+        {"search", "baselines", "validation"},
+        {"design"},
         {"pipeline", "report"},
     ),
     "drivers.cartpole": (

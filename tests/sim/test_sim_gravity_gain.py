@@ -35,12 +35,12 @@ def test_a_gain_that_chance_explains_is_no_warning(tmp_path: Path, monkeypatch: 
     for error, warned in ((0.1, True), (0.6, False)):
         found = GravityGain(*(np.array([v]) for v in (0.5, error, 0.6, 0.1, 0.03)))
         monkeypatch.setattr("deal_hw.sim.recordings.gravity_gain.gravity_gain", lambda *_, f=found: f)
-        said: list[str] = []
-        checks.warn_of_gravity(work.robot, work.space, list(work.episodes), said.append)
-        assert bool(said) is warned
+        printed: list[str] = []
+        checks.warn_of_gravity(work.robot, work.space, list(work.episodes), printed.append)
+        assert bool(printed) is warned
     found = GravityGain(*(np.array([v]) for v in (0.5, 0.1, 0.6, 0.1, 0.03)))
     monkeypatch.setattr("deal_hw.sim.recordings.gravity_gain.gravity_gain", lambda *_: found)
     work.robot.model.dof_frictionloss[:] = 0.2
-    said = []
-    checks.warn_of_gravity(work.robot, work.space, list(work.episodes), said.append)
-    assert not said, "dry friction of 0.2 N·m holds 0.1 N·m"
+    printed = []
+    checks.warn_of_gravity(work.robot, work.space, list(work.episodes), printed.append)
+    assert not printed, "dry friction of 0.2 N·m holds 0.1 N·m"

@@ -74,26 +74,26 @@ def test_a_free_swing_shows_friction_damping_and_inertia(
     swing: dict[str, FloatArray], tmp_path: Path
 ) -> None:
     """All three within 5 % of the truth; the motor's gain keeps its value, and a sentence says why."""
-    said: list[str] = []
+    printed: list[str] = []
     model = write_model(tmp_path, MOTOR)
-    found = deal_hw.calibrate(model=model, data=[swing], say=said.append, threads=1)
+    found = deal_hw.calibrate(model=model, data=[swing], say=printed.append, threads=1)
     values = {row["parameter"]: row["estimate"] for row in found.rows()}
     assert values["hub.damping"] == pytest.approx(0.004, rel=0.05)
     assert values["hub.frictionloss"] == pytest.approx(0.003, rel=0.05)
     assert values["hub.armature"] == pytest.approx(0.001, rel=0.05)
     assert "drive.gain" not in values and values["latency"] == 0.0
-    assert any("no commands, and its motors (hub) were off" in text for text in said)
-    assert any("not identifiable without commands" in text and "drive.gain" in text for text in said)
+    assert any("no commands, and its motors (hub) were off" in text for text in printed)
+    assert any("not identifiable without commands" in text and "drive.gain" in text for text in printed)
     assert found.colour == "green"
 
 
 def test_a_model_needs_no_actuator(swing: dict[str, FloatArray], tmp_path: Path) -> None:
     """Its three parameters are searched."""
-    said: list[str] = []
+    printed: list[str] = []
     settings = CalibrateSettings(recordings=Recordings(model=write_model(tmp_path, "")), threads=1)
-    inputs = calibration_input(settings, data=[swing], say=said.append)
+    inputs = calibration_input(settings, data=[swing], say=printed.append)
     assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
-    assert any("the model has no actuators" in text for text in said)
+    assert any("the model has no actuators" in text for text in printed)
 
 
 @pytest.mark.parametrize("command", [None, 0.0, np.nan])

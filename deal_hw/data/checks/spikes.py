@@ -160,13 +160,13 @@ def _runs(
 
 def describe(spikes: Sequence[Spike], time_s: FloatArray, joints: Sequence[str], units: Sequence[str]) -> str:
     """Return text with joint, size, time and number of samples of each spike."""
-    told = [
+    found_lines = [
         f"{joints[s.joint]} {s.size:+.3g} {units[s.joint]} at {time_s[s.rows[0]]:.3f} s"
         + (f" ({len(s.rows)} samples)" if len(s.rows) > 1 else "")
         for s in spikes[:_TOLD]
     ]
     more = f" and {len(spikes) - _TOLD} more" if len(spikes) > _TOLD else ""
-    return ", ".join(told) + more
+    return ", ".join(found_lines) + more
 
 
 def check_spikes(

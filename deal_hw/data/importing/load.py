@@ -83,7 +83,7 @@ def load_tables(
     columns: ColumnMap | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
-    said: dict[str, str] | None = None,
+    printed: dict[str, str] | None = None,
     kinds: JointKinds | None = None,
 ) -> list[Table]:
     """Read the recordings in a file, in SI units, on their own stamps.
@@ -94,8 +94,8 @@ def load_tables(
         columns: Meaning of its channels; None: guessed from their names.
         joints: Names of the model's joints; None: those of the map, or of the file.
         say: Called with sentences on guesses and omissions.
-        said: Guessed maps that were printed already, each with the recording's name; a new one is added. One
-            that is in it is not printed again.
+        printed: Guessed maps that were printed already, each with the recording's name; a new one is added.
+            One that is in it is not printed again.
         kinds: Which of the model's joints slide or have motors; None: unknown.
 
     Raises:
@@ -103,7 +103,7 @@ def load_tables(
     """
     described = f"{page('how-to/import.md')} describes one"
     with reading(path, "a recording of a robot", described):
-        tables = tables_of(read_channels(path), columns, joints, say, said, kinds)
+        tables = tables_of(read_channels(path), columns, joints, say, printed, kinds)
     if not tables:
         raise DatasetError(f"{path} holds no recording")
     return tables
@@ -114,7 +114,7 @@ def tables_of(
     columns: ColumnMap | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
-    said: dict[str, str] | None = None,
+    printed: dict[str, str] | None = None,
     kinds: JointKinds | None = None,
 ) -> list[Table]:
     """Interpret channels, as :func:`load_tables` does for a file."""
@@ -124,7 +124,7 @@ def tables_of(
         if kinds is not None:
             used = used.for_model(kinds)
         if say is not None:
-            _tell(say, channels, used, joints, columns is None and number == 0, said)
+            _tell(say, channels, used, joints, columns is None and number == 0, printed)
         table = build_table(channels, used, joints)
         if unsaid := _unsaid(table, used):
             table.source["unsaid"] = unsaid
@@ -227,11 +227,11 @@ def _say_map(
     joints: Sequence[str] | None,
     guessed: ColumnMap | None,
     title: str = _INCOMPLETE,
-    said: dict[str, str] | None = None,
+    printed: dict[str, str] | None = None,
 ) -> None:
     name = f"{channels.path.name} {channels.part}".strip()
     lines = starting_map(channels, joints, guessed)
-    first = name if said is None else said.setdefault("\n".join([title, *lines]), name)
+    first = name if printed is None else printed.setdefault("\n".join([title, *lines]), name)
     if first != name:
         say(f"{name}: the same column map as {first}")
         return
@@ -246,7 +246,7 @@ def _tell(
     columns: ColumnMap,
     joints: Sequence[str] | None,
     guessed: bool,
-    said: dict[str, str] | None,
+    printed: dict[str, str] | None,
 ) -> None:
     name = f"{channels.path.name} {channels.part}".strip()
     for note in channels.notes:
@@ -257,4 +257,4 @@ def _tell(
             say(f"{name}: not in the file: {', '.join(missing)}; its channels: {channels.listed()}")
         if not (columns.target or any(joint.target for joint in columns.joints)):
             say(f"{name}: no commanded positions found")
-        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED, said)
+        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED, printed)

@@ -171,8 +171,8 @@ def sound_recordings(
             )
         for jump in [v.message for v in found if v.code == "spikes" and v.severity is Severity.WARN][:1]:
             say(f"episode {index}: {jump}")
-    told = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
-    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, told
+    lines = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
+    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, lines
 
 
 def choose_episodes(

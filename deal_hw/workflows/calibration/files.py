@@ -124,8 +124,8 @@ def _tables(
 
     path = settings.recordings.columns
     columns = None if path is None else read_column_map(path)
-    said: dict[str, str] = {}
-    found = [read_tables(sources, columns, facts, say, name, said) for name, sources in groups]
+    printed: dict[str, str] = {}
+    found = [read_tables(sources, columns, facts, say, name, printed) for name, sources in groups]
     if settings.policy is not None:
         policy = Path(settings.policy)
         found = [with_policy_commands(tables, policy, facts, say) for tables in found]

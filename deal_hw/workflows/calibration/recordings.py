@@ -32,11 +32,11 @@ def read_tables(
     facts: JointFacts,
     say: Callable[[str], None],
     name: str,
-    said: dict[str, str],
+    printed: dict[str, str],
 ) -> list[Table]:
     """Return recordings in SI units, on their own stamps; those in memory are called NAME[0], NAME[1], ...
 
-    ``said`` has the guessed column maps that were printed already; new ones are added.
+    ``printed`` has the guessed column maps that were printed already; new ones are added.
     """
     from deal_hw.data.importing.load import load_tables, tables_of
     from deal_hw.data.importing.memory_source import read_memory
@@ -45,10 +45,10 @@ def read_tables(
     joints, kinds = facts.names, kinds_of(facts)
     for number, source in enumerate(sources):
         if isinstance(source, str | Path):
-            tables += load_tables(Path(source), columns, joints, say, said, kinds)
+            tables += load_tables(Path(source), columns, joints, say, printed, kinds)
         else:
             channels = read_memory(source, f"{name}[{number}]")
-            tables += tables_of([channels], columns, joints, say, said, kinds)
+            tables += tables_of([channels], columns, joints, say, printed, kinds)
     return tables
 
 

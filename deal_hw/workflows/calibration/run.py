@@ -27,7 +27,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.best_so_far import SO_FAR, BestSoFar, keeping_best, saying_how_to_resume
 from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSettings
-from deal_hw.workflows.say import Say, aloud, silent
+from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
@@ -141,8 +141,8 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays, target_changes
         from deal_hw.calib.data.noise import SMOOTHING_S
         from deal_hw.calib.data.problem import Problem
+        from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.pipeline.methods import make_method
-        from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.validation.checks import latency_alarms
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:
@@ -263,7 +263,7 @@ def finish(
             checkpoint.unlink(missing_ok=True)
             shutil.rmtree(folder / SO_FAR, ignore_errors=True)
     except KeyboardInterrupt:
-        aloud(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
+        to_stderr(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
         raise
     return CalibrateReport(result=result, files=files)
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.search.resume import State, Stateful
+from deal_hw.calib.data.resume import State, Stateful
 from deal_hw.on_use import OnUse
 from deal_hw.types import FloatArray
 
@@ -219,7 +219,7 @@ class ClippedCritic(Critic):
 
     def _update(self, real: Tensor, fake: Tensor, pool: Executor) -> float:
         ours, theirs = pool.map(self._mean_and_gradient, (real, fake))
-        # Eq. 5 is a maximum, optimisers minimise.
+        # Eq. 5: max over the weights of E_real D - E_fake D. Optimisers minimise: the gradient turns round.
         for parameter, up, down in zip(self._parameters, ours[1], theirs[1], strict=True):
             parameter.grad = down - up
         self.optimiser.step()
@@ -244,6 +244,8 @@ class PenaltyCritic(Critic):
 
     def _update(self, real: Tensor, fake: Tensor, pool: Executor) -> float:
         self.optimiser.zero_grad(set_to_none=True)
+        # Gulrajani et al. (2017), eq. 3: minimise E_fake D - E_real D + c E (|grad_x D(x)| - 1)^2, with x
+        # uniform between pairs of samples and c = ``penalty``.
         mix = torch.rand(len(real), 1, generator=self.generator)
         between = (mix * real + (1 - mix) * fake).requires_grad_(True)
         output = self.hidden(torch.cat([real, fake, between]))[2][:, 0]
