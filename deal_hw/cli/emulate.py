@@ -11,7 +11,7 @@ from deal_hw.workflows.emulation.cartpole import emulate_cartpole
 from deal_hw.workflows.emulation.common import signalled
 from deal_hw.workflows.emulation.go2 import emulate_go2
 from deal_hw.workflows.emulation.settings import EmulateSettings
-from deal_hw.workflows.say import aloud
+from deal_hw.workflows.say import to_stderr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,5 +28,5 @@ def emulate(config: Emulate) -> int:
     """
     run = emulate_go2 if config.robot == "go2" else emulate_cartpole
     with signalled() as (stop, cut):
-        run(config, stop, cut, announce=partial(print, flush=True), say=aloud)
+        run(config, stop, cut, announce=partial(print, flush=True), say=to_stderr)
     return 0

@@ -226,7 +226,7 @@ def help_text() -> str:
         "",
         "usage: deal-hw VERB [options]      deal-hw VERB --help lists the options of a verb",
     ]
-    for title, verbs in (("the five jobs, in order", JOBS), ("beside them", TOOLS)):
+    for title, verbs in (("the five jobs, in order", JOBS), ("tools", TOOLS)):
         lines += ["", f"{title}:"]
         for name, verb in verbs.items():
             lines += [f"  {name:<17} {verb.help}", f"  {'':<17}   deal-hw {verb.example}"]

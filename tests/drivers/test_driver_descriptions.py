@@ -66,7 +66,7 @@ def _space(robot: str, name: str) -> ParameterSpace:
 
 @pytest.mark.parametrize("name", DESCRIBED)
 def test_description_agrees_with_its_model(name: str) -> None:
-    """Joints in model order, one actuator each, the base as said, effort limits as described."""
+    """Joints in model order, one actuator each, the base as given, effort limits as described."""
     description = robot_description(name)
     robot = load_model(description)
     model = robot.model

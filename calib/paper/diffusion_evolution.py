@@ -1,7 +1,14 @@
 """Diffusion evolution (DEAL, section 3 and appendix A.1): a population denoised towards its fitter members.
 
 It knows no simulator: ``ask`` returns a population, ``tell`` takes the fitness of each member. Equation
-numbers and symbols are the DEAL paper's: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
+numbers and symbols are the DEAL paper's:
+    theta: the population at step t, (N, K) [in the box]; t runs from T to 0.
+    alpha_t: diffusion schedule, 1 at t = 0 and about 0 at t = T [-]; 1 - alpha_t is the noise's variance.
+    p: probabilities of the members from their fitness, (N,) [-]; Z: their sum with the kernel (eq. 20).
+    theta_0, epsilon: estimate of the optimum and of the noise for each member, (N, K) (eqs. 1 and 2).
+    sigma_t, delta, omega: noise schedule, its factor (eq. 9), and standard normal draws, (N, K).
+One step, eq. 10, with s = delta sigma_t:
+theta_{t-1} = alpha_{t-1}^(1/2) theta_0 + (1 - alpha_{t-1} - s^2)^(1/2) epsilon + s omega.
 
 The coordinates are a box around zero. The paper says "normalised within the search range", but not which box.
 In [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any data: a flat
@@ -17,7 +24,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import logsumexp, softmax
 
-from deal_hw.calib.search.resume import Stateful
+from deal_hw.calib.data.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -127,17 +134,20 @@ class DiffusionEvolution(Stateful):
         # theta_i / Z.
         weights = neighbour_weights(theta, p, alpha, divide=settings.divide_distance)
         estimate = weights @ theta
-        # Eq. 2 (line 14). alpha_t < 1 for every t >= 1.
+        # Eq. 2 (line 14): epsilon = (theta - alpha_t^(1/2) theta_0) / (1 - alpha_t)^(1/2). alpha_t < 1 for
+        # every t >= 1.
         noise = (theta - np.sqrt(alpha) * estimate) / np.sqrt(1 - alpha)
-        # sigma_t: the DDPM posterior's standard deviation times eta, as in DDIM (the paper's reference 25,
-        # eq. 16).
+        # sigma_t = eta ((1 - alpha_{t-1}) / (1 - alpha_t))^(1/2) (1 - alpha_t / alpha_{t-1})^(1/2): the DDPM
+        # posterior's standard deviation times eta, eq. 16 of DDIM (Song et al. 2021, the paper's reference
+        # 25). The paper itself gives no sigma_t.
         sigma = (
             settings.eta * np.sqrt((1 - alpha_next) / (1 - alpha)) * np.sqrt(max(1 - alpha / alpha_next, 0.0))
         )
         delta = 1.0
         if settings.adapt_noise:
             finite = fitness[np.isfinite(fitness)]
-            # Eq. 9 (line 10). Cut before exp overflows; the clamp below limits it anyway.
+            # Eq. 9 (line 10): delta = lambda exp(-E D), the mean over all members' transitions, which is the
+            # mean fitness. Cut before exp overflows; the clamp below limits it anyway.
             delta = (
                 settings.influence * float(np.exp(np.clip(-finite.mean(), -50.0, 50.0)))
                 if finite.size
@@ -185,6 +195,8 @@ def neighbour_weights(theta: FloatArray, p: FloatArray, alpha: float, *, divide:
     Computed from logarithms: at high K the density itself underflows to zero for every neighbour. With
     ``divide`` the squared distance is divided by K; the constant factor of the density cancels in Z.
     """
+    # |theta_j - alpha^(1/2) theta_i|^2 by parts, (N, N); the log of the density is minus half of it over
+    # 1 - alpha.
     centres = np.sqrt(alpha) * theta
     squared = np.sum(theta**2, axis=1)[:, None] - 2 * theta @ centres.T + np.sum(centres**2, axis=1)
     if divide:

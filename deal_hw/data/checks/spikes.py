@@ -26,6 +26,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from deal_hw.data.table import position_units
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray, Trajectory
 
 Mask = npt.NDArray[np.bool_]
@@ -158,13 +160,36 @@ def _runs(
 
 def describe(spikes: Sequence[Spike], time_s: FloatArray, joints: Sequence[str], units: Sequence[str]) -> str:
     """Return text with joint, size, time and number of samples of each spike."""
-    told = [
+    found_lines = [
         f"{joints[s.joint]} {s.size:+.3g} {units[s.joint]} at {time_s[s.rows[0]]:.3f} s"
         + (f" ({len(s.rows)} samples)" if len(s.rows) > 1 else "")
         for s in spikes[:_TOLD]
     ]
     more = f" and {len(spikes) - _TOLD} more" if len(spikes) > _TOLD else ""
-    return ", ".join(told) + more
+    return ", ".join(found_lines) + more
+
+
+def check_spikes(
+    time_s: FloatArray,
+    position: FloatArray,
+    joints: Sequence[str],
+    units: Sequence[str],
+    settings: SpikeSettings = DEFAULT_SPIKES,
+) -> Finding:
+    """Check for samples that jump away and come back; arguments as of :func:`find_spikes`."""
+    found = find_spikes(time_s, position, units, settings)
+    if not found:
+        return Finding("spikes", Severity.OK, "no position jumps away and comes back")
+    count = len({row for spike in found for row in spike.rows})
+    text = (
+        f"{count} samples jump and come back, faster than the joint ever moves otherwise: "
+        f"{describe(found, time_s, joints, units)}"
+    )
+    if count > settings.most * time_s.size:
+        text += f"; that is {count / time_s.size:.1%} of all samples: the sensor or its cable fails."
+        return Finding("spikes", Severity.FAIL, text, "Repair it and record again")
+    text += ". Calibration leaves them out (--spike-ratio)"
+    return Finding("spikes", Severity.WARN, text, "check the sensor and its cable")
 
 
 def sound(spikes: Sequence[Spike], count: int) -> Mask:
@@ -198,9 +223,3 @@ def without_spikes(trajectory: Trajectory, settings: SpikeSettings = DEFAULT_SPI
     return dataclasses.replace(
         trajectory, body=body, **{name: getattr(trajectory, name)[kept] for name in sampled}
     )
-
-
-def position_units(trajectory: Trajectory) -> tuple[str, ...]:
-    """Return the unit of each position, "rad" if the recording does not name it, (J,)."""
-    units = trajectory.metadata.get("description", {}).get("position_units")
-    return tuple(units) if units else ("rad",) * len(trajectory.joint_names)

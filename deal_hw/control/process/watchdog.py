@@ -15,7 +15,7 @@ SUPERVISOR_SILENCE_S = 1.0
 real-time priority a busy machine may delay it by about 0.4 s."""
 
 
-class SupervisorVigil:
+class SupervisorWatchdog:
     """Listens to the supervisor in a thread, because the control process may wait seconds for the robot.
 
     Args:
@@ -35,7 +35,7 @@ class SupervisorVigil:
         self._status, self._clock, self._on_silence = status, clock, on_silence
         self._silence_ns = round(silence_s * 1e9)
         self._words: deque[str] = deque(maxlen=256)
-        self._thread = threading.Thread(target=self._listen, name="supervisor vigil", daemon=True)
+        self._thread = threading.Thread(target=self._listen, name="supervisor watchdog", daemon=True)
 
     def start(self) -> None:
         """Start to listen; the thread has the caller's priority."""
@@ -50,7 +50,7 @@ class SupervisorVigil:
         while True:
             left_ns = heard_ns + self._silence_ns - self._clock.now_ns()
             ready = select.select([self._status], [], [], max(left_ns, 0) * 1e-9)[0]
-            if words := self._status.heard():
+            if words := self._status.received():
                 heard_ns = self._clock.now_ns()
                 self._words.extend(word for word in words if word != HEARTBEAT)
             elif ready:

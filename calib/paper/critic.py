@@ -12,19 +12,21 @@ import contextlib
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.search.resume import State, Stateful
-from deal_hw.errors import MissingExtraError
+from deal_hw.calib.data.resume import State, Stateful
+from deal_hw.on_use import OnUse
 from deal_hw.types import FloatArray
 
-try:
+if TYPE_CHECKING:
     import torch
-    from torch import Tensor, nn
-except ImportError as err:  # pragma: no cover - the extra is installed where the tests run
-    raise MissingExtraError("torch", "calib") from err
+    from torch import Tensor
+else:
+    # It loads for seconds. Searches without a critic do not wait for it.
+    torch = OnUse("torch", "torch", "calib")
 
 Samples = npt.NDArray[np.float32]
 
@@ -86,7 +88,11 @@ class Critic(Stateful):
         self.diverged = 0
         self.generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         first, second = settings.hidden
-        self.layers = [nn.Linear(inputs, first), nn.Linear(first, second), nn.Linear(second, 1)]
+        self.layers = [
+            torch.nn.Linear(inputs, first),
+            torch.nn.Linear(first, second),
+            torch.nn.Linear(second, 1),
+        ]
         self._parameters: list[Tensor] = []
         with torch.no_grad():
             for layer in self.layers:
@@ -163,11 +169,11 @@ class Critic(Stateful):
             "diverged": self.diverged,
         }
 
-    @torch.no_grad()
     def load(self, state: State) -> None:
         """Continue from what :meth:`save` returned."""
-        for parameter, values in zip(self._parameters, state["weights"], strict=True):
-            parameter.copy_(torch.tensor(values))
+        with torch.no_grad():
+            for parameter, values in zip(self._parameters, state["weights"], strict=True):
+                parameter.copy_(torch.tensor(values))
         memory = {
             int(number): {name: torch.tensor(value) for name, value in values.items()}
             for number, values in state["optimiser"].items()
@@ -190,18 +196,17 @@ class Critic(Stateful):
             parts = list(pool.map(output, range(0, len(x), chunk)))
         return np.asarray(torch.cat(parts).numpy())
 
-    @torch_threads(1)
-    @torch.no_grad()
     def statistics(self, samples: Samples) -> FloatArray:
         """Return the mean hidden activations and output, (N, h1 + h2 + 1), of samples, (N, n, inputs)."""
         groups, count, width = samples.shape
         per = max(16384 // count, 1)
         out = []
-        for i in range(0, groups, per):
-            block = torch.from_numpy(samples[i : i + per])
-            parts = self.hidden(block.reshape(-1, width))
-            means = [part.reshape(len(block), count, -1).mean(dim=1) for part in parts]
-            out.append(torch.cat(means, dim=1))
+        with torch_threads(1), torch.no_grad():
+            for i in range(0, groups, per):
+                block = torch.from_numpy(samples[i : i + per])
+                parts = self.hidden(block.reshape(-1, width))
+                means = [part.reshape(len(block), count, -1).mean(dim=1) for part in parts]
+                out.append(torch.cat(means, dim=1))
         return torch.cat(out).double().numpy()
 
 
@@ -214,7 +219,7 @@ class ClippedCritic(Critic):
 
     def _update(self, real: Tensor, fake: Tensor, pool: Executor) -> float:
         ours, theirs = pool.map(self._mean_and_gradient, (real, fake))
-        # Eq. 5 is a maximum, optimisers minimise.
+        # Eq. 5: max over the weights of E_real D - E_fake D. Optimisers minimise: the gradient turns round.
         for parameter, up, down in zip(self._parameters, ours[1], theirs[1], strict=True):
             parameter.grad = down - up
         self.optimiser.step()
@@ -239,6 +244,8 @@ class PenaltyCritic(Critic):
 
     def _update(self, real: Tensor, fake: Tensor, pool: Executor) -> float:
         self.optimiser.zero_grad(set_to_none=True)
+        # Gulrajani et al. (2017), eq. 3: minimise E_fake D - E_real D + c E (|grad_x D(x)| - 1)^2, with x
+        # uniform between pairs of samples and c = ``penalty``.
         mix = torch.rand(len(real), 1, generator=self.generator)
         between = (mix * real + (1 - mix) * fake).requires_grad_(True)
         output = self.hidden(torch.cat([real, fake, between]))[2][:, 0]

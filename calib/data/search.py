@@ -10,14 +10,14 @@ from __future__ import annotations
 import abc
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Stateful, restore_generator
+from deal_hw.calib.data.resume import Stateful, restore_generator
 from deal_hw.calibration import (
     Z90,
     Budget,
@@ -29,6 +29,11 @@ from deal_hw.calibration import (
 )
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoSettings:
+    """Settings of a method that has none."""
 
 
 class Coordinates:

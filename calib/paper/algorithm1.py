@@ -2,7 +2,7 @@
 
 Generation t: roll pi_0 out in every simulator (line 3), train the critic (eq. 5), score each member's own
 rollout, turn scores into probabilities and take one denoising step (eqs. 1, 2, 9, 10:
-:mod:`deal_hw.calib.search.diffusion_evolution`). The range is linear and no latency is searched.
+:mod:`deal_hw.calib.paper.diffusion_evolution`). The range is linear and no latency is searched.
 docs/explanation/deal-paper.md lists our choices.
 """
 
@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.base import Coordinates, RangedSearch, SearchLog, Stepper
-from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.diffusion_evolution import DiffusionEvolution, DiffusionSettings
-from deal_hw.calib.search.fitness import FitnessSettings, make_fitness
+from deal_hw.calib.data.search import Coordinates, RangedSearch, SearchLog, Stepper
+from deal_hw.calib.paper.critic import CriticSettings
+from deal_hw.calib.paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
+from deal_hw.calib.paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
@@ -42,7 +42,7 @@ class PaperSettings(FitnessSettings):
         linear: Whether the range is linear ("within the search range", section 3.2); off is uniform in each
             parameter's own scale.
         latency: Whether a latency that is not given is one more coordinate; the paper has none.
-        fitness: Name of the fitness (`deal_hw.calib.search.fitness`). "critic" is the paper's. "flat"
+        fitness: Name of the fitness (`deal_hw.calib.paper.fitness`). "critic" is the paper's. "flat"
             scores every member 0, so the search does not depend on the data. Eq. 9 reads the raw fitness,
             whatever its scale.
     """

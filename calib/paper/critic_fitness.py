@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.critic import ClippedCritic, CriticSettings
-from deal_hw.calib.search.fitness import Fitness, RolloutView, Samples
+from deal_hw.calib.paper.critic import ClippedCritic, CriticSettings
+from deal_hw.calib.paper.fitness import Fitness, RolloutView, Samples
 from deal_hw.sim.engine.batch import default_threads
 from deal_hw.types import FloatArray
 

@@ -17,7 +17,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control.process.channel import HEARTBEAT, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.process.claim import LocalClaim
 from deal_hw.control.process.realtime import priority
-from deal_hw.control.process.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
+from deal_hw.control.process.watchdog import SUPERVISOR_SILENCE_S, SupervisorWatchdog
 from deal_hw.errors import PortBusyError
 
 pytestmark = pytest.mark.real_time
@@ -27,7 +27,7 @@ PATIENCE_S = 20.0
 
 
 class Rig:
-    """A vigil, its supervisor's end of the channel, and a clock that moves when told."""
+    """A watchdog, its supervisor's end of the channel, and a clock that moves on request."""
 
     def __init__(self) -> None:
         self.clock = VirtualClock(10**12)
@@ -35,16 +35,18 @@ class Rig:
         self.supervisor = StatusReceiver(self._ends[1])
         self.silent = threading.Event()
         self.calls = 0
-        self.vigil = SupervisorVigil(StatusSender(self._ends[0]), self.clock, self._on_silence, SILENCE_S)
+        self.watchdog = SupervisorWatchdog(
+            StatusSender(self._ends[0]), self.clock, self._on_silence, SILENCE_S
+        )
 
     def _on_silence(self) -> None:
         self.calls += 1
         self.silent.set()
 
     def words(self) -> list[str]:
-        """Wait for words; the vigil is not silent meanwhile."""
+        """Wait for words; the watchdog is not silent meanwhile."""
         for _ in range(round(PATIENCE_S * 1e3)):
-            if words := self.vigil.messages():
+            if words := self.watchdog.messages():
                 return words
             assert not self.silent.wait(0.001)
         raise AssertionError("the words did not come")
@@ -52,27 +54,27 @@ class Rig:
     def close(self) -> None:
         """The supervisor is gone."""
         self.supervisor.close()
-        self.vigil._thread.join(PATIENCE_S)
-        assert not self.vigil._thread.is_alive()
+        self.watchdog._thread.join(PATIENCE_S)
+        assert not self.watchdog._thread.is_alive()
         self._ends[0].close()
 
 
 def test_words_are_kept_and_heartbeats_left_out() -> None:
-    """In order, once; the channel's end ends the vigil without an alarm."""
+    """In order, once; the channel's end ends the watchdog without an alarm."""
     rig = Rig()
     for word in ("w", HEARTBEAT, "a", HEARTBEAT, HEARTBEAT, "s"):
         rig.supervisor.tell(word)
-    rig.vigil.start()
+    rig.watchdog.start()
     rig.close()
-    assert rig.vigil.messages() == ["w", "a", "s"]
-    assert rig.vigil.messages() == []
+    assert rig.watchdog.messages() == ["w", "a", "s"]
+    assert rig.watchdog.messages() == []
     assert rig.calls == 0
 
 
 def test_a_supervisor_that_beats_is_never_taken_for_silent() -> None:
     """Time passes just short of the limit between two beats, far more than the limit in all."""
     rig = Rig()
-    rig.vigil.start()
+    rig.watchdog.start()
     for _ in range(10):
         rig.clock.advance_ns(round(SILENCE_S * 1e9) - 1)
         rig.supervisor.tell(HEARTBEAT)
@@ -93,8 +95,8 @@ def test_a_wait_that_ends_early_is_taken_up_again() -> None:
             asked.release()
             return super().now_ns()
 
-    rig.vigil._clock = Asked(10**12)
-    rig.vigil.start()
+    rig.watchdog._clock = Asked(10**12)
+    rig.watchdog.start()
     for _ in range(6):
         assert asked.acquire(timeout=PATIENCE_S)
     rig.close()
@@ -117,9 +119,9 @@ def test_the_kernels_wait_is_what_is_left_of_the_time(monkeypatch: pytest.Monkey
         waits.append(timeout_s)
         return [], [], []
 
-    monkeypatch.setattr("deal_hw.control.process.vigil.select.select", wait)
-    rig.vigil._clock = Scripted()
-    rig.vigil.start()
+    monkeypatch.setattr("deal_hw.control.process.watchdog.select.select", wait)
+    rig.watchdog._clock = Scripted()
+    rig.watchdog.start()
     assert rig.silent.wait(PATIENCE_S)
     rig.close()
     assert waits == pytest.approx([0.015, 0.0])
@@ -130,12 +132,12 @@ def test_a_supervisor_that_falls_silent_is_reported_once() -> None:
     rig = Rig()
     rig.supervisor.tell(HEARTBEAT)
     rig.supervisor.tell("x")
-    rig.vigil.start()
+    rig.watchdog.start()
     assert rig.words() == ["x"]
     rig.clock.advance_ns(round(SILENCE_S * 1e9))
     assert rig.silent.wait(PATIENCE_S)
-    rig.vigil._thread.join(PATIENCE_S)
-    assert not rig.vigil._thread.is_alive()
+    rig.watchdog._thread.join(PATIENCE_S)
+    assert not rig.watchdog._thread.is_alive()
     assert rig.calls == 1
     rig.close()
 
@@ -143,36 +145,36 @@ def test_a_supervisor_that_falls_silent_is_reported_once() -> None:
 def test_a_supervisor_that_never_spoke_is_reported() -> None:
     """The silence counts from the start."""
     rig = Rig()
-    rig.vigil.start()
+    rig.watchdog.start()
     rig.clock.advance_ns(10**12)
     assert rig.silent.wait(PATIENCE_S)
     rig.close()
 
 
-def test_the_vigil_keeps_nobody_alive() -> None:
+def test_the_watchdog_keeps_nobody_alive() -> None:
     """Its thread is a daemon, with a name for debuggers."""
     rig = Rig()
-    assert rig.vigil._thread.daemon
-    assert rig.vigil._thread.name == "supervisor vigil"
-    rig.vigil.start()
+    assert rig.watchdog._thread.daemon
+    assert rig.watchdog._thread.name == "supervisor watchdog"
+    rig.watchdog.start()
     rig.close()
 
 
 def test_the_limit_is_the_one_that_the_docs_name() -> None:
     """docs/explanation/safety.md says 1 s."""
     rig = Rig()
-    vigil = SupervisorVigil(rig.vigil._status, rig.clock, rig._on_silence)
-    assert vigil._silence_ns == round(SUPERVISOR_SILENCE_S * 1e9) == 10**9
-    rig.vigil.start()
+    watchdog = SupervisorWatchdog(rig.watchdog._status, rig.clock, rig._on_silence)
+    assert watchdog._silence_ns == round(SUPERVISOR_SILENCE_S * 1e9) == 10**9
+    rig.watchdog.start()
     rig.close()
 
 
 def test_words_that_nobody_takes_are_forgotten() -> None:
     """The newest 256 are kept."""
     rig = Rig()
-    rig.vigil._words.extend(map(str, range(300)))
-    assert rig.vigil.messages() == list(map(str, range(44, 300)))
-    rig.vigil.start()
+    rig.watchdog._words.extend(map(str, range(300)))
+    assert rig.watchdog.messages() == list(map(str, range(44, 300)))
+    rig.watchdog.start()
     rig.close()
 
 
@@ -303,7 +305,7 @@ def test_other_errors_of_the_kernel_come_out(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("children", [True, False])
 def test_a_priority_holds_inside_its_block_only(children: bool) -> None:
-    """Where it is granted; whether threads get it, too, is said."""
+    """Where it is granted; whether threads get it, too, is reported."""
     before = os.sched_getscheduler(0)
     found: list[int] = []
     with priority(7, children=children, lock=True):

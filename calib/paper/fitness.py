@@ -18,9 +18,9 @@ from scipy.spatial.distance import cdist, pdist
 
 from deal_hw.calib.data.innovations import Members, Whitening, cut, is_noisy, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.base import Coordinates
-from deal_hw.calib.search.resume import Stateful
-from deal_hw.calib.search.rollouts import (
+from deal_hw.calib.data.resume import Stateful
+from deal_hw.calib.data.search import Coordinates
+from deal_hw.calib.paper.rollouts import (
     TransitionScale,
     control_ticks,
     demonstration,
@@ -32,16 +32,16 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.calib.search.critic import CriticSettings
+    from deal_hw.calib.paper.critic import CriticSettings
 
 Samples = npt.NDArray[np.float32]
 
 FITNESSES: dict[str, str] = {
-    "critic": "deal_hw.calib.search.critic_fitness:CriticFitness",
-    "trajectory": "deal_hw.calib.search.fitness:TrajectoryFitness",
-    "energy": "deal_hw.calib.search.fitness:EnergyFitness",
-    "mmd": "deal_hw.calib.search.fitness:KernelFitness",
-    "flat": "deal_hw.calib.search.fitness:FlatFitness",
+    "critic": "deal_hw.calib.paper.critic_fitness:CriticFitness",
+    "trajectory": "deal_hw.calib.paper.fitness:TrajectoryFitness",
+    "energy": "deal_hw.calib.paper.fitness:EnergyFitness",
+    "mmd": "deal_hw.calib.paper.fitness:KernelFitness",
+    "flat": "deal_hw.calib.paper.fitness:FlatFitness",
 }
 """Name -> ``module:class``, imported on use: only the critic needs torch. ``flat`` ignores the data."""
 
@@ -176,6 +176,7 @@ class TrajectoryFitness(Fitness):
         residual = whitened_residual(
             self._problem, members, self._midpoint, self._windows, whitenings=self._whitenings
         )
+        # f = -ln(mean_m r_m^2) over the M whitened innovations r.
         with np.errstate(over="ignore"):
             error = np.mean(residual**2, axis=1)
         return np.where(np.isfinite(error), -np.log(np.maximum(error, 1e-300)), -np.inf)
