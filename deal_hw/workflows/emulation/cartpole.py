@@ -22,7 +22,7 @@ from deal_hw.workflows.emulation.settings import (
     CARTPOLE_RANGE_RATIO,
     ON_CAN,
     WITH_FIRMWARE,
-    EmulateSettings,
+    EmulateCartpoleSettings,
 )
 from deal_hw.workflows.say import Say, silent
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def emulate_cartpole(
-    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
+    config: EmulateCartpoleSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
 ) -> None:
     """Run the emulator until a stop, the given time or the end of its port.
 
@@ -43,7 +43,7 @@ def emulate_cartpole(
         announce: Called with the port first, and with the truth at the end.
         say: Called with a summary at the end.
     """
-    module, _, function = CARTPOLE_EMULATORS[config.transport or "serial"].partition(":")
+    module, _, function = CARTPOLE_EMULATORS[config.transport].partition(":")
     try:
         make = getattr(importlib.import_module(module), function)
     except ModuleNotFoundError as error:
@@ -53,7 +53,7 @@ def emulate_cartpole(
     truth = _truth(config)
     own: dict[str, str] = {}
     runs = ""
-    if (config.transport or "serial") in WITH_FIRMWARE:
+    if config.transport in WITH_FIRMWARE:
         from deal_hw.drivers.cartpole.chips.firmwares import usable_firmware
 
         own["firmware"] = usable_firmware(config.firmware)
@@ -86,14 +86,14 @@ def emulate_cartpole(
     )
 
 
-def _truth(config: EmulateSettings) -> CartpoleTruth:
+def _truth(config: EmulateCartpoleSettings) -> CartpoleTruth:
     from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
     from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 
     return choose_truth(config, nominal_truth, draw_truth, CartpoleTruth.from_json, CARTPOLE_RANGE_RATIO)
 
 
-def _hazards(config: EmulateSettings) -> Hazards:
+def _hazards(config: EmulateCartpoleSettings) -> Hazards:
     import numpy as np
 
     from deal_hw.testing.faults import FaultRates, FrameFaults

@@ -17,7 +17,11 @@ from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
 from deal_hw.signals import ENDING, taken
-from deal_hw.workflows.emulation.settings import EmulateSettings
+from deal_hw.workflows.emulation.settings import (
+    EmulateCartpoleSettings,
+    EmulateGo2Settings,
+    EmulateSettings,
+)
 from deal_hw.workflows.options import File
 from deal_hw.workflows.say import Say
 
@@ -131,9 +135,10 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
         return parse(values)
 
 
-def next_line(config: EmulateSettings, port: str) -> str:
+def next_line(config: EmulateCartpoleSettings | EmulateGo2Settings, port: str) -> str:
     """Return the line that says how to reach an emulated robot."""
-    transport = f" --transport {config.transport}" if config.transport else ""
+    usual = type(config).transport
+    transport = "" if config.transport == usual else f" --transport {config.transport}"
     return f"next, in another terminal: deal-hw doctor {config.robot} --port {port}{transport}"
 
 
