@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from deal_hw.cli.piped import PipedProgress, Quiet, is_quiet
 from deal_hw.documentation import page
-from deal_hw.drivers import ROBOTS
+from deal_hw.robots import driven_robots
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import TRAIN, InterruptedTrainingError, Training, TrainSettings, run
 
@@ -48,7 +48,7 @@ def train(config: TrainSettings) -> Training:
 def train_and_say_next(config: TrainSettings) -> Training:
     """Train, and print the line that runs the policy."""
     training = train(config)
-    if not is_quiet(config) and config.robot in ROBOTS:
+    if not is_quiet(config) and config.robot in driven_robots():
         print(f"next: deal-hw deploy {config.robot} --port PORT --policy {training.path}")
     return training
 

@@ -11,18 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 
 from deal_hw.calibration import LATENCY_RANGE_S
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.excitation.plan import (
     ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
     make_plan,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.ranges import Checked, Range
+from deal_hw.robots import is_known, robot_entry, robots
 from deal_hw.workflows.kinds import InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, from_settings, given, refuse
 from deal_hw.workflows.robot import described, described_spaces
@@ -277,23 +278,26 @@ def _design(config: ExcitationSettings, balance_s: float) -> ExcitationDesign:
 
 
 def _sway(config: SwaySettings, description: RobotDescription) -> ExcitationPlan:
-    if description.name != "go2":
+    entry = robot_entry(description.name) if is_known(description.name) else None
+    if entry is None or not entry.sway:
+        able = ", ".join(one.name for one in robots().entries() if one.sway)
         raise ConfigurationError(
-            f"robot {description.name!r} does not sway: that is for go2, which stands on four feet; choose "
-            "another --family"
+            f"robot {description.name!r} does not sway: that is for robots that stand on feet ({able}); "
+            "choose another --family"
         )
     try:
-        from deal_hw.drivers.go2.motions import sway_plan
+        sway_plan = entry.load(entry.sway)
         from deal_hw.sim.engine.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
-    return sway_plan(
+    plan: ExcitationPlan = sway_plan(
         load_model(description),
         np.random.default_rng(config.seed),
         config.seconds,
         (config.low_hz, config.high_hz),
         config.amplitude,
     )
+    return plan
 
 
 def _search(

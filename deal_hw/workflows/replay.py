@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from deal_hw.control.behaviours import ReplayBehaviour
 from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_metadata, read_trajectory
-from deal_hw.drivers import driver_description
 from deal_hw.errors import DealHwError
+from deal_hw.motions.behaviours import ReplayBehaviour
+from deal_hw.robots import driver_description
 from deal_hw.types import Trajectory
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds, field_names
 from deal_hw.workflows.options import File, from_settings, refuse
@@ -36,7 +36,7 @@ from deal_hw.workflows.running.simulated import (
     require_simulation,
     run_simulated,
 )
-from deal_hw.workflows.running.supervised import recording_folder, run_episodes
+from deal_hw.workflows.running.supervised import dataset_folder, recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 
 
@@ -195,8 +195,9 @@ def _rehearse(
     require_simulation(robot, config.simulation)
     description = user_robot(robot).description()
     behaviour = ReplayBehaviour(trajectory, description)
-    folder = recording_folder(config.out, config.dataset, "replay", description.name)
-    assert folder is not None
+    default = Path("runs") / f"replay_{description.name}"
+    named = config.out is not None or config.dataset is not None
+    folder = dataset_folder(config.out if named else default, config.dataset)
     plan = RunPlan(robot=robot, motion="replay", recording=str(path.resolve()), seconds=behaviour.duration_s)
     return run_simulated(
         plan, robot, config.simulation, dataset=folder, episodes=1, purpose="replay", view=view

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from deal_hw.drivers import ROBOTS, driver_description
 from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.robots import driven_robots, driver_description
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.robot import is_user_robot
 
@@ -42,7 +42,7 @@ def robot_kinds(
 
     def table() -> Mapping[str, InputKind]:
         found = {} if nothing is None else {"": InputKind(nothing)}
-        for name in ROBOTS:
+        for name in driven_robots():
             found[name] = InputKind(own.get(name) or (legged if has_legs(name) else plain))
         return found if file is None else {**found, FILE: InputKind(file)}
 
@@ -70,7 +70,7 @@ def robot_kind(name: str, files: bool, no_file: str = "") -> str:
         if not files:
             raise ConfigurationError(f"{name}: deal-hw has no driver for this robot{no_file}")
         return FILE
-    if name and name not in ROBOTS:
+    if name and name not in driven_robots():
         driver_description(name)
     return name
 

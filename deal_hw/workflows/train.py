@@ -18,6 +18,7 @@ from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import VERDICT
 from deal_hw.ranges import Checked, Range
 from deal_hw.reading import read_json, reading
+from deal_hw.robots import trained_robots
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, File, Seed, from_settings
@@ -115,9 +116,7 @@ class TrainOwnSettings(TrainSettings):
 
 
 def _table() -> dict[str, InputKind]:
-    from deal_hw.policies.tasks import TASKS
-
-    robots = {name: InputKind(TrainRobotSettings) for name in TASKS}
+    robots = {name: InputKind(TrainRobotSettings) for name in trained_robots()}
     return {**robots, FILE: InputKind(TrainOwnSettings)}
 
 
@@ -303,7 +302,8 @@ def train_policy(
     import inspect
 
     from deal_hw.policies.onnx_export import export_network
-    from deal_hw.policies.tasks import OWN_TASK, training_task
+    from deal_hw.policies.tasks import OWN_TASK
+    from deal_hw.robots import training_task
 
     task = OWN_TASK if env else training_task(robot)
     teacher, config = task.trainer_and_config(trainer, steps)
@@ -387,7 +387,7 @@ def udr_distribution(robot: str) -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot.
     """
-    from deal_hw.policies.tasks import training_task
+    from deal_hw.robots import training_task
 
     task = training_task(robot)
     return ParameterDistribution.uniform(_space(robot).with_ratio(task.udr_ratio), task.udr_latency_s)
@@ -399,7 +399,7 @@ def nominal_distribution(robot: str) -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot.
     """
-    from deal_hw.policies.tasks import training_task
+    from deal_hw.robots import training_task
 
     task, space = training_task(robot), _space(robot)
     K = len(space)
@@ -426,7 +426,7 @@ def _with_verdict(path: Path) -> tuple[ParameterDistribution, str]:
 
 
 def _space(robot: str) -> ParameterSpace:
-    from deal_hw.drivers import parameter_spaces
+    from deal_hw.robots import parameter_spaces
 
     return next(iter(parameter_spaces(robot).values()))()
 

@@ -15,13 +15,13 @@ import pytest
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
 from deal_hw.cli.design_excitation import design_excitation
-from deal_hw.control.excitation_plan import ExcitationBehaviour, read_plan
-from deal_hw.control.loop import Outcome
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.motions.excitation.plan import ExcitationBehaviour, read_plan
 from deal_hw.workflows.collect import _excitation
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
@@ -144,7 +144,7 @@ def test_playing_needs_no_extra(optimal: Path) -> None:
     """The control process plays an optimal excitation without torch, mujoco and scipy."""
     code = (
         "import sys; from deal_hw.workflows.running.plan import RunPlan, make_behaviour; "
-        "from deal_hw.drivers import robot_description; import deal_hw.cli.collect; "
+        "from deal_hw.robots import robot_description; import deal_hw.cli.collect; "
         f"plan = RunPlan(robot='cartpole', motion='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
         "seconds=2.0); make_behaviour(plan, robot_description('cartpole')); "
         "print([m for m in ('torch', 'mujoco', 'scipy') if m in sys.modules])"

@@ -13,15 +13,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.realtime import priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
 from deal_hw.signals import ENDING, taken
-from deal_hw.workflows.emulation.settings import (
-    EmulateCartpoleSettings,
-    EmulateGo2Settings,
-    EmulateSettings,
-)
+from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.options import File
 from deal_hw.workflows.say import Say
 
@@ -135,7 +131,7 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
         return parse(values)
 
 
-def next_line(config: EmulateCartpoleSettings | EmulateGo2Settings, port: str) -> str:
+def next_line(config: EmulateSettings, port: str) -> str:
     """Return the line that says how to reach an emulated robot."""
     usual = type(config).transport
     transport = "" if config.transport == usual else f" --transport {config.transport}"

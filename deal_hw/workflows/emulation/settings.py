@@ -10,13 +10,11 @@ from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
+from deal_hw.robots import emulated_robots
 from deal_hw.transport import NetworkOptions, WireOptions
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Share, given, refuse
 from deal_hw.workflows.robot import is_user_robot
-
-DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
-"""Transports of the Go2, and the emulator's default port on each: reachable on this machine only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +69,6 @@ class EmulatorWireOptions(NetworkOptions):
         return WireOptions(**shared, listen=transport == "zenoh" and self.mode == "peer", mode=mode)
 
 
-CARTPOLE_EMULATORS = {
-    "serial": "deal_hw.drivers.cartpole.emulator.emulator:serial_emulator",
-    "can": "deal_hw.drivers.cartpole.emulator.can_emulator:can_emulator",
-    "odrive": "deal_hw.drivers.cartpole.emulator.odrive_emulator:odrive_emulator",
-    "dynamixel": "deal_hw.drivers.cartpole.dynamixel.emulator:dynamixel_emulator",
-}
-"""Wires of the cart-pole -> "module:function"; the function is called as
-``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
 ON_CAN = ("can", "odrive")
 """Wires of the cart-pole with a CAN bus."""
 WITH_FIRMWARE = ("serial", "can", "odrive")
@@ -91,7 +81,10 @@ class EmulateSettings(Checked):
     """Emulate a robot in real time on its own port, with hidden physics."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """The robot to emulate: cartpole or go2."""
+    """The robot to emulate."""
+
+    transport: str = ""
+    """The wire; by default the robot's usual one."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
@@ -218,7 +211,11 @@ class EmulateGo2Settings(EmulateSettings):
     """How it joins its network."""
 
 
-_TABLE = {"cartpole": InputKind(EmulateCartpoleSettings), "go2": InputKind(EmulateGo2Settings)}
+_SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettings, "go2": EmulateGo2Settings}
+
+
+def _table() -> dict[str, InputKind]:
+    return {name: InputKind(_SETTINGS.get(name, EmulateSettings)) for name in emulated_robots()}
 
 
 def _find(arguments: Arguments) -> str:
@@ -231,5 +228,5 @@ def _find(arguments: Arguments) -> str:
     return name
 
 
-EMULATE = Kinds(noun="robot to emulate", argument="robot", table=lambda: _TABLE, find=_find)
+EMULATE = Kinds(noun="robot to emulate", argument="robot", table=_table, find=_find)
 """The kinds of :func:`deal_hw.emulate`; without a robot it emulates a cart-pole."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import default_transport, driver_description
+from deal_hw.motions.posture import PostureConfig
 from deal_hw.ranges import Checked, option
+from deal_hw.robots import default_transport, driver_description
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import FROM_PYTHON, File, given, refuse
 from deal_hw.workflows.say import Say, silent
