@@ -41,6 +41,7 @@ API_NAMES = {
         "replay",
         "RunReport",
         "LinkOptions",
+        "Go2LinkOptions",
         "LegOptions",
         "SimulationOptions",
         "WireOptions",
