@@ -212,22 +212,16 @@ REFUSED: list[tuple[str, str]] = [
         "collect {made}/robot.yaml --simulated --out r --excite chirp",
         "is unknown, so no excitation can be planned; write its position_range",
     ),
-    ("collect cartpole --simulated --out r", "--simulated takes a robot.yaml"),
     (
-        "collect {made}/robot.yaml --simulated --port p --out r",
-        "--port would have no effect: --simulated needs no",
-    ),
-    (
-        "collect cartpole --port p --truth-seed 1 --out r",
-        "--truth-seed would have no effect: only with --simulated",
+        "collect cartpole --simulated --out r",
+        "--simulated: `deal-hw collect cartpole` has no such option; `collect robot.yaml` has it",
     ),
     ("collect nosuch --out r", "unknown robot 'nosuch'; known: "),
-    ("collect cartpole --out r", "no port is given: name the robot's port"),
+    ("collect cartpole --out r", "`deal-hw collect cartpole` needs --port; --port is: The robot's port"),
     (
         "replay {made}/run/dataset/episodes/000000.mcap --port p",
         "deal-hw has no driver for this robot; record its simulation with --simulated",
     ),
-    ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a simulated"),
     (
         "deploy {made}/robot.yaml --port p",
         "docs/how-to/add.md shows how to write one",
