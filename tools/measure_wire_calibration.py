@@ -54,8 +54,8 @@ from deal_hw.drivers.cartpole.wire.odrive_link import OdriveSettings
 from deal_hw.errors import DealHwError, InsufficientDataError, UnknownNameError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
-from deal_hw.workflows.calibration.dataset import without_speed_limits
 from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.space import without_speed_limits
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.settings import CARTPOLE_RANGE_RATIO
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate

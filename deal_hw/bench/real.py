@@ -21,11 +21,10 @@ from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import HELDOUT_PART
-from deal_hw.workflows.calibration.prepare import prepare as prepare_recordings
-from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings
-from deal_hw.workflows.say import aloud, silent
+from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.settings import HELDOUT_PART, CalibrateSettings
+from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
@@ -35,9 +34,7 @@ UNTOLD = frozenset({"nominal", "output-error"})
 """Methods that need no expected prediction error."""
 
 
-def prepare(
-    source: CalibrateSettings, range_ratio: float | None, *, quiet: bool = False
-) -> CalibrationInputs:
+def prepare(source: CalibrateSettings, range_ratio: float | None, *, quiet: bool = False) -> CalibrationInput:
     """Read and check recordings and parameters once for all cells.
 
     Args:
@@ -56,7 +53,7 @@ def prepare(
         )
     settings = dataclasses.replace(source, range_ratio=range_ratio)
     settings.check()
-    return prepare_recordings(settings, say=silent if quiet else aloud)
+    return calibration_input(settings, say=silent if quiet else to_stderr)
 
 
 def split_name(source: CalibrateSettings) -> str:
@@ -69,7 +66,7 @@ def split_name(source: CalibrateSettings) -> str:
 
 
 def expected_std(
-    work: CalibrationInputs, given: FloatArray | None, threads: int | None
+    work: CalibrationInput, given: FloatArray | None, threads: int | None
 ) -> Callable[[str], FloatArray | None]:
     """Return a method's expected prediction error, (2 C,): the given one, or a first fit's."""
     from deal_hw.calib.data.problem import Problem
@@ -136,7 +133,7 @@ def cells(
 
 
 def run_cell(
-    work: CalibrationInputs,
+    work: CalibrationInput,
     task: str,
     split: str,
     method: str,

@@ -154,7 +154,7 @@ def cells(
 
     Raises:
         UnknownNameError: There is no such task or method.
-        ConfigurationError: There are too few steps, or a base policy does not fit; said before long work.
+        ConfigurationError: There are too few steps, or a base policy does not fit; raised before long work.
     """
     for task in tasks:
         if task not in TASKS:

@@ -7,13 +7,19 @@ from functools import partial
 from deal_hw.workflows.emulation.cartpole import emulate_cartpole
 from deal_hw.workflows.emulation.common import signalled
 from deal_hw.workflows.emulation.go2 import emulate_go2
-from deal_hw.workflows.emulation.settings import EMULATE, EmulateCartpoleSettings, EmulateGo2Settings
-from deal_hw.workflows.say import aloud
+from deal_hw.workflows.emulation.plug_in import emulate_plug_in
+from deal_hw.workflows.emulation.settings import (
+    EMULATE,
+    EmulateCartpoleSettings,
+    EmulateGo2Settings,
+    EmulateSettings,
+)
+from deal_hw.workflows.say import to_stderr
 
 KINDS = EMULATE
 
 
-def emulate(config: EmulateCartpoleSettings | EmulateGo2Settings) -> int:
+def emulate(config: EmulateSettings) -> int:
     """Run the emulator until a signal, the given time or the port's end; return the exit status.
 
     The first line on standard output is ``port PATH``.
@@ -21,7 +27,9 @@ def emulate(config: EmulateCartpoleSettings | EmulateGo2Settings) -> int:
     announce = partial(print, flush=True)
     with signalled() as (stop, cut):
         if isinstance(config, EmulateGo2Settings):
-            emulate_go2(config, stop, cut, announce=announce, say=aloud)
+            emulate_go2(config, stop, cut, announce=announce, say=to_stderr)
+        elif isinstance(config, EmulateCartpoleSettings):
+            emulate_cartpole(config, stop, cut, announce=announce, say=to_stderr)
         else:
-            emulate_cartpole(config, stop, cut, announce=announce, say=aloud)
+            emulate_plug_in(config, stop, cut, announce=announce)
     return 0

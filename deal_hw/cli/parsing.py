@@ -37,7 +37,7 @@ HELP_ALL = "--help-all"
 _HELP_WORDS = ("-h", "--help", HELP_ALL)
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
-"""Options are named without their group, and what only Python can give is no option."""
+"""Options are named without their group. A field that only Python can set has no option."""
 
 
 class Rules:

@@ -62,12 +62,12 @@ class PipedProgress:
 
     def tell(self) -> None:
         """Print the current step every ten seconds, once each, until the verb has ended."""
-        told = None
+        printed = None
         while not self._wait(EVERY_S):
             text = self._text
-            if text == told:
+            if text == printed:
                 continue
-            told = text
+            printed = text
             passed_s = (self._clock.now_ns() - self._began_ns) * 1e-9
             self.say(f"{passed_s:.0f} s" + (f", {text}" if text else ""))
 

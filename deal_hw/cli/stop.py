@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from deal_hw.workflows.say import aloud
+from deal_hw.workflows.say import to_stderr
 from deal_hw.workflows.stop import STOP, StopReport, StopSettings, run_stop
 
 KINDS = STOP
@@ -12,6 +12,6 @@ KINDS = STOP
 
 def stop(config: StopSettings) -> StopReport:
     """Run the verb; see :func:`deal_hw.workflows.stop.stop`."""
-    report = run_stop(config, aloud)
+    report = run_stop(config, to_stderr)
     print(report.words, file=sys.stdout if report.passive else sys.stderr)
     return report

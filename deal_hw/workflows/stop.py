@@ -24,7 +24,7 @@ from deal_hw.workflows.running.commander import who
 from deal_hw.workflows.say import Say, silent
 
 OBEY_S = 5.0
-"""How long a run that is told to end may take until its robot is passive [s]. It takes 0.25 s at most
+"""How long a run may take after a request to end until its robot is passive [s]. It takes 0.25 s at most
 (measured); a run that hangs longer is killed, its control process first."""
 TAKE_OVER_S = 2.0
 """How long its supervisor may take after its control process was killed [s]."""
@@ -139,9 +139,9 @@ def stop(settings: StopSettings) -> StopReport:
     """Make a robot passive, as ``deal-hw stop``: motor off, or damping. Nothing is asked.
 
     ``deal-hw stop ROBOT --help`` describes the arguments: ``stop("go2", port="enp2s0")``. A run on this
-    computer is told to end, and makes its robot passive itself: two writers would fight. A run that hangs is
-    killed. If no run commands the robot, this program does it, and sends nothing while another program or the
-    robot's own controller has it.
+    computer gets a request to end, and makes its robot passive itself: two writers would fight. A run that
+    hangs is killed. If no run commands the robot, this program does it, and sends nothing while another
+    program or the robot's own controller has it.
 
     Returns:
         Whether the robot confirmed that it is passive.
@@ -162,9 +162,9 @@ def run_stop(settings: StopSettings, say: Say) -> StopReport:
         runs = [run for run in runs if _is_meant(settings, run)]
         if not runs and not settings.port:
             words = (
-                f"no run of {settings.robot} of this user on this computer, so nothing was told and nothing "
-                "sent. Give its port, as for deploy, to make it passive all the same (--port); runs of "
-                "another user: sudo"
+                f"no run of {settings.robot} of this user on this computer, so nothing was requested and "
+                "nothing sent. Give its port, as for deploy, to make it passive all the same (--port); runs "
+                "of another user: sudo"
             )
             return StopReport(robot=settings.robot, passive=False, words=words)
         found = [_stopped(settings, run, clock, say) for run in runs] or [_directly(settings, clock, say)]
@@ -195,12 +195,13 @@ def _stopped(settings: StopSettings, run: FoundRun, clock: Clock, say: Say) -> S
     """Tell a run to end; kill it, and do it here, if it does not make its robot passive."""
     name, facts = f"the run of process {run.pid}", run.facts
     if end_run(run, clock):
-        words = f"{facts['robot']} is passive: {name} was told to end, and the robot has confirmed it"
+        words = f"{facts['robot']} is passive: {name} got a request to end, and the robot has confirmed it"
         return StopReport(robot=settings.robot, passive=True, words=words)
     alive = run.holders()
     if alive:
         words = (
-            f"{name} was told to end, but it does not, and may not be killed by this user: sudo deal-hw stop"
+            f"{name} got a request to end, but it does not, and may not be killed by this user: "
+            "sudo deal-hw stop"
         )
         return StopReport(robot=settings.robot, passive=False, words=words)
     wire = WireOptions.from_json(facts["wire"])

@@ -185,9 +185,9 @@ def test_a_recording_that_tripped_is_made_again(loaded: None, capsys: pytest.Cap
 
     assert numbers(recorded(record, "rich")) == (3,)
     assert levels == [0, 0, 1, 1]
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 3 and all("load 12.3 on 2 processors" in line for line in told)
-    assert "76 ms old" in told[0] and told[0].endswith("it is made again, 2 of 5")
+    reported = capsys.readouterr().err.splitlines()
+    assert len(reported) == 3 and all("load 12.3 on 2 processors" in line for line in reported)
+    assert "76 ms old" in reported[0] and reported[0].endswith("it is made again, 2 of 5")
 
 
 @pytest.mark.parametrize(
@@ -207,8 +207,8 @@ def test_the_demo_ends_with_the_right_remedy(
         calls.append(gentler)
         return run_of(ended(len(calls), *end))
 
-    said = f"no rich of 5 can be used .*{re.escape(end[1])}.*{remedy}"
-    with pytest.raises(SafetyError, match=said) as raised:
+    output = f"no rich of 5 can be used .*{re.escape(end[1])}.*{remedy}"
+    with pytest.raises(SafetyError, match=output) as raised:
         recorded(record, "rich")
     assert len(calls) == 5 and not_said not in str(raised.value) and "2 s" not in str(raised.value)
 

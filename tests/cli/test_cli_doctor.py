@@ -47,10 +47,10 @@ def test_this_computer_is_examined(capsys: pytest.CaptureFixture[str], tmp_path:
         for f in report.findings
     ]
     assert all(f.do for f in report.findings if f.severity in (Severity.WARN, Severity.FAIL))
-    said = capsys.readouterr()
-    words = " ".join(said.out.split())
+    printed = capsys.readouterr()
+    words = " ".join(printed.out.split())
     assert all(" ".join(f.seen.split()) in words for f in report.findings)
-    assert "all is well" in said.err or "worst:" in said.err
+    assert "all is well" in printed.err or "worst:" in printed.err
 
 
 def test_nothing_heavy_is_loaded() -> None:
@@ -72,11 +72,10 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "waitpid", lambda pid, options: (pid, 256))
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda which: (8 << 20, 8 << 20))
-    monkeypatch.setattr(machine, "PACKAGES", (("no-such", "dds"),))
     monkeypatch.setattr(
         machine, "_read", lambda path: {"rmem_max": "1000"}.get(path.rpartition("/")[2], "acpi_pm")
     )
-    findings = tuple(machine.examine_machine())
+    findings = tuple(machine.examine_machine([("no-such", "dds")]))
     assert levels(findings, "scheduling") == levels(findings, "memory") == {Severity.WARN}
     assert levels(findings, "packages") == {Severity.NOTE}
     assert levels(findings, "network") == {Severity.WARN}
@@ -86,7 +85,7 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[str]) -> None:
-    """A wrong endpoint or interface is told like everything else, and the exit code says so."""
+    """A wrong endpoint or interface is reported like everything else, and the exit code says so."""
     for robot, transport, port in (
         ("go2", "zenoh", "tcp/127.0.0.1:1"),
         ("go2", "dds", "nope0"),

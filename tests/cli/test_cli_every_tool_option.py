@@ -185,26 +185,26 @@ def contents(path: Path) -> str:
     return re.sub(r"\d{4}-\d\d-\d\dT[\d:.]+", "", path.read_text(encoding="utf-8"))
 
 
-def told(value: Any) -> str:
+def reported(value: Any) -> str:
     """Return a value as text that is the same for the same value."""
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]
     if isinstance(value, np.random.Generator):
         return str(value.bit_generator.state)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        inner = {entry.name: told(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
+        inner = {entry.name: reported(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
         return f"{type(value).__name__}{inner}"
     if isinstance(value, dict):
-        return str({key: told(one) for key, one in value.items()})
+        return str({key: reported(one) for key, one in value.items()})
     if isinstance(value, list | tuple):
-        return str([told(one) for one in value])
+        return str([reported(one) for one in value])
     if isinstance(value, mujoco.MjModel):
         return f"MjModel {value.opt.timestep} {value.nq}"
     if callable(value):
         return getattr(value, "__qualname__", type(value).__name__)
     if type(value).__module__.startswith("deal_hw"):
         inner = vars(value) if hasattr(value, "__dict__") else {}
-        return f"{type(value).__name__}{ {key: told(one) for key, one in inner.items()} }"
+        return f"{type(value).__name__}{ {key: reported(one) for key, one in inner.items()} }"
     return repr(value)
 
 
@@ -244,7 +244,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def note(name: str, answer: Any = None, *, ends: bool = False) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            did.append(f"{name} {told(args)} {told(kwargs)}")
+            did.append(f"{name} {reported(args)} {reported(kwargs)}")
             if ends:
                 raise SeenError
             return answer
@@ -257,7 +257,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def nothing(name: str) -> Callable[..., Any]:
         @contextlib.contextmanager
         def enter(*args: Any) -> Iterator[Callable[[], None]]:
-            did.append(f"{name} {told(args)}")
+            did.append(f"{name} {reported(args)}")
             yield lambda: None
 
         return enter
@@ -327,24 +327,24 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
     """Note all that a calibration is called with, and what its result goes into."""
     from deal_hw.cli import calibrate
-    from deal_hw.workflows.calibration import prepare
+    from deal_hw.workflows.calibration import run as run_calibration
 
     def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
         rest.pop("progress"), rest.pop("say")
         searched = (space.names, space.nominal, space.low, space.high)
-        did.append(told((robot.model, searched, episodes, holdout, rest)))
+        did.append(reported((robot.model, searched, episodes, holdout, rest)))
 
     def finish(work: Any, result: Any, folder: Path, *settings: Any, **rest: Any) -> None:
-        did.append(told((work.provenance, folder, settings, rest)))
+        did.append(reported((work.provenance, folder, settings, rest)))
         raise SeenError
 
     @contextlib.contextmanager
     def watching(*shown: Any) -> Iterator[None]:
-        did.append(told(shown[:2]))
+        did.append(reported(shown[:2]))
         yield None
 
     monkeypatch.setattr(calibrate, "watching", watching)
-    monkeypatch.setattr(prepare, "calibrate_episodes", search)
+    monkeypatch.setattr(run_calibration, "calibrate_episodes", search)
     monkeypatch.setattr(calibrate, "finish", finish)
 
 

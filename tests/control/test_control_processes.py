@@ -190,9 +190,9 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     asked = [d.read(0).trajectory.requested_position for d in (first, Dataset.open(tmp_path / "b"))]
     assert asked[0].shape == (25, 1)
     assert (asked[0] == asked[1]).all()
-    said = report.episodes[-1]
-    assert said.replay is not None and said.replay.position[0] < 0.05
-    lines = said.lines()
+    printed = report.episodes[-1]
+    assert printed.replay is not None and printed.replay.position[0] < 0.05
+    lines = printed.lines()
     assert lines[1].startswith("  ran for 0.5 s")
     assert any(line.startswith("  difference from the recording at most ") for line in lines)
 
@@ -377,7 +377,7 @@ def test_a_state_stream_that_stops_trips(start_emulator: Callable[..., Emulator]
 def test_five_percent_of_corrupt_frames_are_survived_and_reported(
     start_emulator: Callable[..., Emulator], tmp_path: Path
 ) -> None:
-    """The run finishes, the robot is passive, and the operator is told that an emulator has no cable."""
+    """The run finishes, the robot is passive, and the operator is informed that an emulator has no cable."""
     emulator = start_emulator("--corrupt", "0.05")
     report = run(emulator, tmp_path, seconds=2.0)
     assert report.outcome is Outcome.FINISHED
@@ -473,9 +473,9 @@ def test_deploy_balances_with_a_policy_file(emulator: Emulator, tmp_path: Path) 
     assert report.outcome is Outcome.FINISHED
     episode = Dataset.open(tmp_path / "dataset").read(0)
     assert (episode.metadata["purpose"], episode.metadata["task"]) == ("deploy", "stand")
-    said = report.episodes[-1]
-    assert said.balance is not None and not said.balance.fell and said.balance.angle_error_rad < 0.1
-    assert any(line.startswith("  pole upright (within 0.5 rad) for 1.") for line in said.lines())
+    printed = report.episodes[-1]
+    assert printed.balance is not None and not printed.balance.fell and printed.balance.angle_error_rad < 0.1
+    assert any(line.startswith("  pole upright (within 0.5 rad) for 1.") for line in printed.lines())
     assert abs(episode.trajectory.position[:, 1]).max() < 0.3
 
 

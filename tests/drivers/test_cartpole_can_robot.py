@@ -469,7 +469,7 @@ def test_python_can_logs_the_bus_and_cantools_decodes_it(tmp_path: Path) -> None
 
 
 def test_only_frames_on_the_bus_have_reached_the_device() -> None:
-    """A dry run opens the adapter, and the device has heard nothing; then it hears one frame of 16 bytes."""
+    """A dry run opens the adapter, and the device has received nothing; then one frame of 16 bytes."""
     adapter = SlcanAdapter([can_device(nominal_truth())], CanFaults())
     adapter.receive(b"\rC\rS6\rO\r")
     assert adapter.received_bytes == 0

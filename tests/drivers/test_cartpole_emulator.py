@@ -155,14 +155,14 @@ def test_the_port_vanishes_on_request() -> None:
 
 
 def test_the_wire_is_cut_for_a_time() -> None:
-    """0.3 s after arming nothing is heard or said for 0.4 s; the device's watchdog acts meanwhile."""
+    """0.3 s after arming nothing is received or sent for 0.4 s; the device's watchdog acts meanwhile."""
     bench = Bench(Hazards(cut_after_s=0.3, cut_s=0.4))
     try:
         bench.arm()
         assert len(bench.run(1000)) in range(201 - 90, 201 - 70)
         # Disarmed 0.2 s after the last word, 0.1 s before the cut: a robot goes on without its host.
-        told = [what for _, _, what in bench.emulator.changes]
-        assert told == ["homing", "held", "armed", "idle", "cut"]
+        reported = [what for _, _, what in bench.emulator.changes]
+        assert reported == ["homing", "held", "armed", "idle", "cut"]
         assert bench.emulator.report()["watchdog"]
         bench.emulator.cut()
         bench.send(protocol.Arm(3))
@@ -239,12 +239,12 @@ def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.Ca
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("port /dev/")
-    told = json.loads(lines[-1])
-    assert told == json.loads(revealed.read_text())
-    assert (told["changes"], told["last_mode"], told["received_bytes"]) == ([], "idle", 0)
+    reported = json.loads(lines[-1])
+    assert reported == json.loads(revealed.read_text())
+    assert (reported["changes"], reported["last_mode"], reported["received_bytes"]) == ([], "idle", 0)
     assert emulate(EMULATE.settings(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
     again = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert CartpoleTruth.from_json(again) == CartpoleTruth.from_json(told)
+    assert CartpoleTruth.from_json(again) == CartpoleTruth.from_json(reported)
 
 
 def test_a_process_end_to_end(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_a_process_end_to_end(tmp_path: Path) -> None:
 
 
 def test_a_process_that_loses_its_parent_ends() -> None:
-    """An emulator whose parent is another process than it was told stops by itself."""
+    """An emulator whose parent is another process than the given one stops by itself."""
     emulator = EmulatorProcess("cartpole", "--nominal", "--parent", "1")
     emulator.start()
     process = emulator._process

@@ -216,7 +216,7 @@ def test_a_free_port_is_found() -> None:
 
 @pytest.mark.real_time
 def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
-    """A client releases sport mode and commands, sees ticks that count up; at the end the truth is told."""
+    """A client releases sport mode and commands, sees ticks that count up; at the end it prints the truth."""
     pytest.importorskip("zenoh")
     revealed = tmp_path / "truth.json"
     process = EmulatorProcess(

@@ -44,8 +44,10 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
     )
     assert training.status is not None and training.first_return is not None
     now, first = training.status.mean_return, training.first_return
-    told = f"return: {now:.1f}, at first {first:.1f}; {training.status.measures['time_up']:.0%} of an episode"
-    assert first < 0 and first != now and told in capsys.readouterr().out
+    reported = (
+        f"return: {now:.1f}, at first {first:.1f}; {training.status.measures['time_up']:.0%} of an episode"
+    )
+    assert first < 0 and first != now and reported in capsys.readouterr().out
     assert f"{first:.4g}" in training.table()
     policy = OnnxPolicy(tmp_path / "policies" / "policy.onnx")
     policy.spec.check_fits(DESCRIPTION)
@@ -59,15 +61,15 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
     assert record["reward"].endswith("which has the effect of an alive bonus.")
 
 
-@pytest.mark.parametrize(("robot", "told"), [("cartpole", True), ("ant", False)])
+@pytest.mark.parametrize(("robot", "reported"), [("cartpole", True), ("ant", False)])
 def test_the_next_line_runs_the_policy(
-    robot: str, told: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    robot: str, reported: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of a robot that has a driver; a robot of the simulator alone cannot be deployed to."""
     monkeypatch.setattr(train_module, "train", lambda config: types.SimpleNamespace(path=Path("p.onnx")))
     train_module.train_and_say_next(TRAIN.settings(robot=robot, udr=True))
     line = f"next: deal-hw deploy {robot} --port PORT --policy p.onnx\n"
-    assert capsys.readouterr().out == (line if told else "")
+    assert capsys.readouterr().out == (line if reported else "")
 
 
 def test_udr_covers_a_factor_of_five_and_30_ms() -> None:

@@ -241,7 +241,7 @@ def test_joints_and_actuators_that_are_left_out(model: Path) -> None:
 
 
 def test_a_model_with_two_robots(tmp_path: Path) -> None:
-    """It is refused with both named; two arms of one robot are taken where that is said."""
+    """It is refused with both named; two arms of one robot are taken where an option allows it."""
     path = tmp_path / "two.xml"
     bodies = LINK.format(name="left", joint="left", inner="") + LINK.format(
         name="right", joint="right", inner=""

@@ -217,9 +217,9 @@ def test_both_refuse_with_the_same_words(
         getattr(deal_hw, verb)(**given)
     assert words in str(raised.value)
     assert main(line) == EXIT_ERROR
-    told = capsys.readouterr()
-    assert told.err == f"deal-hw: error: {raised.value}\n"
-    assert not told.out and not list(tmp_path.iterdir())
+    reported = capsys.readouterr()
+    assert reported.err == f"deal-hw: error: {raised.value}\n"
+    assert not reported.out and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("verb", sorted({verb for verb, _, _ in TABLE}))

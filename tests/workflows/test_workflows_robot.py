@@ -35,9 +35,9 @@ def test_from_two_files_to_an_inspected_calibration(made: Path, capsys: pytest.C
     """new, check, import, info, calibrate, inspect; nothing after the import names robot or model."""
     dataset = made / "run" / "dataset"
     assert main(["robot", "check", str(made / "robot.yaml")]) == EXIT_OK
-    told = capsys.readouterr().out
-    assert "robot.yaml and MJCF agree" in told and "holding for 1 s: stable" in told
-    assert "note velocity_limit: missing for" in told
+    reported = capsys.readouterr().out
+    assert "robot.yaml and MJCF agree" in reported and "holding for 1 s: stable" in reported
+    assert "note velocity_limit: missing for" in reported
     assert main(["data", "info", str(dataset)]) == EXIT_OK
     assert "its robot" in capsys.readouterr().out
     assert main(["data", "verify", str(dataset)]) == EXIT_OK
@@ -247,8 +247,8 @@ def test_refusals(
         ",".join(["time", "alpha", "alpha.command", *columns[3:]]) + "\n" + renamed[1], encoding="utf-8"
     )
     assert main(line.format(made=made).split()) == EXIT_ERROR
-    told = capsys.readouterr()
-    assert words in told.err.splitlines()[-1] and not list(tmp_path.iterdir())
+    reported = capsys.readouterr()
+    assert words in reported.err.splitlines()[-1] and not list(tmp_path.iterdir())
 
 
 def test_a_dataset_without_its_robot(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

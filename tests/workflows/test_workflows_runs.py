@@ -1,4 +1,4 @@
-"""Runs of a robot from Python: what comes back, what is told, and that nothing is printed."""
+"""Runs of a robot from Python: what comes back, what is reported, and that nothing is printed."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def test_a_robot_is_emulated_recorded_and_replayed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Paths, outcome and truth come back; sentences go to `say` alone; a path may be a string."""
-    said: list[str] = []
+    output: list[str] = []
     with deal_hw.emulate("cartpole", nominal=True, profile="sensor", seed=3) as robot:
         port = robot.port
         assert port in repr(robot) and not robot.truth
         run = deal_hw.collect(
-            "cartpole", port=port, out=str(tmp_path), motion="hold", seconds=SECONDS, say=said.append
+            "cartpole", port=port, out=str(tmp_path), motion="hold", seconds=SECONDS, say=output.append
         )
         again = deal_hw.replay(run.paths[0], port=port, dataset=str(tmp_path / "again"))
         dry = deal_hw.deploy("cartpole", port=port, seconds=SECONDS, dry_run=True)
@@ -59,8 +59,8 @@ def test_a_robot_is_emulated_recorded_and_replayed(
     assert again.paths[0].parent == tmp_path / "again" / "episodes" and dry.paths == ()
     assert kept.dataset == Path("runs/replay_cartpole/dataset") and kept.paths[0].is_file()
     assert lost.dataset is None and lost.paths == ()
-    assert any("too short: `deal-hw calibrate`" in text for text in said)
-    assert "finished: the run is over" in said
+    assert any("too short: `deal-hw calibrate`" in text for text in output)
+    assert "finished: the run is over" in output
     for shown in (run._repr_html_(), run.table()):
         assert str(run.paths[0]) in shown and "finished" in shown
     assert robot.truth["seed"] == 3 and robot.truth["parameters"]
@@ -76,12 +76,12 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
         passive_confirmed=False,
         warnings=("switch it off by hand",),
     )
-    said: list[str] = []
-    for view in (RunView.of_python(silent), RunView.of_python(said.append), RunView()):
+    output: list[str] = []
+    for view in (RunView.of_python(silent), RunView.of_python(output.append), RunView()):
         view.ended(lost)
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
-    assert said == ["tripped: the connection is lost", "warning: switch it off by hand"]
+    assert output == ["tripped: the connection is lost", "warning: switch it off by hand"]
     # The reason of a failure follows as the error.
     assert dataclasses.replace(lost, outcome=Outcome.FAILED).lines() == ["failed"]
     kept = dataclasses.replace(lost, path=Path("000003.mcap"))
@@ -191,8 +191,8 @@ def test_functions_for_a_robot_load_neither_torch_nor_mujoco() -> None:
         "    getattr(deal_hw, name)\n"
         "print([n for n in ('mujoco', 'torch', 'scipy', 'rich', 'tyro') if n in sys.modules])"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told == "[]\n"
+    reported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert reported == "[]\n"
 
 
 def test_no_workflow_prints_asks_or_ends_the_program() -> None:

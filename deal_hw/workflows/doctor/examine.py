@@ -16,6 +16,7 @@ from deal_hw.robots import (
     make_topic_transport,
     on_this_computer,
     other_wires,
+    plug_ins,
     reached_over,
 )
 from deal_hw.transport import WireOptions
@@ -145,6 +146,7 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
     from deal_hw.workflows.doctor.can import list_adapters
 
     yield from examine_machine()
+    yield from list_plug_ins()
     yield from list_adapters()
     yield from judge_interfaces(config.port if isinstance(config, DoctorRobotSettings) else "")
     if not isinstance(config, DoctorRobotSettings):
@@ -179,6 +181,15 @@ def _examine_link(config: DoctorRobotSettings, name: str, clock: Clock) -> Itera
     robot = make_robot(config.robot, name, config.port, clock)
     local = on_this_computer(name, config.port)
     yield from examine_robot(config.robot, robot, clock, config.seconds, local)
+
+
+def list_plug_ins() -> Iterator[Finding]:
+    """Yield the installed plug-ins, and why those are left out that cannot be used."""
+    for one in plug_ins():
+        if one.problem:
+            yield Finding("plug-ins", Severity.WARN, one.problem)
+        else:
+            yield Finding("plug-ins", Severity.OK, f"{one.kind} {one.name} ({one.origin})")
 
 
 def judge_interfaces(port: str) -> Iterator[Finding]:

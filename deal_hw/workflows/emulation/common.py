@@ -55,15 +55,15 @@ def happenings(path: File | None, *logs: Sequence[tuple[int, int, str]]) -> Iter
     if path is None:
         yield lambda: None
         return
-    told = [0] * len(logs)
+    written = [0] * len(logs)
     with Path(path).open("a", encoding="utf-8") as file:
 
         def tell() -> None:
             for number, log in enumerate(logs):
-                for entry in log[told[number] :]:
+                for entry in log[written[number] :]:
                     file.write(json.dumps(entry) + "\n")
                     file.flush()
-                told[number] = len(log)
+                written[number] = len(log)
 
         yield tell
 
