@@ -216,7 +216,7 @@ def default_space(description: RobotDescription) -> ParameterSpace:
 
 def carries_robot(dataset: File | None) -> bool:
     """Return whether a dataset contains a user's robot."""
-    # The same as deal_hw.sim.robots.carried, which needs mujoco; this one also runs without it.
+    # The same as deal_hw.sim.robots.dataset_robot, which needs mujoco; this one also runs without it.
     return dataset is not None and (Path(dataset) / "robot" / "files.json").is_file()
 
 
@@ -246,10 +246,10 @@ def recorded_robot(values: Mapping[str, Any], dataset: Path) -> RobotDescription
     if not carries_robot(dataset) and is_ours(str(values["name"])):
         return recorded_description(str(values["name"]))
     try:
-        from deal_hw.sim.robots.carried import carried_description
+        from deal_hw.sim.robots.dataset_robot import stored_description
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "sim") from err
-    return carried_description(dataset, values)
+    return stored_description(dataset, values)
 
 
 def _sim() -> Any:
