@@ -23,8 +23,8 @@ import numpy as np
 from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
-from deal_hw.calib.search.critic import PenaltyCritic, Samples
-from deal_hw.calib.search.diffusion_evolution import Schedule, alpha_schedule
+from deal_hw.calib.paper.critic import PenaltyCritic, Samples
+from deal_hw.calib.paper.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
 from deal_hw.on_use import OnUse
 from deal_hw.types import FloatArray

@@ -34,8 +34,8 @@ from scipy.special import ndtri
 
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
-from deal_hw.calib.search.resume import Stateful
+from deal_hw.calib.data.resume import Stateful
+from deal_hw.calib.data.search import RangedSearch, Search, SearchLog
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
@@ -243,7 +243,7 @@ def _largest_improvement(
     from gpytorch.mlls import ExactMarginalLogLikelihood
     from linear_operator.utils.errors import NanError, NotPSDError
 
-    from deal_hw.calib.search.critic import torch_threads
+    from deal_hw.calib.paper.critic import torch_threads
 
     x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
     # From 20 coordinates on BoTorch moves a part of them, and leaves the others where a good point has them,

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback

@@ -22,6 +22,7 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
@@ -47,7 +48,6 @@ from deal_hw.calib.pipeline.calibration_run import (
     CalibrationRun,
     FitOutcome,
 )
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
 from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play

@@ -27,8 +27,8 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.innovations import Members, cut, explained, is_noisy, whitened_residual
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.resume import State, Stateful
+from deal_hw.calib.data.resume import State, Stateful
+from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

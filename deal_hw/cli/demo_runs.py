@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Final
 
 from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.data.checks.suite import check as check_recording
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.errors import SafetyError, TransportError
 from deal_hw.findings import Severity
 from deal_hw.workflows.causes import LATE, Load, late_advice

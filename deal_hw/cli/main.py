@@ -287,6 +287,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """
     try:
         settings, function = parse(name, arguments)
+        if name != "doctor":
+            _name_problems()
         result = function(settings)
     except ModuleNotFoundError as err:
         package = (err.name or "").partition(".")[0]
@@ -295,6 +297,19 @@ def run(name: str, arguments: Sequence[str]) -> int:
         raise MissingExtraError(package, find(name).extra or "all") from err
     code = getattr(result, "exit_code", result)
     return code if isinstance(code, int) and not isinstance(code, bool) else EXIT_OK
+
+
+def _name_problems() -> None:
+    """Print a line for each plug-in that is left out, if the verb uses the table of robots.
+
+    ``deal-hw doctor`` shows them among its findings.
+    """
+    if "deal_hw.robots" in sys.modules:
+        from deal_hw.robots import plug_ins
+
+        for one in plug_ins():
+            if one.problem:
+                print(f"deal-hw: warning: {one.problem}", file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -218,7 +218,7 @@ def calibrate(
         fit_seconds: Most seconds to fit, spread evenly over the recordings [s].
         window_s: Length of the longest prediction windows of the search [s].
         physics_step_s: Requested physics step [s]; the MJCF's timestep by default.
-        force: Use recordings although a plausibility check failed.
+        force: Use recordings although a check of them failed.
         sample_hz: Rate of the fitted states of a dataset [Hz]; by default four per control period.
         spike_ratio: A sample is left out if it jumps away and back by more than this multiple of the joint's
             fastest motion.

@@ -19,9 +19,9 @@ from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.data.recording.reader import Episode
+    from deal_hw.data.table import Table
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
@@ -87,8 +87,8 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.importing.grid import common_period, to_trajectories
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
-    from deal_hw.data.importing.table import table_of
     from deal_hw.data.recording.episode_info import verdict_json
+    from deal_hw.data.table import table_of
 
     _refuse_ignored(config)
     columns = None if config.columns is None else read_column_map(config.columns)

@@ -16,7 +16,7 @@ from deal_hw.calib.baselines.bayesian import (
     critic_return,
 )
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace

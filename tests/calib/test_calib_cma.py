@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.calib.baselines.cma_es import Cma, CmaSettings, RestartedCma
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import ParameterSpace

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calib.search.critic import (
+from deal_hw.calib.paper.critic import (
     ClippedCritic,
     Critic,
     CriticSettings,

@@ -14,7 +14,7 @@ from deal_hw.calib.baselines.least_squares import (
     textbook_covariance,
 )
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.episode import SampledEpisode

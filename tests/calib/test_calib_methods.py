@@ -12,7 +12,10 @@ from fakes.recorded_commands import RecordedCommands
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.paper.algorithm1 import DealPaper, PaperSettings, _Box
+from deal_hw.calib.paper.critic import CriticSettings
 from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
     DEFAULT_SEARCH,
@@ -27,11 +30,8 @@ from deal_hw.calib.pipeline.methods import (
     with_search,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
-from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings, _Box
-from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import NEAR_SPREAD, Eki
-from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calibration import EXPLAINED_CHI2, Budget, Progress

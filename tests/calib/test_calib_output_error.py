@@ -13,6 +13,7 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts, SearchCheckpoint
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.null_space import confounded
 from deal_hw.calib.fit.output_error import (
@@ -30,7 +31,6 @@ from deal_hw.calib.pipeline.output_error_fits import (
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts, SearchCheckpoint
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress

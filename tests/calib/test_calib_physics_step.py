@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import with_finer_step
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.time_steps import (
     CLEARLY,

@@ -19,6 +19,7 @@ from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import HELD_STD, noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
     FALSE_ALARMS,
@@ -42,7 +43,6 @@ from deal_hw.calib.pipeline.stages import (
     conclusive,
     lower_minimum,
 )
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calib.validation.time_steps import LatencyScan

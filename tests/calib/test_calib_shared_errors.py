@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.pipeline import stages
@@ -19,7 +20,6 @@ from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun
 from deal_hw.calib.pipeline.stages import Fits, Refinement, with_shared_error
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.shared_errors import (

@@ -9,12 +9,12 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Member, Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.checks import (
     HALVES,

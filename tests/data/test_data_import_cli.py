@@ -15,13 +15,13 @@ import pytest
 
 from deal_hw.cli.data import Export, Import, data
 from deal_hw.cli.main import parse
-from deal_hw.data.checks.plausibility import examine
+from deal_hw.data.checks.suite import examine
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.columns import parse_column_map, read_column_map
 from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.table import Table
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.findings import Severity, worst
 from deal_hw.install import install_line

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from deal_hw.data.importing.grid import Gains, common_period, period_of, to_trajectories
 from deal_hw.data.importing.load import own_episodes
 from deal_hw.data.importing.store import write_dataset
-from deal_hw.data.importing.table import Table, table_of
 from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.table import Table, table_of
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError

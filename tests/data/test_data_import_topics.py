@@ -17,8 +17,8 @@ from deal_hw.cli.data import Import, data
 from deal_hw.data.importing import mcap_source
 from deal_hw.data.importing.columns import parse_column_map
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.importing.table import table_of
 from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.table import table_of
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import parse_yaml
 from deal_hw.types import Trajectory

@@ -20,7 +20,7 @@ from deal_hw.data.importing.columns import parse_column_map
 from deal_hw.data.importing.grid import period_of, to_trajectories
 from deal_hw.data.importing.lerobot_source import read_lerobot
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError
 from deal_hw.types import Trajectory
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from deal_hw.data.checks.joint_match import best_assignment
-from deal_hw.data.checks.plausibility import examine, require
-from deal_hw.data.importing.table import Table
+from deal_hw.data.checks.suite import examine, require
+from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError, MissingExtraError
 from deal_hw.findings import Finding, Severity, worst
 from deal_hw.install import install_line

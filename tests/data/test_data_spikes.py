@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.data.checks.plausibility import despiked, examine
+from deal_hw.data.checks.spikes import SpikeSettings, describe, find_spikes, sound, without_spikes
+from deal_hw.data.checks.suite import check, despiked, examine
 from deal_hw.data.importing.npz_source import read_npz
-from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.spikes import SpikeSettings, describe, find_spikes, sound, without_spikes
-from deal_hw.data.recording.telemetry_checks import check
+from deal_hw.data.table import Table
 from deal_hw.findings import Severity
 from deal_hw.types import FloatArray, Trajectory
 

@@ -113,7 +113,7 @@ def test_the_paper_is_mapped_line_by_line() -> None:
     named = set(re.findall(r"`([\w./]+)`", algorithm + equations))
     files = {name for name in named if name.endswith((".py", "/"))}
     assert {
-        name for name in files if not ((ROOT / name).exists() or (ROOT / "calib" / "search" / name).exists())
+        name for name in files if not ((ROOT / name).exists() or (ROOT / "calib" / "paper" / name).exists())
     } == set()
     words = {part for name in named - files for part in name.split(".")}
     assert {word for word in words if not re.search(rf"\b{re.escape(word)}\b", SOURCES)} == set()

@@ -11,9 +11,9 @@ import pytest
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings
-from deal_hw.calib.search.resume import digest
-from deal_hw.calib.search.rollouts import control_ticks, rollout_population
+from deal_hw.calib.data.resume import digest
+from deal_hw.calib.paper.algorithm1 import DealPaper, PaperSettings
+from deal_hw.calib.paper.rollouts import control_ticks, rollout_population
 from deal_hw.calibration import Budget
 from deal_hw.errors import PolicyMismatchError, UnknownNameError
 from deal_hw.parameters import ParameterSpace

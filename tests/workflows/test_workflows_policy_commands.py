@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError

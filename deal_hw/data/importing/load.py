@@ -19,10 +19,11 @@ from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.starting_map import starting_map
-from deal_hw.data.importing.table import Table, build_table
+from deal_hw.data.importing.table import build_table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.data.table import Table
 from deal_hw.documentation import page
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.findings import Finding
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.joint_facts import JointFacts
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 GRAVITY_EXPLAINED, GRAVITY_LEAST, GRAVITY_ERRORS = 0.5, 0.01, 4.0
 """Gravity must explain this share of a deviation of at least this size [rad, m], or no gain is reported. A
 contradiction counts from this many standard errors on."""
-REQUIRED_CHECKS = ("size", "finite", "clock", "rate", "commands")
+REQUIRED_CHECKS = ("length", "finite", "clock", "rate", "commands")
 """Checks without which a recording has no time grid: --force does not overrule them."""
 MOTOR_CHECKS = (
-    "size",
+    "length",
     "finite",
     "clock",
     "rate",
@@ -97,7 +97,7 @@ def examine_recording(
         DatasetError: A check failed, and ``force`` is not set.
     """
     from deal_hw.data.checks.command_kind import command_kind
-    from deal_hw.data.checks.plausibility import examine, require
+    from deal_hw.data.checks.suite import examine, require
     from deal_hw.errors import DatasetError
     from deal_hw.findings import Severity
 

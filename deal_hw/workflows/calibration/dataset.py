@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
+from deal_hw.data.checks.spikes import SpikeSettings
 from deal_hw.data.recording.episode_info import motion_of
-from deal_hw.data.recording.spikes import SpikeSettings
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
@@ -157,8 +157,8 @@ def sound_recordings(
     Raises:
         InsufficientDataError: An episode cannot be used.
     """
-    from deal_hw.data.recording.spikes import without_spikes
-    from deal_hw.data.recording.telemetry_checks import check
+    from deal_hw.data.checks.spikes import without_spikes
+    from deal_hw.data.checks.suite import check
     from deal_hw.findings import Severity
 
     verdicts = {index: check(trajectory, spikes) for index, trajectory in trajectories.items()}

@@ -26,7 +26,7 @@ from deal_hw.workflows.calibration.space import searched_space
 from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
@@ -45,7 +45,7 @@ def read_files(
         ConfigurationError: A setting, the model or a parameter cannot be used.
         DatasetError: A recording cannot be read, understood or trusted.
     """
-    from deal_hw.data.checks.plausibility import despiked
+    from deal_hw.data.checks.suite import despiked
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.engine.model import load_model
     from deal_hw.sim.mjcf.describe import describe, with_speed_limits

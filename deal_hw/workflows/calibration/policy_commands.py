@@ -18,7 +18,7 @@ from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policy import PolicySpec
     from deal_hw.sim.mjcf.joint_facts import JointFacts

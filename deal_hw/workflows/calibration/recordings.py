@@ -17,7 +17,7 @@ from deal_hw.workflows.calibration.source import Named
 if TYPE_CHECKING:
     from deal_hw.data.importing.columns import ColumnMap, JointKinds
     from deal_hw.data.importing.grid import Recording
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.describe import Sampling
     from deal_hw.sim.mjcf.joint_facts import JointFacts
@@ -94,7 +94,7 @@ def common_rates(
         ConfigurationError: They have different joints, or a setting cannot be used.
         DatasetError: A clock is invalid, or rates differ.
     """
-    from deal_hw.data.checks.plausibility import examine, require
+    from deal_hw.data.checks.suite import examine, require
     from deal_hw.data.importing.grid import common_period
     from deal_hw.sim.mjcf.describe import sampling
 

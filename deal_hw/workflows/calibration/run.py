@@ -141,8 +141,8 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays, target_changes
         from deal_hw.calib.data.noise import SMOOTHING_S
         from deal_hw.calib.data.problem import Problem
+        from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.pipeline.methods import make_method
-        from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.validation.checks import latency_alarms
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:

@@ -19,8 +19,8 @@ from deal_hw.calib.pipeline.methods import (
     with_search,
 )
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
+from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.data.files import dataset_of
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
@@ -85,7 +85,7 @@ class Recordings(Checked):
     per sampling period."""
 
     force: bool = False
-    """Use recordings although a plausibility check failed."""
+    """Use recordings although a check of them failed."""
 
 
 OF_DATASETS = ("episodes", "space", "sample_hz")

@@ -16,6 +16,7 @@ from deal_hw.robots import (
     make_topic_transport,
     on_this_computer,
     other_wires,
+    plug_ins,
     reached_over,
 )
 from deal_hw.transport import WireOptions
@@ -106,6 +107,7 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
 
     name = _transport(config)
     yield from examine_machine()
+    yield from list_plug_ins()
     yield from list_adapters()
     yield from judge_interfaces(config.port)
     if not config.robot:
@@ -154,6 +156,15 @@ def _transport(config: DoctorSettings) -> str:
     if config.simulator != "none":
         refuse(given(config, default, ("state_check",)), f"{config.simulator} has no checksums")
     return name
+
+
+def list_plug_ins() -> Iterator[Finding]:
+    """Yield the installed plug-ins, and why those are left out that cannot be used."""
+    for one in plug_ins():
+        if one.problem:
+            yield Finding("plug-ins", Severity.WARN, one.problem)
+        else:
+            yield Finding("plug-ins", Severity.OK, f"{one.kind} {one.name} ({one.origin})")
 
 
 def judge_interfaces(port: str) -> Iterator[Finding]:
