@@ -14,8 +14,9 @@ from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.robots import robot_entry
 from deal_hw.testing.plain_robots import make_robot, write
-from deal_hw.workflows.robot import described, load_robot
+from deal_hw.workflows.robot import described, entry_of, load_robot
 from deal_hw.workflows.running.supervised import InterruptedRunError
 
 
@@ -49,6 +50,15 @@ def test_from_two_files_to_an_inspected_calibration(made: Path, capsys: pytest.C
     shown = deal_hw.inspect(episode, calibration=made / "run" / "calibration")
     nominal, calibrated = (sum(v for v in row.values() if isinstance(v, float)) for row in shown.rows())
     assert shown.description.name == "swing" and calibrated < nominal
+
+
+def test_files_and_names_become_entries_of_one_type(made: Path) -> None:
+    """A robot.yaml and a dataset's robot have no wires; they are simulated and calibrated as any other."""
+    for robot in (made / "robot.yaml", made / "run" / "dataset"):
+        entry = entry_of(str(robot))
+        assert (entry.recorded_description().name, entry.driven) == ("swing", False)
+        assert len(entry.parameter_spaces()["default"]()) > 0
+    assert entry_of("cartpole") is robot_entry("cartpole")
 
 
 CART = """<mujoco model="cart"><option timestep="0.002" integrator="implicitfast"/><worldbody>

@@ -94,7 +94,7 @@ def run_simulated(
     try:
         from deal_hw.data.recording.dataset import Dataset
         from deal_hw.sim.engine.model import load_model
-        from deal_hw.sim.robots.carried import carry
+        from deal_hw.sim.robots.dataset_robot import store_robot
         from deal_hw.sim.robots.simulated import SimulatedRobot, draw_truth
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "sim") from err
@@ -108,7 +108,7 @@ def run_simulated(
     make_behaviour(plan, description)
     reports: list[EpisodeReport] = []
     with Dataset.create_or_open(dataset, description, view.warn) as store:
-        carry(own, dataset)
+        store_robot(own, dataset)
 
         def run_one(episode: RunPlan, number: int, attempt: int) -> EpisodeReport:
             clock = VirtualClock(_START_NS)
