@@ -21,6 +21,7 @@ from verb_options import Option, kind_of, options
 
 from deal_hw.cli.main import VERBS, main, parse
 from deal_hw.errors import DealHwError
+from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import robot_entry
 from deal_hw.workflows.emulation import cartpole as emulated_cartpole
 from deal_hw.workflows.emulation import go2 as emulated_go2
@@ -262,7 +263,8 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         return enter
 
-    # The model is the test's own: it needs no process that tries it first.
+    # The model is the test's own, and a shipped policy sound: neither needs a process that tries it first.
+    monkeypatch.setattr("deal_hw.policies.trial.check_policy", lambda path, _: OnnxPolicy(path))
     monkeypatch.setattr("deal_hw.sim.engine.compiling._try", lambda path: None)
     experiment = types.SimpleNamespace(afresh=note("afresh"), space=None, refused=0)
     demos = [importlib.import_module(f"deal_hw.cli.demo_{robot}") for robot in ("cartpole", "go2")]

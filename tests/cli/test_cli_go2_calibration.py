@@ -131,6 +131,7 @@ def test_hidden_gains_and_latency_are_found_over_the_wire(
     assert 0.0055 <= result.latency_s <= 0.0075
 
 
+@pytest.mark.slow
 def test_held_out_motion_is_predicted_four_times_better(calibrated: CalibrateReport) -> None:
     """The chirp was not fitted."""
     rmse = calibrated.result.provenance["heldout_rmse"]["mean"]
