@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.cli.bench import Bench, bench
+from deal_hw.bench.settings import Real
+from deal_hw.cli.bench import bench
 from deal_hw.cli.main import main
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.settings import Recordings
@@ -57,11 +58,10 @@ def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
 ) -> None:
     """The rows say who fitted, how far off unseen motion is predicted, and what ended at a bound."""
     out = tmp_path / "real.json"
-    settings = Bench(
-        bench="real",
+    settings = Real(
         recordings=hinge,
-        methods="nominal,default",
-        seeds="0",
+        methods=("nominal", "default"),
+        seeds=(0,),
         out=out,
         heldout_window=0.5,
         population=30,
@@ -98,4 +98,4 @@ def test_a_dataset_that_carries_its_robot(hinge: Recordings, tmp_path: Path) -> 
 def test_recordings_must_be_named(tmp_path: Path) -> None:
     """Without a model the error says what to give."""
     with pytest.raises(ConfigurationError, match="--model"):
-        bench(Bench(bench="real", out=tmp_path / "real.json"))
+        bench(Real(out=tmp_path / "real.json"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib
 import json
@@ -200,6 +201,10 @@ def told(value: Any) -> str:
         return str([told(one) for one in value])
     if isinstance(value, mujoco.MjModel):
         return f"MjModel {value.opt.timestep} {value.nq}"
+    if isinstance(value, functools.partial):
+        return f"{told(value.func)} {told(value.args)} {told(value.keywords)}"
+    if closure := getattr(value, "__closure__", None):
+        return f"{value.__qualname__} {[told(cell.cell_contents) for cell in closure]}"
     if callable(value):
         return getattr(value, "__qualname__", type(value).__name__)
     if type(value).__module__.startswith("deal_hw"):
@@ -290,10 +295,6 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     patch("deal_hw.calib.design.excitation_search.search_excitation")
     monkeypatch.setattr("deal_hw.calib.design.experiment_design.Experiment", note("experiment", experiment))
     patch("deal_hw.cli.bridge.Go2Bridge")
-    for bench in ("loop", "go2_loop", "transfer", "speed", "first_answer", "real"):
-        monkeypatch.setattr(f"deal_hw.bench.{bench}.cells", note(f"{bench}.cells"))
-    monkeypatch.setattr("deal_hw.bench.calibration.cells", note("calibration"))
-    monkeypatch.setattr("deal_hw.bench.verdict.table", note("verdict"))
     patch("deal_hw.bench.rows.run_cells")
     emulator = types.SimpleNamespace(
         open=lambda: "port", close=lambda: None, changes=[], report=lambda: {}, slips=0, dropped=0

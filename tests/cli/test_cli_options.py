@@ -27,6 +27,7 @@ DOUBTFUL: tuple[float, ...] = (-1, 0, 1e-300, 2**63)
 FINE_AT_ZERO = {
     "node",
     "seed",
+    "seeds",
     "episodes",
     "holdout",
     "web_port",
@@ -81,7 +82,6 @@ REQUIRED: dict[str, Any] = {
     "paths": (Path("p"),),
     "path": Path("p"),
     "episode": Path("e"),
-    "bench": "loop",
     "dataset": Path("d"),
     "folder": Path("f"),
     "name": "n",
@@ -270,7 +270,6 @@ def test_words_that_do_not_parse_get_one_line(
         ("design-excitation cartpole --out o --amplitude 0.5", "--amplitude"),
         ("design-excitation cartpole --out o --family steps --draws 3", "--draws"),
         ("inspect e --web-port 1234", "--web-port"),
-        ("bench loop --model m.xml", "--model"),
     ],
 )
 def test_an_option_without_effect_is_refused(line: str, option: str) -> None:
@@ -340,7 +339,7 @@ def test_what_is_on_by_default_has_two_flags(
     assert "--no-quiet" not in page and "None" not in page and "(default: )" not in page
 
 
-@pytest.mark.parametrize("verb", ["collect", "deploy", "replay", "doctor", "emulate", "demo", "bench"])
+@pytest.mark.parametrize("verb", ["collect", "deploy", "replay", "doctor", "emulate", "demo"])
 def test_a_help_page_shows_what_the_named_robot_takes(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Options of others appear where one of them is named, and without a name it is said which there are."""
     marked: dict[str, tuple[str, ...]] = {}
