@@ -67,7 +67,7 @@ arm-tools: ## install gcc-arm-none-eabi and qemu-system-arm (60 MB to fetch, 490
 	@tools/install_arm_tools.sh
 
 # The file and not the module: the package around it needs numpy, and a board needs no environment of 3 GB.
-BUILD_FIRMWARE := PYTHONPATH=. $(PYTHON) drivers/cartpole/native.py
+BUILD_FIRMWARE := PYTHONPATH=. $(PYTHON) drivers/cartpole/chips/native.py
 firmware: avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
 	@$(BUILD_FIRMWARE) avr build/firmware
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.findings import Finding
 from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.reading import number, numbers, object_of, read_json, reading, texts
 from deal_hw.schema import from_values
@@ -79,32 +80,6 @@ class Budget:
     brief: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """A reason to distrust a result.
-
-    Attributes:
-        seen: What was seen, with its number and unit.
-        means: What it means.
-        do: What to do.
-    """
-
-    seen: str
-    means: str
-    do: str
-
-    def __post_init__(self) -> None:
-        """Check that no part is missing."""
-        if not all(part.strip() for part in (self.seen, self.means, self.do)):
-            raise ValueError(
-                f"an alarm has three parts: what was seen, what it means, what to do; got {self!r}"
-            )
-
-    def __str__(self) -> str:
-        """Return the three parts in one line."""
-        return f"{self.seen} {self.means} {self.do}"
-
-
 def percent(share: float) -> str:
     """Return a share as text, in percent with two digits, or as a whole number from 100 on."""
     value = 100 * share
@@ -163,7 +138,7 @@ class CalibrationResult:
     latency_s: float = 0.0
     latency_interval_s: tuple[float, float] = (0.0, 0.0)
     chi2: float = float("nan")
-    alarms: tuple[Alarm, ...] = ()
+    alarms: tuple[Finding, ...] = ()
     biased: Mapping[str, str] = field(default_factory=dict)
     advice: Sequence[Mapping[str, Any]] = ()
     heldout_nrmse: Mapping[str, float] = field(default_factory=dict)
@@ -232,7 +207,7 @@ class CalibrationResult:
             "latency_s": self.latency_s,
             "latency_interval_s": list(self.latency_interval_s),
             "chi2": self.chi2,
-            "alarms": [asdict(alarm) for alarm in self.alarms],
+            "alarms": [{"seen": a.seen, "means": a.means, "do": a.do} for a in self.alarms],
             "biased": dict(self.biased),
             "advice": [dict(row) for row in self.advice],
             "heldout_nrmse": dict(self.heldout_nrmse),
@@ -274,7 +249,7 @@ class CalibrationResult:
             latency_s=number(values["latency_s"], "latency_s", 0.0, LONGEST_LATENCY_S),
             latency_interval_s=(float(low_s), float(high_s)),
             chi2=float(numbers(values["chi2"], "chi2", (), finite=False)),
-            alarms=tuple(from_values(dict[str, list[Alarm]], {"alarms": values["alarms"]})["alarms"]),
+            alarms=_alarms(values["alarms"]),
             biased=from_values(dict[str, dict[str, str]], {"biased": values.get("biased", {})})["biased"],
             advice=tuple(object_of(row, "advice") for row in values.get("advice", ())),
             heldout_nrmse={
@@ -285,6 +260,20 @@ class CalibrationResult:
             seconds=number(values["seconds"], "seconds", 0.0),
             provenance=object_of(values["provenance"], "provenance"),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _AlarmText:
+    """An alarm as result.json has it."""
+
+    seen: str
+    means: str
+    do: str
+
+
+def _alarms(values: Any) -> tuple[Finding, ...]:
+    found = from_values(dict[str, list[_AlarmText]], {"alarms": values})["alarms"]
+    return tuple(Finding.alarm(a.seen, a.means, a.do) for a in found)
 
 
 def read_result(path: Path) -> CalibrationResult:

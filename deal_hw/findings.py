@@ -1,14 +1,14 @@
-"""Findings of checks, each with its remedy."""
+"""What a check found: of a computer, a robot, a recording or a calibration."""
 
 from __future__ import annotations
 
 import enum
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 
-class Level(enum.Enum):
-    """Severity of a finding."""
+class Severity(str, enum.Enum):
+    """Severity of a finding, the least first."""
 
     OK = "ok"
     NOTE = "note"
@@ -16,30 +16,67 @@ class Level(enum.Enum):
     WARN = "warn"
     """Works, but not as well as possible."""
     FAIL = "fail"
-    """Does not work."""
+    """Does not work, or cannot be used."""
+
+    def __str__(self) -> str:
+        """Return the value, as for a plain text."""
+        return str(self.value)
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding.
+    """One finding. Documents have their own shapes of it: each writer chooses the keys.
 
     Attributes:
-        area: The checked area, such as "scheduling".
-        level: Its severity.
-        message: The finding, one sentence.
-        remedy: What to do; "" if nothing is wrong.
+        code: What was checked or suspected, such as "scheduling", "gaps" or "backlash"; "" for an alarm
+            without a name.
+        severity: Its severity.
+        seen: What was seen, with numbers and units.
+        do: What to do; "" if nothing is wrong.
+        means: What it means; "" where that is plain.
+        subject: What it is about, such as joints, the clearest first.
     """
 
-    area: str
-    level: Level
-    message: str
-    remedy: str = ""
+    code: str
+    severity: Severity
+    seen: str
+    do: str = ""
+    means: str = ""
+    subject: tuple[str, ...] = ()
 
     @classmethod
-    def judged(cls, area: str, wrong: bool, message: str, remedy: str) -> Finding:
-        """Return a warning with its remedy where something is wrong, else the same message as OK."""
-        return cls(area, Level.WARN, message, remedy) if wrong else cls(area, Level.OK, message)
+    def judged(cls, code: str, wrong: bool, seen: str, do: str) -> Finding:
+        """Return a warning with its remedy where something is wrong, else the same sentence as OK."""
+        return cls(code, Severity.WARN, seen, do) if wrong else cls(code, Severity.OK, seen)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {**asdict(self), "level": self.level.value}
+    @classmethod
+    def alarm(cls, seen: str, means: str, do: str) -> Finding:
+        """Return a reason to distrust a result.
+
+        Raises:
+            ValueError: One of the three parts is missing.
+        """
+        if not all(part.strip() for part in (seen, means, do)):
+            raise ValueError(
+                "an alarm has three parts: what was seen, what it means, what to do; "
+                f"got {(seen, means, do)!r}"
+            )
+        return cls("", Severity.WARN, seen, do, means)
+
+    @property
+    def message(self) -> str:
+        """All its parts in one line."""
+        text = self.seen
+        for part in filter(None, (self.means, self.do)):
+            text += f" {part}" if text.endswith(".") else f"; {part}"
+        return text
+
+    def __str__(self) -> str:
+        """Return all its parts in one line."""
+        return self.message
+
+
+def worst(findings: Sequence[Finding]) -> Severity:
+    """Return the worst severity; that of no finding is OK."""
+    order = list(Severity)
+    return max((finding.severity for finding in findings), key=order.index, default=Severity.OK)

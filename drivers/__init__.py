@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from deal_hw.drivers.go2.claim import WireClaim
 
 ROBOTS: Final = {
-    "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
+    "cartpole": "deal_hw.drivers.cartpole.robots.robot:CartpoleRobot",
     "go2": "deal_hw.drivers.go2.robot:Go2Robot",
     "go2_on_stand": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
 }
@@ -66,8 +66,8 @@ WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """The fields of :class:`~deal_hw.transport.WireOptions` that each transport takes."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
-    ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
-    ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
+    ("cartpole", "can"): "deal_hw.drivers.cartpole.robots.can_robot:can_robot",
+    ("cartpole", "odrive"): "deal_hw.drivers.cartpole.robots.odrive_robot:odrive_robot",
     ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.connect:dynamixel_robot",
 }
 """Robots with another driver on one wire than in :data:`ROBOTS`, (robot, wire) -> "module:function".
@@ -80,8 +80,8 @@ SIMULATED: Final[Mapping[tuple[str, str], str]] = {
 }
 """Drivers for a third-party simulator in place of a robot, (robot, simulator) -> "module:class"."""
 CAN_BUSES: Final[Mapping[str, str]] = {
-    "can": "deal_hw.drivers.cartpole.can_robot:can_bus",
-    "odrive": "deal_hw.drivers.cartpole.odrive_robot:odrive_bus",
+    "can": "deal_hw.drivers.cartpole.robots.can_robot:can_bus",
+    "odrive": "deal_hw.drivers.cartpole.robots.odrive_robot:odrive_bus",
 }
 """Transports over a CAN bus -> function that returns a port's bus and nodes."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {

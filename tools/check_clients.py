@@ -39,15 +39,15 @@ from clients.programs import CLIENTS, Client
 from dynamixel_sdk import PacketHandler, PortHandler
 from measuring import parser
 
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
-from deal_hw.drivers.cartpole.odrive_endpoints import flat_endpoints
-from deal_hw.drivers.cartpole.odrive_frames import (
+from deal_hw.drivers.cartpole.emulator.odrive_endpoints import flat_endpoints
+from deal_hw.drivers.cartpole.wire.odrive_frames import (
     LAYOUT,
     PASSTHROUGH,
     POSITION_CONTROL,
     VELOCITY_CONTROL,
     Command,
 )
+from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
 from deal_hw.errors import TransportError
 from deal_hw.workflows.emulation.process import EmulatorProcess
 

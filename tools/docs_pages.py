@@ -28,6 +28,8 @@ if str(Path(__file__).parent) not in sys.path:  # mkdocs loads a hook by its pat
 
 from refusals import EXIT_ERROR, Refusal, refusals, words
 
+from deal_hw.workflows.kinds import Kinds
+
 ROOT = Path(__file__).resolve().parents[1]
 ALARM_FOLDERS = ("calib", "deal_hw")
 
@@ -115,15 +117,6 @@ def options(parser: argparse.ArgumentParser) -> Sections:
     return sections
 
 
-def sub_verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """Return the parsers of a verb's sub-verbs."""
-    found: dict[str, argparse.ArgumentParser] = {}
-    for action in parser._actions:
-        if type(action).__name__ == "_SubParsersAction":
-            found |= cast("dict[str, argparse.ArgumentParser]", action.choices)
-    return found
-
-
 def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
     """Return the parser of a dataclass of settings, as the command line builds it."""
     import tyro
@@ -138,7 +131,7 @@ def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
 
 
 def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
-    """Yield the lines of a verb: purpose, options, then its sub-verbs."""
+    """Yield the lines of a verb, or of a kind of its input: purpose, options."""
     for paragraph in re.split(r"\n\s*\n", (parser.description or "").strip()):
         yield from (cell(paragraph), "")
     for title, rows in options(parser).items():
@@ -150,9 +143,6 @@ def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
             for name, text, default in rows
         )
         yield ""
-    for name, sub in sub_verbs(parser).items():
-        yield from (f"{'#' * (level + 1)} {parser.prog} {name}", "")
-        yield from describe(sub, level + 1)
 
 
 def cli_page() -> str:
@@ -184,7 +174,13 @@ def cli_page() -> str:
     for name, verb in main.VERBS.items():
         settings = getattr(importlib.import_module(verb.module), verb.config)
         lines += [f"## deal-hw {name}", "", f"    deal-hw {verb.example}", ""]
-        lines += describe(verb_parser(settings, f"deal-hw {name}"), 2)
+        if not isinstance(settings, Kinds):
+            lines += describe(verb_parser(settings, f"deal-hw {name}"), 2)
+            continue
+        lines += [cell(f"{verb.help[:1].upper()}{verb.help[1:]}."), ""]
+        for types, kinds in itertools.groupby(settings.table().items(), key=lambda item: item[1].settings):
+            usages = [f"deal-hw {name} {kind.usage or word}".rstrip() for word, kind in kinds]
+            lines += [f"### {', '.join(usages)}", "", *describe(verb_parser(types, usages[0]), 3)]
     return "\n".join(lines)
 
 
@@ -213,9 +209,14 @@ def api_pages() -> dict[str, str]:
         for name in names:
             lines += reference(full[name], f"deal_hw.{name}")
             settings = getattr(getattr(deal_hw, name), "settings", None)
-            if isinstance(settings, type):
-                heading = f"Arguments of deal_hw.{name}"
-                lines += reference(f"{settings.__module__}.{settings.__qualname__}", heading, inherited=True)
+            heading = f"Arguments of deal_hw.{name}"
+            of_kinds: dict[type[Any], list[str]] = {settings: []} if isinstance(settings, type) else {}
+            if isinstance(settings, Kinds):
+                for word, kind in settings.table().items():
+                    of_kinds.setdefault(kind.settings, []).append(f'"{word}"')
+            for one, robots in of_kinds.items():
+                of_robots = f"{heading}: {', '.join(robots)}" if robots else heading
+                lines += reference(f"{one.__module__}.{one.__qualname__}", of_robots, inherited=True)
         found[api_place(title)] = "\n".join(lines)
     for title, modules in API_MODULES.items():
         lines = [f"# {title}", "", "[All pages of the API](api.md)", ""]
@@ -305,7 +306,7 @@ def alarms() -> list[tuple[str, ...]]:
     for folder in ALARM_FOLDERS:
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Alarm" and node.args:
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding.alarm" and node.args:
                     parts = [shortened(words(part)) for part in node.args]
                     # An alarm without a text of its own is copied from a file or from the table of causes.
                     if parts[0].strip("…"):

@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, CanLink
-from deal_hw.drivers.cartpole.controller import Firmware, Mode
-from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, HostFirmware, Settings
-from deal_hw.drivers.cartpole.protocol import Target
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.servo import Servo
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.controller import Firmware, Mode
+from deal_hw.drivers.cartpole.chips.host_firmware import CanHostFirmware, HostFirmware, Settings
+from deal_hw.drivers.cartpole.chips.servo import Servo
+from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, CanLink
+from deal_hw.drivers.cartpole.wire.protocol import Target
 
 Wire = tuple[Callable[[protocol.AnyMessage], bytes], Callable[[bytes], bytes]]
 """How a message is written, and 20 random bytes as what no host sends."""

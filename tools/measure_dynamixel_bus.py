@@ -23,10 +23,10 @@ from measuring import Rows, spread
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
-from deal_hw.drivers.cartpole.dynamixel.bus import Bus
 from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
-from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BYTES
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.registers import BLOCK_ADDRESS, BLOCK_BYTES
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import FrameError, TransportTimeoutError
 from deal_hw.workflows.emulation.process import EmulatorProcess

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from measuring import markdown
 
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.avr_device import Chip, eeprom
-from deal_hw.drivers.cartpole.host_firmware import Settings
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.avr_device import Chip, eeprom
+from deal_hw.drivers.cartpole.chips.host_firmware import Settings
+from deal_hw.drivers.cartpole.wire import protocol
 
 CYCLES_PER_TICK = 16_000
 

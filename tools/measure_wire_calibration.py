@@ -36,20 +36,20 @@ from measuring import Rows, add_seeds, parser, read_rows
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.drivers.cartpole.avr_device import AvrDevice
-from deal_hw.drivers.cartpole.can_emulator import can_device
-from deal_hw.drivers.cartpole.can_link import CanLink
+from deal_hw.drivers.cartpole.chips.avr_device import AvrDevice
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.odrive_emulator import odrive_device
-from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
-from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
-from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.emulator.can_emulator import can_device
+from deal_hw.drivers.cartpole.emulator.odrive_emulator import odrive_device
+from deal_hw.drivers.cartpole.emulator.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.robots.odrive_robot import OdriveRobot
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire.can_link import CanLink
+from deal_hw.drivers.cartpole.wire.odrive_link import OdriveSettings
 from deal_hw.errors import DealHwError, InsufficientDataError, UnknownNameError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps

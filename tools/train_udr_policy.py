@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.policies.demonstration import BatchPolicy
 from deal_hw.policies.evaluate import evaluate_batch
 from deal_hw.workflows.train import train_policy, udr_distribution

@@ -11,6 +11,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from deal_hw.cli.arguments import CommandLine, options_of
+from deal_hw.workflows.kinds import Kinds
+from deal_hw.workflows.options import FROM_PYTHON
+
 SEVERAL = (Annotated, UnionType, typing.Union)
 
 
@@ -34,8 +38,11 @@ class Option:
 
 def dataclasses_of(hint: Any) -> Iterator[type[Any]]:
     """Yield the dataclasses in a type, those inside them included, but none that no option reaches."""
-    if typing.get_origin(hint) in SEVERAL:
-        if tyro.conf.Suppress not in typing.get_args(hint)[1:]:
+    if isinstance(hint, Kinds):
+        for kind in hint.table().values():
+            yield from dataclasses_of(kind.settings)
+    elif typing.get_origin(hint) in SEVERAL:
+        if not {tyro.conf.Suppress, FROM_PYTHON} & set(typing.get_args(hint)[1:]):
             for part in typing.get_args(hint):
                 yield from dataclasses_of(part)
     elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
@@ -44,12 +51,12 @@ def dataclasses_of(hint: Any) -> Iterator[type[Any]]:
             yield from dataclasses_of(inner)
 
 
-def sub_verb(config: Any, name: str) -> Any:
-    """Return the settings of a verb's sub-verb; of a verb without sub-verbs its own."""
-    for part in typing.get_args(config) if typing.get_origin(config) in SEVERAL else ():
-        if any(getattr(mark, "name", "") == name for mark in typing.get_args(part)[1:]):
-            return part
-    return config
+def kind_of(config: Any, *words: str) -> Any:
+    """Return the settings that words behind a verb are for: those of a kind, or the only ones."""
+    if not isinstance(config, Kinds):
+        return config
+    every = [one for kind in config.table().values() for one in options_of(kind.settings).values()]
+    return config.choose(CommandLine(words, every).arguments)[1].settings
 
 
 def options(config: Any, values: Mapping[str, tuple[str, ...]]) -> Iterator[Option]:
@@ -62,25 +69,21 @@ def options(config: Any, values: Mapping[str, tuple[str, ...]]) -> Iterator[Opti
     Raises:
         KeyError: Such an option has no value.
     """
-    for settings in dataclasses_of(config):
-        hints = typing.get_type_hints(settings, include_extras=True)
-        for entry in dataclasses.fields(settings):
-            hint = hints[entry.name]
-            marks = typing.get_args(hint)[1:] if typing.get_origin(hint) is Annotated else ()
-            kinds = set(_kinds(hint))
-            if any(dataclasses.is_dataclass(kind) for kind in kinds) or tyro.conf.Positional in marks:
+    for settings in dict.fromkeys(dataclasses_of(config)):
+        defaults = {entry.name: entry.default for entry in dataclasses.fields(settings)}
+        for one in options_of(settings).values():
+            if one.positional or one.owner is not settings:
                 continue
-            flag = Option(entry.name, ()).flag
-            words = values.get(entry.name)
-            if words is None and kinds == {bool}:
-                yield Option(entry.name, (f"--no-{flag[2:]}" if entry.default is True else flag,))
+            words = values.get(one.name)
+            if words is None and one.values == 0:
+                yield Option(one.name, one.flags[-1:])
                 continue
             if words is None:
-                words = _other(entry.default, kinds)
+                words = _other(defaults[one.name], set(one.kinds))
             if words is None:
-                raise KeyError(f"{settings.__name__}.{entry.name} has no value to try")
+                raise KeyError(f"{settings.__name__}.{one.name} has no value to try")
             if words:
-                yield Option(entry.name, (flag, *words))
+                yield Option(one.name, (one.flags[0], *words))
 
 
 def _other(default: Any, kinds: set[Any]) -> tuple[str, ...] | None:
@@ -91,14 +94,3 @@ def _other(default: Any, kinds: set[Any]) -> tuple[str, ...] | None:
     if kinds <= {int, float, NoneType}:
         return ("2.5",) if float in kinds else ("2",)
     return None
-
-
-def _kinds(hint: Any) -> Iterator[Any]:
-    origin = typing.get_origin(hint)
-    if origin is Annotated:
-        yield from _kinds(typing.get_args(hint)[0])
-    elif origin in SEVERAL:
-        for part in typing.get_args(hint):
-            yield from _kinds(part)
-    else:
-        yield hint

@@ -20,7 +20,8 @@ from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calibration import Z90, Alarm, CalibrationResult
+from deal_hw.calibration import Z90, CalibrationResult
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 
@@ -219,7 +220,7 @@ class _Passes(Stepper):
         alarms = []
         if not self._misfit < self.settings.diverged:
             alarms.append(
-                Alarm(
+                Finding.alarm(
                     f"The filter's innovations are {self._misfit:.1f} times their own variance.",
                     "The filter diverged: its covariance is not valid.",
                     "Use another method, or narrower ranges (--range NAME LOW HIGH).",

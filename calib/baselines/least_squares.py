@@ -29,8 +29,9 @@ from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_er
 from deal_hw.calib.fit.residual import DIFFERENCES
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
+from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
@@ -74,7 +75,7 @@ class FittedStart:
     message: str
     source: str
     steps: int = 0
-    alarms: tuple[Alarm, ...] = ()
+    alarms: tuple[Finding, ...] = ()
     interval: FloatArray | None = None
 
 
@@ -137,9 +138,8 @@ class OneShot(Stepper):
         """Continue from a saved state."""
         saved = state["found"]
         if saved is not None:
-            self._found = FittedStart(
-                **{**saved, "alarms": tuple(Alarm(**alarm) for alarm in saved["alarms"])}
-            )
+            alarms = (Finding.alarm(a["seen"], a["means"], a["do"]) for a in saved["alarms"])
+            self._found = FittedStart(**{**saved, "alarms": tuple(alarms)})
 
 
 class OneShotSearch(Search, abc.ABC):
@@ -335,8 +335,8 @@ class MultiStartLeastSquares(OneShotSearch):
         )
 
 
-def _unfinished(iterations: int) -> Alarm:
-    return Alarm(
+def _unfinished(iterations: int) -> Finding:
+    return Finding.alarm(
         f"The fit had not converged after {iterations} iterations.",
         "Its values may still be far from those that fit best.",
         "Allow more (--generations).",

@@ -10,7 +10,8 @@ import numpy as np
 from deal_hw.calib.data.innovations import Members, explained
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.fitness import FitnessSettings, make_fitness
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})
@@ -63,7 +64,7 @@ class ScoredStepper(Stepper):
         centre, population = self.found()
         scored = sum(row["scored"] for row in self.log.trace)
         lost = sum(row["diverged"] for row in self.log.trace)
-        alarm = Alarm(
+        alarm = Finding.alarm(
             f"{lost:.0f} of {scored:.0f} members diverged and had no score.",
             "Simulations diverge over much of the search range, and nothing was searched there.",
             "Narrow the ranges (--range NAME LOW HIGH), or shorten the physics step.",

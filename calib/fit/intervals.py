@@ -19,7 +19,8 @@ from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
-from deal_hw.calibration import EXPLAINED_CHI2, Z90, Alarm, Identifiability, listed
+from deal_hw.calibration import EXPLAINED_CHI2, Z90, Identifiability, listed
+from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import find_kind
 from deal_hw.types import FloatArray
@@ -121,7 +122,7 @@ class Uncertainty:
     interval: FloatArray
     latency_interval_s: tuple[float, float]
     null_directions: tuple[str, ...]
-    alarms: tuple[Alarm, ...]
+    alarms: tuple[Finding, ...]
     inflation: float
     blind: npt.NDArray[np.bool_]
     bound: npt.NDArray[np.int64]
@@ -144,7 +145,7 @@ class Uncertainty:
                 found.append("weak" if std <= SETTINGS.weak_share * prior_std[k] else "not identifiable")
         return tuple(found)
 
-    def with_alarms(self, *first: Alarm, last: Sequence[Alarm] = ()) -> Uncertainty:
+    def with_alarms(self, *first: Finding, last: Sequence[Finding] = ()) -> Uncertainty:
         """Return it with more alarms, before and after its own."""
         return dataclasses.replace(self, alarms=(*first, *self.alarms, *last))
 
@@ -353,11 +354,11 @@ def _alarms(
     least_tau: float,
     timing_std_s: float,
     pressed: npt.NDArray[np.bool_],
-) -> tuple[Alarm, ...]:
+) -> tuple[Finding, ...]:
     alarms = []
     if timing_std_s >= MISMATCH.least_jitter_s:
         alarms.append(
-            Alarm(
+            Finding.alarm(
                 f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
                 "The model's delay is constant: if commands jitter too, the intervals are too narrow.",
                 "Record over a connection with less jitter, or with the device's own time stamps.",
@@ -367,7 +368,7 @@ def _alarms(
         alarms.append(mismatch(chi2))
     if chi2 > MISMATCH.negligible_chi2 and least_tau > MISMATCH.correlation_samples:
         alarms.append(
-            Alarm(
+            Finding.alarm(
                 f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
                 "The robot has something that the model lacks: a friction law, backlash or a varying delay.",
                 "Free a parameter for it (--parameters) or repair the hardware; trust predictions more than "
@@ -390,7 +391,7 @@ def _alarms(
         ]
         if names:
             alarms.append(
-                Alarm(
+                Finding.alarm(
                     f"Ended at the bound of the search range: {listed(names)}.",
                     means,
                     "Widen the range (--range NAME LOW HIGH) if such a value is possible, or check the "
@@ -400,9 +401,9 @@ def _alarms(
     return tuple(alarms)
 
 
-def mismatch(chi2: float, window: str = "") -> Alarm:
+def mismatch(chi2: float, window: str = "") -> Finding:
     """Return the alarm of residuals above the sensors' noise; ``window`` names the windows."""
-    return Alarm(
+    return Finding.alarm(
         f"Residuals are {np.sqrt(chi2):.1f} times the sensor's noise{window}.",
         "The model does not explain the recording: it lacks something that the robot has (a friction law, "
         "backlash, a varying delay), or a range is too narrow. The intervals count all of it as noise.",

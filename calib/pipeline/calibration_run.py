@@ -16,14 +16,8 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.wider_models import WiderFit
-from deal_hw.calibration import (
-    BEFORE_SEARCH,
-    Alarm,
-    Budget,
-    CalibrationResult,
-    Progress,
-    ProgressCallback,
-)
+from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
@@ -55,7 +49,7 @@ class FitOutcome:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def but(
-        self, *first: Alarm, last: Sequence[Alarm] = (), chi2: float | None = None, **facts: Any
+        self, *first: Finding, last: Sequence[Finding] = (), chi2: float | None = None, **facts: Any
     ) -> FitOutcome:
         """Return it with more alarms, before and after its own, and with more facts."""
         chi2 = self.chi2 if chi2 is None else chi2

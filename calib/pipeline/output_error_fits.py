@@ -47,6 +47,7 @@ from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.no_data import nominal
+from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import (
     HALVES,
     SplitHalf,
@@ -64,7 +65,7 @@ from deal_hw.calib.validation.cross_validation import (
     on_folds,
     time_masks,
 )
-from deal_hw.calib.validation.diagnosis import Diagnosis, diagnose
+from deal_hw.calib.validation.diagnosis import diagnose
 from deal_hw.calibration import Z90, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode

@@ -44,15 +44,15 @@ from deal_hw.calib.pipeline.calibration_run import (
     FitOutcome,
 )
 from deal_hw.calib.search.resume import Restarts
+from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
-from deal_hw.calib.validation.diagnosis import PLAY, Diagnosis, find_play, fit_play
+from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.time_steps import STEP, averaged, check_step, halved, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     EXPLAINED_CHI2,
-    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -61,6 +61,7 @@ from deal_hw.calibration import (
     StateStore,
     listed,
 )
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 
@@ -391,7 +392,7 @@ def conclude_fit(
         known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
-        known = known.with_alarms(cause.alarm)
+        known = known.with_alarms(cause)
         checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
     facts: dict[str, Any] = {
         "restarts": restarts,
@@ -420,7 +421,7 @@ def conclude_fit(
 def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
     """Return random delays of commands as a cause of the residual, which the fit has allowed for."""
     found = late.found
-    alarm = Alarm(
+    alarm = Finding.alarm(
         f"Each command acts after its own delay: {1e3 * latency_s:.3g} ms on average, with a standard "
         f"deviation of {1e3 * found.std_s:.2g} ms.",
         "The latency is their mean. Each command's own delay was an unknown of the fit, so the intervals "
@@ -428,7 +429,7 @@ def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
         "To measure more exactly: end other programs on the computer that sends, send at an even pace, or "
         "time-stamp commands where they are received.",
     )
-    return Diagnosis("delay", found.share, found.deviance, (), alarm)
+    return Diagnosis.of("delay", found.share, found.deviance, (), alarm)
 
 
 def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
@@ -460,9 +461,9 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     fit = refined_from(wide, play.theta, play.latency_s)
     if not conclusive(play.problem, fit):
         return None
-    added = play.problem.space.names[-len(play.diagnosis.joints) :]
+    added = play.problem.space.names[-len(play.diagnosis.subject) :]
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
-    alarm = dataclasses.replace(play.diagnosis.alarm, do=do)
+    alarm = dataclasses.replace(play.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
     return conclude_fit(wide, None, fit).but(alarm, diagnosis=[play.diagnosis.to_json()])
 

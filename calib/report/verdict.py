@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from deal_hw import calibration
-from deal_hw.calibration import EXPLAINED_CHI2, Alarm, CalibrationResult
+from deal_hw.calibration import EXPLAINED_CHI2, CalibrationResult
+from deal_hw.findings import Finding
 
 Colour = Literal["green", "amber", "red"]
 
@@ -164,9 +165,9 @@ def _first_cause(result: CalibrationResult) -> str:
     return " The first alarm names the likely cause." if result.provenance.get("diagnosis") else ""
 
 
-def grouped(alarms: Sequence[Alarm]) -> list[list[Alarm]]:
+def grouped(alarms: Sequence[Finding]) -> list[list[Finding]]:
     """Return alarms with the same remedy as one group, in the order of their first ones, without doubles."""
-    groups: dict[str, list[Alarm]] = {}
+    groups: dict[str, list[Finding]] = {}
     for alarm in dict.fromkeys(alarms):
         groups.setdefault(alarm.do, []).append(alarm)
     return list(groups.values())

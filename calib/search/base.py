@@ -20,7 +20,6 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.resume import Stateful, restore_generator
 from deal_hw.calibration import (
     Z90,
-    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -28,6 +27,7 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
+from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 
@@ -140,22 +140,22 @@ class SearchLog:
         self._earlier_steps, self._earlier_seconds = state["steps"], state["seconds"]
         self._steps, self._start = self.problem.steps, time.perf_counter()
 
-    def unexplained(self, chi2: float) -> Alarm:
+    def unexplained(self, chi2: float) -> Finding:
         """Return the alarm of a search that left a residual."""
-        return Alarm(
+        return Finding.alarm(
             f"After {len(self.trace)} generations the residual is {chi2:.1f} times its expected variance.",
             "The search ended far from the robot's values, or the model is incomplete.",
             "Refine it, search again (another --seed, more --generations, wider ranges), or check the model.",
         )
 
-    def critic_diverged(self, times: int) -> list[Alarm]:
+    def critic_diverged(self, times: int) -> list[Finding]:
         """Return the alarm of a critic whose training was undone so many times; none for 0."""
         if not times:
             return []
         seen = f"The critic's training diverged in {times} of {len(self.trace)} generations."
         means = "Its last sound weights were used there, and they tell less about the simulators."
         do = "Search again with another --seed, or with --search eki, which has no critic."
-        return [Alarm(seen, means, do)]
+        return [Finding.alarm(seen, means, do)]
 
     def result(
         self,
@@ -163,7 +163,7 @@ class SearchLog:
         population: Members,
         *,
         chi2: float = float("nan"),
-        alarms: Sequence[Alarm] = (),
+        alarms: Sequence[Finding] = (),
         extra: Mapping[str, Any] | None = None,
         **better: Any,
     ) -> CalibrationResult:

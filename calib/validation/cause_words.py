@@ -1,4 +1,4 @@
-"""Words of each cause of a residual: how it looks, what it means, and what to do about it.
+"""Causes of a residual as findings: how each looks, what it means, and what to do about it.
 
 What to do depends on the calibration: a parameter that is searched already is not advised, and one that ended
 at the bound of its range has too narrow a range.
@@ -7,16 +7,70 @@ at the bound of its range has too narrow a range.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import ended_at_bound
 from deal_hw.calib.validation.signatures import Cause
 from deal_hw.calibration import listed
+from deal_hw.findings import Finding
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Diagnosis(Finding):
+    """One cause of the residual: its code is the cause, its subject the joints or bodies that show it.
+
+    Attributes:
+        share: Share of the held-out squared residual that it explains.
+        deviance: Gain in held-out deviance.
+        shift: Change of the estimates where the fit may have this effect, too: of each parameter in its own
+            scale, then of the latency [s], (K + 1,); empty where it was not estimated.
+    """
+
+    share: float
+    deviance: float
+    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(
+        cls,
+        cause: Cause,
+        share: float,
+        deviance: float,
+        joints: Sequence[str],
+        alarm: Finding,
+        shift: FloatArray | None = None,
+    ) -> Diagnosis:
+        """Return the cause that an alarm describes."""
+        return cls(
+            cause,
+            alarm.severity,
+            alarm.seen,
+            alarm.do,
+            alarm.means,
+            tuple(joints),
+            share=float(share),
+            deviance=float(deviance),
+            shift=np.zeros(0) if shift is None else shift,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "cause": self.code,
+            "share": self.share,
+            "deviance": self.deviance,
+            "joints": list(self.subject),
+            "alarm": {"seen": self.seen, "means": self.means, "do": self.do},
+            "shift": self.shift.tolist(),
+        }
+
 
 LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     "friction": (

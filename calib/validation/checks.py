@@ -27,11 +27,13 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.diagnosis import Allows, Diagnosis, all_allowed, diagnose
+from deal_hw.calib.validation.cause_words import Diagnosis
+from deal_hw.calib.validation.diagnosis import Allows, all_allowed, diagnose
 from deal_hw.calib.validation.residual_place import unexplained_alarm
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.wider_models import WiderFit
-from deal_hw.calibration import Z90, Alarm, listed
+from deal_hw.calibration import Z90, listed
+from deal_hw.findings import Finding
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -88,7 +90,7 @@ class Validation:
     """Run checks to their end where they take more physics steps than the fits."""
 
 
-def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
+def latency_alarms(problem: Problem, latency_s: float) -> tuple[Finding, ...]:
     """Return an alarm where a searched latency ended at an end of its range; zero is no such end."""
     if problem.fixed_latency_s is not None:
         return ()
@@ -101,7 +103,7 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
     else:
         return ()
     return (
-        Alarm(
+        Finding.alarm(
             f"The latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "
             f"{1e3 * high:g} ms).",
             f"The robot may act {side} than that; then other parameters compensate for it.",
@@ -219,7 +221,7 @@ def with_causes(
 
     Where there is none, the alarm says so, and where the residual lies.
     """
-    alarms = [f.alarm for f in found[: SETTINGS.causes]]
+    alarms: list[Finding] = list(found[: SETTINGS.causes])
     if not found and refined.chi2 > MISMATCH.chi2:
         alarms = [unexplained_alarm(problem, refined)]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
@@ -241,13 +243,13 @@ def biased(problem: Problem, known: Uncertainty, causes: Sequence[Diagnosis]) ->
     for k, name in enumerate(known.space.names):
         most = int(np.argmax([shift[k] for shift in shifts]))
         if total[k] > Z90 * std[k] or known.bound[k]:
-            marks[name] = causes[most].cause
+            marks[name] = causes[most].code
     known = dataclasses.replace(known.widened_to(std + total[:K] / Z90), biased=marks)
     if problem.fixed_latency_s is not None or not total[-1]:
         return known
     (first, last), (low, high) = problem.latency_range_s, known.latency_interval_s
     if total[-1] > max((high - low) / 2, 0.5 * problem.episodes[0].step_s):
-        marks[LATENCY] = causes[int(np.argmax([shift[-1] for shift in shifts]))].cause
+        marks[LATENCY] = causes[int(np.argmax([shift[-1] for shift in shifts]))].code
     wider = (max(low - total[-1], first), min(high + total[-1], last))
     return dataclasses.replace(known, latency_interval_s=wider, biased=marks)
 
@@ -312,7 +314,7 @@ class SplitHalf:
             "steps": self.steps,
         }
 
-    def alarms(self, space: ParameterSpace) -> tuple[Alarm, ...]:
+    def alarms(self, space: ParameterSpace) -> tuple[Finding, ...]:
         """Return one alarm that names all flagged parameters, if there are any."""
         if not self.flagged:
             return ()
@@ -322,7 +324,7 @@ class SplitHalf:
             if r.first[0] is not None and r.second[0] is not None:
                 both[r.name] = f" ({scale * r.first[0]:.4g} and {scale * r.second[0]:.4g} {unit})"
         return (
-            Alarm(
+            Finding.alarm(
                 "Two halves of the data disagree about "
                 f"{listed([name + both.get(name, '') for name in self.flagged])}.",
                 "A value that depends on the choice of data means that the model is incomplete. The "

@@ -13,7 +13,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
-from deal_hw.calib.validation.cause_words import LOOKS, SearchedKinds, advice, stretch_words
+from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, SearchedKinds, advice, stretch_words
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
@@ -33,7 +32,8 @@ from deal_hw.calib.validation.wider_models import (
     wider_cost,
     zero_parameters,
 )
-from deal_hw.calibration import Alarm, listed, percent
+from deal_hw.calibration import listed, percent
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
@@ -109,39 +109,6 @@ ZERO_CAUSES: Mapping[str, Cause] = {
     "dof_damping": "damping",
 }
 """Cause that a parameter stands for which is 0 in the model."""
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """One cause of the residual.
-
-    Attributes:
-        cause: The cause.
-        share: Share of the held-out squared residual that it explains.
-        deviance: Gain in held-out deviance.
-        joints: Joints or bodies that show it, strongest first.
-        alarm: The alarm for the user.
-        shift: Change of the estimates where the fit may have this effect, too: of each parameter in its own
-            scale, then of the latency [s], (K + 1,); empty where it was not estimated.
-    """
-
-    cause: Cause
-    share: float
-    deviance: float
-    joints: tuple[str, ...]
-    alarm: Alarm
-    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {
-            "cause": self.cause,
-            "share": self.share,
-            "deviance": self.deviance,
-            "joints": list(self.joints),
-            "alarm": dataclasses.asdict(self.alarm),
-            "shift": self.shift.tolist(),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,8 +355,8 @@ def find_play(problem: Problem, refined: Refined, fitted: WiderFit | None = None
         f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: backlash."
     )
     looks = LOOKS["backlash"]
-    alarm = Alarm(seen_words, looks[1], looks[2].replace("{}", listed(joints)))
-    cause = Diagnosis("backlash", gained.share, gained.deviance, tuple(joints), alarm, wide.shift_of(refined))
+    alarm = Finding.alarm(seen_words, looks[1], looks[2].replace("{}", listed(joints)))
+    cause = Diagnosis.of("backlash", gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))
     theta = np.concatenate([fit.theta[: len(problem.space)], found[order]])
     return Play(cause, problem.with_more(named), theta, fit.latency_s, wide.prediction.chi2)
 
@@ -413,7 +380,7 @@ def find_zero(problem: Problem, refined: Refined, more: Sequence[Parameter]) -> 
         f"With {values} the model predicts motion that it was not fitted to with chi2 "
         f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}."
     )
-    alarm = Alarm(
+    alarm = Finding.alarm(
         seen,
         "In your model this is 0, so it was not searched. Other values compensate for it.",
         "Write a value above 0 into the MJCF, such as this one, and calibrate again. Or give it a nominal "
@@ -421,7 +388,7 @@ def find_zero(problem: Problem, refined: Refined, more: Sequence[Parameter]) -> 
     )
     joints = tuple(dict.fromkeys(joint for p in named for joint in p.elements))
     cause = ZERO_CAUSES[named[0].kind]
-    return [Diagnosis(cause, gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))]
+    return [Diagnosis.of(cause, gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))]
 
 
 def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
@@ -518,7 +485,7 @@ def _diagnosis(
     means, do = advice(cause, joints, where or listed(joints), known.searched)
     looks = LOOKS[cause][0]
     seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: {cause}."
-    return Diagnosis(cause, float(share), float(deviance), tuple(joints), Alarm(seen, means, do))
+    return Diagnosis.of(cause, share, deviance, joints, Finding.alarm(seen, means, do))
 
 
 def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
@@ -549,7 +516,7 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
     do = do.replace("{}", " and ".join(names))
     if rotors:
         do += f" If it is a rotor's inertia, free dof_armature of {listed(rotors)}."
-    return Diagnosis("mass", float(share), float(deviance), tuple(names), Alarm(seen, means, do))
+    return Diagnosis.of("mass", share, deviance, names, Finding.alarm(seen, means, do))
 
 
 def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
@@ -562,9 +529,8 @@ def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | N
         f"had its own delay (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
     )
     _, means, do = LOOKS["delay"]
-    return Diagnosis(
-        "delay", float(found.share), float(found.deviance), (), Alarm(seen, means, do.replace("{}", ""))
-    )
+    alarm = Finding.alarm(seen, means, do.replace("{}", ""))
+    return Diagnosis.of("delay", found.share, found.deviance, (), alarm)
 
 
 def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None:

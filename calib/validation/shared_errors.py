@@ -22,8 +22,8 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, measurements, samples_in
 from deal_hw.calib.fit.intervals import MISMATCH
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
-from deal_hw.calibration import Alarm
 from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.findings import Finding
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
@@ -164,11 +164,11 @@ class FoundError:
     length: int
 
     @property
-    def alarm(self) -> Alarm:
+    def alarm(self) -> Finding:
         """The alarm for the user."""
         words = ", or ".join(error.words for error in self.errors)
         before = f"instead of {self.before:.3g}" if np.isfinite(self.before) else "where it diverged before"
-        return Alarm(
+        return Finding.alarm(
             f"The recordings look as if {words}, in commands and measurements alike. After this correction, "
             f"motion that was not fitted is predicted with chi2 {self.chi2:.3g} {before}.",
             "The parameters would compensate for this error. Comparing the two channels does not show it.",

@@ -21,7 +21,8 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
-from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
+from deal_hw.calibration import Z90, Progress, ProgressCallback, listed
+from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
 from deal_hw.types import FloatArray
 
@@ -256,7 +257,7 @@ def counted(problem: Problem, known: Uncertainty, found: StepCheck) -> Uncertain
     return dataclasses.replace(known, latency_interval_s=(max(low - more, first), min(high + more, last)))
 
 
-def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
+def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Finding, ...]:
     """Return the alarm of a step that is too coarse, if it is; ``known`` is without the step's shift."""
     if not found.coarse:
         return ()
@@ -266,7 +267,7 @@ def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
     if not names:
         return ()
     return (
-        Alarm(
+        Finding.alarm(
             f"With half the physics step ({500 * found.step_s:g} ms) the recordings are explained better "
             f"(chi-square {found.gain:.3g} lower), and these would leave their intervals: {listed(names)}.",
             f"A step of {1e3 * found.step_s:g} ms is too coarse: its error went into these values.",

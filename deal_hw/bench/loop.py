@@ -24,7 +24,7 @@ from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy

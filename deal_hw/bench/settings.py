@@ -228,7 +228,7 @@ class Mismatch(KnownTruth):
     """Calibrate robots with effects that no simulator here models (profile realistic)."""
 
     name: ClassVar[str] = "mismatch"
-    profile: ClassVar[Profile] = "realistic"
+    profile: ClassVar[str] = "realistic"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +253,7 @@ class Loop(SeededBench):
 
 @dataclass(frozen=True, kw_only=True)
 class Go2Loop(SeededBench):
-    """The same loop with emulated Go2 that walk; the shipped policy is fine-tuned."""
+    """Record walks of emulated Go2, calibrate, fine-tune the shipped policy, and walk again."""
 
     name: ClassVar[str] = "go2-loop"
     work: ClassVar[str] = "deal_hw.bench.go2_loop:table"

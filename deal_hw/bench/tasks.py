@@ -17,9 +17,9 @@ from deal_hw.calib.data.problem import PopulationPolicy
 from deal_hw.control.excitation_level import ATTEMPTS
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.profiles import profile as find_profile
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+from deal_hw.drivers.cartpole.plant.profiles import profile as find_profile
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model

@@ -5,43 +5,17 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from deal_hw.bench.settings import (
-    Bench,
-    FirstAnswer,
-    FixedRange,
-    Go2Codec,
-    Go2Loop,
-    Loop,
-    Mismatch,
-    Paper,
-    Real,
-    Speed,
-    Transfer,
-    Verdict,
-)
+from deal_hw.bench.settings import BENCHES, Bench
 from deal_hw.cli.json_output import only_document
 from deal_hw.cli.piped import PipedProgress
+from deal_hw.workflows.kinds import InputKind, Kinds
 
 if TYPE_CHECKING:
     from deal_hw.bench.rows import Row, Table
 
-Benches = (
-    Annotated[Loop, tyro.conf.subcommand(Loop.name)]
-    | Annotated[Go2Loop, tyro.conf.subcommand(Go2Loop.name)]
-    | Annotated[Transfer, tyro.conf.subcommand(Transfer.name)]
-    | Annotated[FixedRange, tyro.conf.subcommand(FixedRange.name)]
-    | Annotated[Mismatch, tyro.conf.subcommand(Mismatch.name)]
-    | Annotated[Paper, tyro.conf.subcommand(Paper.name)]
-    | Annotated[Real, tyro.conf.subcommand(Real.name)]
-    | Annotated[Verdict, tyro.conf.subcommand(Verdict.name)]
-    | Annotated[FirstAnswer, tyro.conf.subcommand(FirstAnswer.name)]
-    | Annotated[Speed, tyro.conf.subcommand(Speed.name)]
-    | Annotated[Go2Codec, tyro.conf.subcommand(Go2Codec.name)]
-)
+KINDS = Kinds(noun="bench", table=lambda: {name: InputKind(settings) for name, settings in BENCHES.items()})
 
 
 def bench(settings: Bench) -> int:

@@ -8,8 +8,9 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from deal_hw.calibration import Alarm, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
+from deal_hw.findings import Finding
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
@@ -173,7 +174,7 @@ def print_verdict(result: CalibrationResult) -> None:
         console.print(escape(line), highlight=False, soft_wrap=True)
 
 
-def other_alarms(alarms: Sequence[Alarm], width: int, room: int) -> list[str]:
+def other_alarms(alarms: Sequence[Finding], width: int, room: int) -> list[str]:
     """Return what alarms saw in at most ``room`` lines, the most important one last.
 
     Alarms with the same remedy are one entry. What finds no room is counted, and stands in the report.

@@ -1,26 +1,20 @@
-"""``deal-hw --completion SHELL``: a script that completes verbs, options, choices and files on Tab.
+"""``deal-hw --completion SHELL``: a script that completes verbs, kinds, options, choices and files on Tab.
 
-The parser's own generator makes it. The script holds every option, so that Tab does not start deal-hw. The
-generator knows no positional arguments: their names are added here, and the shell completes files by itself.
+The script holds every option, so that Tab does not start deal-hw. The shell completes files by itself.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import importlib
-import io
-import operator
-import typing
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
-import tyro
-
-from deal_hw.cli.parsing import CONFIG, Rules
+from deal_hw.cli.arguments import Option, options_of
+from deal_hw.drivers import ROBOTS
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.kinds import Kinds, one_kind
 
-if typing.TYPE_CHECKING:
+if TYPE_CHECKING:
     from deal_hw.cli.main import Verb
 
 SHELLS = ("bash", "zsh")
@@ -32,21 +26,37 @@ autoload -Uz compinit bashcompinit
 bashcompinit
 """
 
-_NAMES = """\
-
-# Names of robots and benches behind the verb, and files where nothing else fits.
+_SCRIPT = """\
+# What can follow the words so far: verbs; kinds of a verb's input; options; the choices of an option. Where
+# nothing fits, the shell offers files.
 _deal_hw() {{
-  local current="${{COMP_WORDS[COMP_CWORD]}}" verb="${{COMP_WORDS[1]}}" one
-  local -a found
-  _tyro_deal_hw
-  # An empty word, for no match, would keep the shell from offering files.
-  for one in "${{COMPREPLY[@]}}"; do [[ -n "$one" ]] && found+=("$one"); done
-  if [[ "$COMP_CWORD" == 2 && "$current" != -* ]]; then
-    case "$verb" in
-{cases}
-    esac
+  local current="${{COMP_WORDS[COMP_CWORD]}}" previous="${{COMP_WORDS[COMP_CWORD-1]}}"
+  local verb="${{COMP_WORDS[1]}}" kind="" word index offers="" kinds="" options=""
+  COMPREPLY=()
+  if [[ "$COMP_CWORD" == 1 ]]; then
+    COMPREPLY=($(compgen -W "{verbs} --help --version --completion" -- "$current"))
+    return
   fi
-  COMPREPLY=("${{found[@]}}")
+  case "$verb" in
+{kinds}
+  esac
+  for ((index = 2; index < COMP_CWORD; index++)); do
+    for word in $kinds; do [[ "${{COMP_WORDS[index]}}" == "$word" ]] && kind="$word"; done
+  done
+  case "$verb:$kind:$previous" in
+{choices}
+  esac
+  if [[ -n "$offers" ]]; then
+    COMPREPLY=($(compgen -W "$offers" -- "$current"))
+    return
+  fi
+  case "$verb:$kind" in
+{options}
+  esac
+  [[ "$current" == -* ]] && offers="$options --help"
+  [[ "$current" != -* && -z "$kind" && "$previous" != -* ]] && offers="$kinds"
+  [[ -z "$current" && "$previous" != -* ]] && offers="$offers $options"
+  COMPREPLY=($(compgen -W "$offers" -- "$current"))
 }}
 complete -o default -F _deal_hw deal-hw
 """
@@ -66,49 +76,37 @@ def completion(shell: str, verbs: Mapping[str, Verb]) -> str:
         raise ConfigurationError(
             f"--completion {shell}: give {' or '.join(SHELLS)}, such as --completion bash"
         )
-    configs = {
-        name: getattr(importlib.import_module(verb.module), verb.config) for name, verb in verbs.items()
-    }
-    head = _ZSH if shell == "zsh" else ""
-    return head + _of_all(configs) + _NAMES.format(cases="\n".join(_cases(configs)))
+    kinds: list[str] = []
+    options: list[str] = []
+    choices: list[str] = []
+    for name, verb in verbs.items():
+        config = getattr(importlib.import_module(verb.module), verb.config)
+        table = (config if isinstance(config, Kinds) else one_kind(config)).table()
+        found = {word: list(options_of(kind.settings).values()) for word, kind in table.items()}
+        first = [one for one in found.get("", ()) if one.positional and one.choices][:1]
+        words = [*filter(None, found), *(choice for one in first for choice in one.choices)]
+        if any(one.positional and one.name == "robot" for one in found.get("", ())):
+            words = words or list(ROBOTS)
+        kinds.append(f'    {name}) kinds="{" ".join(words)}" ;;')
+        # Without a known kind, such as behind a path: the options of all.
+        every = {one.name: one for entries in found.values() for one in entries}
+        for word, entries in {**found, "": [*every.values()]}.items():
+            pattern = f"{name}:{word}" if word else f"{name}:*"
+            options.append(f'    {pattern}) options="{" ".join(_flags(entries))}" ;;')
+            choices += _choices(pattern, entries)
+    script = _SCRIPT.format(
+        verbs=" ".join(verbs), kinds="\n".join(kinds), options="\n".join(options), choices="\n".join(choices)
+    )
+    return (_ZSH if shell == "zsh" else "") + script
 
 
-def _of_all(configs: Mapping[str, Any]) -> str:
-    """Return the parser's script of a command whose sub-commands are the verbs."""
-    parts = [
-        Annotated[config, tyro.conf.subcommand(name, prefix_name=False)] for name, config in configs.items()
-    ]
-    everything: Any = functools.reduce(operator.or_, parts)
-    written = io.StringIO()
-    with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
-        tyro.cli(
-            everything,
-            prog="deal-hw",
-            args=["--tyro-write-completion", "bash", "-"],
-            config=CONFIG,
-            registry=Rules(choices=True).registry,
-        )
-    return written.getvalue()
+def _flags(options: Iterable[Option]) -> Iterator[str]:
+    for one in options:
+        yield from one.flags
 
 
-def _cases(configs: Mapping[str, Any]) -> list[str]:
-    """Return the lines that offer names as a verb's first argument."""
-    return [
-        f'      {verb}) found+=($(compgen -W "{" ".join(names)}" -- "$current")) ;;'
-        for verb, config in configs.items()
-        if (names := _names(config))
-    ]
-
-
-def _names(config: Any) -> Sequence[str]:
-    from deal_hw.drivers import ROBOTS
-
-    if not isinstance(config, type):
-        return ()
-    for name, hint in typing.get_type_hints(config, include_extras=True).items():
-        kind, *marks = typing.get_args(hint) or (hint,)
-        if tyro.conf.Positional in marks:
-            if typing.get_origin(kind) is Literal:
-                return typing.get_args(kind)
-            return tuple(ROBOTS) if name == "robot" and kind is str else ()
-    return ()
+def _choices(pattern: str, options: Iterable[Option]) -> Iterator[str]:
+    """Yield the lines that offer the choices of options as their value."""
+    for one in options:
+        if one.choices and not one.positional:
+            yield f'    {pattern}:{one.flags[0]}) offers="{" ".join(one.choices)}" ;;'

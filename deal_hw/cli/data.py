@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -21,6 +21,7 @@ from deal_hw.workflows.import_export import (
     export_recordings,
     import_recordings,
 )
+from deal_hw.workflows.kinds import sub_verbs
 from deal_hw.workflows.robot import carried_problems, carries_robot
 from deal_hw.workflows.say import aloud
 
@@ -80,12 +81,8 @@ class Export(ExportSettings):
     path: tyro.conf.Positional[Path]
 
 
-Data = (
-    Annotated[InfoSettings, tyro.conf.subcommand("info")]
-    | Annotated[Verify, tyro.conf.subcommand("verify")]
-    | Annotated[Repair, tyro.conf.subcommand("repair")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
+KINDS = sub_verbs(
+    **{"info": InfoSettings, "verify": Verify, "repair": Repair, "import": Import, "export": Export}
 )
 
 

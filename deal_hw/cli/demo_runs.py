@@ -9,9 +9,9 @@ from typing import Final
 
 from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.errors import SafetyError, TransportError
+from deal_hw.findings import Severity
 from deal_hw.workflows.causes import LATE, Load, late_advice
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 

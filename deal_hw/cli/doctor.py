@@ -8,14 +8,13 @@ import sys
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.workflows.doctor.examine import DoctorReport, DoctorSettings, examine
 
-_MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: "FAIL"}
+_MARKS = {Severity.OK: "ok  ", Severity.NOTE: "note", Severity.WARN: "WARN", Severity.FAIL: "FAIL"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,18 +41,18 @@ def doctor(config: Doctor) -> DoctorReport:
     found: list[Finding] = []
     area = ""
     for finding in examine(config):
-        if finding.area != area:
-            area = finding.area
+        if finding.code != area:
+            area = finding.code
             print(area)
-        print(_wrapped(f"  {_MARKS[finding.level]}  ", finding.message), flush=True)
-        if finding.remedy:
-            print(_wrapped("        -> ", finding.remedy))
+        print(_wrapped(f"  {_MARKS[finding.severity]}  ", finding.seen), flush=True)
+        if finding.do:
+            print(_wrapped("        -> ", finding.do))
         found.append(finding)
     report = DoctorReport(findings=tuple(found))
     if config.json is not None:
-        rows: list[dict[str, Any]] = [finding.to_json() for finding in found]
+        rows = [{"area": f.code, "level": f.severity.value, "message": f.seen, "remedy": f.do} for f in found]
         config.json.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    worst = [level for level in (Level.FAIL, Level.WARN) if any(f.level is level for f in found)]
+    worst = [level for level in (Severity.FAIL, Severity.WARN) if any(f.severity is level for f in found)]
     print("all is well" if not worst else f"worst: {worst[0].value}", file=sys.stderr)
     return report
 

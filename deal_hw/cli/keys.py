@@ -18,6 +18,7 @@ from deal_hw.drivers.transports.certificates import (
 )
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
+from deal_hw.workflows.kinds import sub_verbs
 
 Days = Annotated[float, Range(1, 36500, "days")]
 WARN_DAYS = 30
@@ -72,11 +73,7 @@ class Show(Checked):
     """The folder."""
 
 
-Keys = (
-    Annotated[Make, tyro.conf.subcommand("make")]
-    | Annotated[Add, tyro.conf.subcommand("add")]
-    | Annotated[Show, tyro.conf.subcommand("show")]
-)
+KINDS = sub_verbs(make=Make, add=Add, show=Show)
 
 
 def keys(config: Make | Add | Show) -> int:

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import inspect
-import io
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType, MappingProxyType
 from typing import Any, TextIO, cast
@@ -35,16 +33,32 @@ EXIT_PIPE = 141
 LONGEST_MESSAGE = 2000
 """Longest error in one line [characters]: part of it may come from a file of unknown origin."""
 TRACEBACK_VARIABLE = "DEAL_HW_TRACEBACK"
-HELP_ALL = "--help-all"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verb:
     """One verb of the command.
 
+    A verb whose options depend on its input has *kinds*. ``config`` then names a ``Kinds`` in its module:
+
+    - Its ``table`` returns kind word -> ``InputKind(settings, help)``; the settings are a frozen dataclass
+      that has only the options that apply. Share options by inheritance, or by groups: a field whose type is
+      another dataclass, with a default factory. Its options need no prefix on the command line.
+    - Its ``find`` returns the kind word from :class:`~deal_hw.workflows.kinds.Arguments`, where the first
+      argument alone is none, such as for a path or for ``--model``.
+    - ``argument`` is the field that takes the first argument; without it the word only names the kind, as in
+      ``deal-hw data info`` (see :func:`~deal_hw.workflows.kinds.sub_verbs`).
+    - ``kinds.with_options(Quiet)`` adds what only the command line has.
+
+    The function of Python takes the same kinds: ``@from_settings(KINDS)``. Both refuse an option of another
+    kind and say which kinds have it. A field is an argument without a name if it is not keyword-only. A
+    field marked ``Annotated[..., FROM_PYTHON]`` is no option. ``deal-hw VERB --help`` lists the kinds,
+    ``deal-hw VERB KIND --help`` the options of one.
+
     Attributes:
         module: The module that does it.
-        config: Its settings: a dataclass, or a union of dataclasses for a verb with sub-verbs.
+        config: Its settings: a frozen dataclass, or a :class:`~deal_hw.workflows.kinds.Kinds` where the
+            options depend on the robot, the bench, the kind of input, or a sub-verb.
         function: Called with the settings; returns an exit code, or a report, which may have an `exit_code`.
         help: One line.
         example: Working arguments, as `deal-hw --help` shows them.
@@ -158,18 +172,21 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         "keys": _verb(
             "keys",
             help="make certificates for the bridge and its clients, and show how long they are valid",
+            config="KINDS",
             example="keys make --out keys --robot 192.168.1.20",
             extra="keys",
         ),
         "robot": _verb(
             "robot",
             help="describe your own robot (robot.yaml, made from its MJCF), and check the description",
+            config="KINDS",
             example="robot new robot.xml",
             extra="sim",
         ),
         "data": _verb(
             "data",
             help="show, verify and repair datasets; import and export recordings",
+            config="KINDS",
             example="data info runs/first/dataset",
             extra="sim",
         ),
@@ -192,7 +209,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         "bench": _verb(
             "bench",
             help="measure how well calibration and the whole loop work, as JSON rows",
-            config="Benches",
+            config="KINDS",
             example="bench loop --profile sensor --seeds 0,1 --out loop.json",
             extra="bench",
         ),
@@ -246,74 +263,20 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     """Return a verb's settings, parsed from its command-line arguments, and the function that takes them.
 
     Raises:
-        UnknownNameError: There is no such verb.
+        UnknownNameError: There is no such verb, or no such kind of its input.
         DealHwError: The arguments do not parse, or a setting refuses its value.
         SystemExit: The arguments are --help.
     """
     verb = find(name)
     import importlib
 
-    import tyro
-
-    from deal_hw.cli.parsing import CONFIG, Rules, rarely_needed, unparsed
+    from deal_hw.cli.parsing import read_settings
 
     module = importlib.import_module(verb.module)
-    explains_all = HELP_ALL in arguments
-    arguments = ["--help" if word == HELP_ALL else word for word in arguments]
-    rules = Rules(arguments, () if explains_all else verb.common)
-
-    def read() -> Any:
-        return tyro.cli(
-            getattr(module, verb.config),
-            prog=f"deal-hw {name}",
-            description=_description(verb, getattr(module, verb.config), rules.hidden),
-            args=arguments,
-            config=CONFIG,
-            registry=rules.registry,
-        )
-
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            settings = read()
-    except SystemExit as stop:
-        if not stop.code:
-            # Help. Only now is it known which options are hidden.
-            with contextlib.suppress(SystemExit):
-                read()
-            if rules.rare:
-                given = [word for word in arguments if word not in ("-h", "--help")]
-                print(rarely_needed(rules.rare, " ".join(["deal-hw", name, *given])))
-            raise
-        # tyro draws a box around an error; here it becomes one line, like other errors.
-        cause: BaseException | None = stop
-        while cause is not None and not isinstance(cause, DealHwError):
-            cause = cause.__context__
-        if cause is not None:
-            raise cause from None
-        if hasattr(module, "check_words"):
-            # A verb may know a better answer than that an option is unknown.
-            module.check_words(arguments)
-        raise unparsed(
-            said.getvalue(), f"deal-hw {name}", verb.example, shortened=bool(verb.common)
-        ) from None
+    settings = read_settings(
+        name, verb, getattr(module, verb.config), arguments, getattr(module, "check_words", None)
+    )
     return settings, getattr(module, verb.function)
-
-
-def _description(verb: Verb, config: Any, hidden: Iterable[str]) -> str:
-    """Return the text above the options in a verb's help: purpose, example, hidden options."""
-    text = inspect.cleandoc(config.__doc__) if isinstance(config, type) and config.__doc__ else ""
-    text = text or f"{verb.help[:1].upper()}{verb.help[1:]}."
-    lines = [text]
-    if f"deal-hw {verb.example}" not in text:
-        lines.append(f"Example:  deal-hw {verb.example}")
-    if hidden:
-        first, *others = sorted(hidden)
-        lines.append(
-            f"More options for {', '.join([first, *others])}: name one before --help to see them, such as "
-            f"deal-hw {verb.example.split()[0]} {first} --help"
-        )
-    return "\n\n".join(lines)
 
 
 def run(name: str, arguments: Sequence[str]) -> int:

@@ -1,15 +1,17 @@
-"""Makes a command line from settings: values from arguments, and a help page for the named robot."""
+"""Makes settings from a command line, and the help pages of a verb."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import re
+import inspect
+import io
 import shutil
 import textwrap
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 import tyro
 from tyro.constructors import (
@@ -21,10 +23,18 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from deal_hw.cli.arguments import CommandLine, check, is_positional, options_of
 from deal_hw.documentation import with_places
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.ranges import option
-from deal_hw.workflows.options import OWN_ROBOT, Only
+from deal_hw.workflows.kinds import InputKind, Kinds, MissingKindError, one_kind
+from deal_hw.workflows.options import FROM_PYTHON
+
+if TYPE_CHECKING:
+    from deal_hw.cli.main import Verb
+
+HELP_ALL = "--help-all"
+_HELP_WORDS = ("-h", "--help", HELP_ALL)
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
 """Options are named without their group, and what only Python can give is no option."""
@@ -35,40 +45,25 @@ class Rules:
 
     Files and folders, which Python may also name by a string, are paths. The settings themselves refuse wrong
     choices, with the same words as from Python. An option that is off by default has one flag, one that is on
-    has two. A help page hides options of other robots or benches; they are still parsed, so that the settings
-    can refuse them. It names rare options without explaining them.
+    has two. A help page names rare options without explaining them.
 
     Args:
-        words: The arguments, which may contain --help, and name a robot or a bench.
-        common: Fields that --help explains; all where empty.
-        choices: Whether the parser knows the choices, to complete them; it then refuses others by itself.
+        helps: Whether a help page is made.
+        common: Fields that the page explains; all where empty.
     """
 
-    def __init__(
-        self, words: Sequence[str] = (), common: Collection[str] = (), *, choices: bool = False
-    ) -> None:
-        self._named = set(words)
+    def __init__(self, *, helps: bool = False, common: Collection[str] = ()) -> None:
         self._common = common
-        self._helps = bool({"-h", "--help"} & self._named)
-        if any(word.endswith((".yaml", ".yml")) for word in words):
-            self._named |= set(OWN_ROBOT.names)
+        self._helps = helps
         self._no_options: list[Any] = []
         self._asks_others = False
-        self.hidden: set[str] = set()
-        """Names whose own options were not shown."""
         self.rare: list[str] = []
         """Options that the help page only names."""
         self.registry = ConstructorRegistry()
-        if not choices:
-            self.registry.primitive_rule(_choice)
+        self.registry.primitive_rule(_choice)
         self.registry.primitive_rule(_path)
         self.registry.primitive_rule(_number)
         self.registry.struct_rule(self._struct)
-
-    def hides(self, hint: Any) -> set[str]:
-        """Return the names that an option type is for, if the page hides it; else nothing."""
-        names = {name for part in get_args(hint)[1:] if isinstance(part, Only) for name in part.names}
-        return names if self._helps and not self._named & names else set()
 
     def _struct(self, info: StructTypeInfo) -> StructConstructorSpec | None:
         if self._asks_others or not dataclasses.is_dataclass(info.type):
@@ -88,10 +83,12 @@ class Rules:
     def _field(self, field: StructFieldSpec, owner: Any) -> StructFieldSpec:
         parts = get_args(field.type) if get_origin(field.type) is Annotated else (field.type,)
         marks: list[Any] = [tyro.conf.arg(metavar=_metavar(field.name, parts), help_behavior_hint=_default)]
-        if others := self.hides(field.type):
+        if FROM_PYTHON in parts[1:]:
             marks.append(tyro.conf.Suppress)
-            self.hidden |= others
             self._no_options += [kind for kind in parts if dataclasses.is_dataclass(kind)]
+        elif is_positional(owner, field.name, field.type):
+            marks += [tyro.conf.Positional]
+            marks[0] = tyro.conf.arg(metavar=field.name.upper(), help_behavior_hint=_default)
         elif self._helps and self._is_rare(field.name, parts, owner):
             marks.append(tyro.conf.Suppress)
             self.rare += [flag] if (flag := option(field.name)) not in self.rare else []
@@ -199,20 +196,113 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float | None] |
     )
 
 
-def unparsed(printed: str, line: str, example: str, *, shortened: bool) -> ConfigurationError:
-    """Return the parser's error as one line.
+def read_settings(
+    name: str,
+    verb: Verb,
+    config: Any,
+    arguments: Sequence[str],
+    explain: Callable[[Sequence[str]], None] | None = None,
+) -> Any:
+    """Return a verb's settings from its command-line arguments.
 
     Args:
-        printed: What the parser printed: a title, the error, mostly an explanation, and the help page; rules
-            lie between them.
-        line: The command without its arguments, such as `deal-hw collect`.
-        example: Working arguments, the verb included.
-        shortened: Whether --help explains the common options only.
+        name: The verb's name.
+        verb: The verb.
+        config: Its settings, or their kinds.
+        arguments: The words behind the verb.
+        explain: Called with the words before they are refused; it may raise a better explanation.
+
+    Raises:
+        DealHwError: The arguments do not parse, or a setting refuses its value.
+        SystemExit: The arguments ask for help; it was printed.
     """
-    _, *parts, page = (" ".join(part.split()) for part in re.split("-{10,}", printed))
-    page = "deal-hw" + page.partition("deal-hw")[2]
-    parts = [part.removeprefix("Argument helptext: ").removesuffix(".") for part in parts]
-    if page == f"{line} --help":
-        # The example of a verb with sub-verbs is not one of each sub-verb.
-        parts.append(f"example: deal-hw {example}")
-    return ConfigurationError("; ".join([*parts, f"all options: {page}{'-all' * shortened}"]))
+    kinds = config if isinstance(config, Kinds) else one_kind(config)
+    words = [word for word in arguments if word not in _HELP_WORDS]
+    helps = len(words) < len(arguments)
+    every = [one for kind in kinds.table().values() for one in options_of(kind.settings).values()]
+    given = CommandLine(words, every)
+    if helps and not words and kinds.noun:
+        _print_and_exit(kinds_page(name, verb, kinds))
+    try:
+        word, chosen = kinds.choose(given.arguments)
+    except MissingKindError as error:
+        if helps:
+            _print_and_exit(kinds_page(name, verb, kinds))
+        example = f"example: deal-hw {verb.example}; all options: deal-hw {name} --help"
+        raise ConfigurationError(f"`deal-hw {name}`: {error}; {example}") from None
+    line = f"deal-hw {name} {chosen.usage or word}".rstrip()
+    if kinds.noun and not kinds.argument:
+        words.remove(given.positional[0])
+    if helps:
+        _print_help(verb, chosen, line, explains_all=HELP_ALL in arguments)
+
+    def having(field: str) -> list[str]:
+        return [f"{name} {one}" for one, kind in kinds.table().items() if field in options_of(kind.settings)]
+
+    try:
+        check(line, words, chosen.settings, having)
+    except ConfigurationError as error:
+        if explain is not None:
+            explain(words)
+        page = f"{line} {HELP_ALL if verb.common else '--help'}"
+        raise ConfigurationError(f"{error}; all options: {page}") from None
+    return _parsed(chosen.settings, words, line)
+
+
+def _print_and_exit(page: str) -> NoReturn:
+    print(page)
+    raise SystemExit(0)
+
+
+def _parsed(settings: type[Any], words: Sequence[str], line: str) -> Any:
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            return tyro.cli(settings, prog=line, args=words, config=CONFIG, registry=Rules().registry)
+    except SystemExit as stop:
+        # The parser catches what the settings refuse, and keeps it as the cause.
+        cause: BaseException | None = stop
+        while cause is not None and not isinstance(cause, DealHwError):
+            cause = cause.__context__
+        if cause is not None:
+            raise cause from None
+        raise ConfigurationError(
+            f"`{line} {' '.join(words)}` cannot be understood; options: {line} --help"
+        ) from None
+
+
+def _print_help(verb: Verb, kind: InputKind, line: str, *, explains_all: bool) -> NoReturn:
+    """Print the options of one kind of a verb's input."""
+    rules = Rules(helps=True, common=() if explains_all else verb.common)
+    text = inspect.cleandoc(kind.settings.__doc__ or "") or f"{verb.help[:1].upper()}{verb.help[1:]}."
+    if f"deal-hw {verb.example}" not in text:
+        text = f"{text}\n\nExample:  deal-hw {verb.example}"
+    with contextlib.suppress(SystemExit):
+        tyro.cli(
+            kind.settings,
+            prog=line,
+            description=text,
+            args=["--help"],
+            config=CONFIG,
+            registry=rules.registry,
+        )
+    if rules.rare:
+        print(rarely_needed(rules.rare, line))
+    raise SystemExit(0)
+
+
+def kinds_page(name: str, verb: Verb, kinds: Kinds) -> str:
+    """Return the help of a verb without a kind: the kinds, and how to see the options of one."""
+    rows = [
+        (
+            f"deal-hw {name} {kind.usage or word}".rstrip(),
+            kind.help or (kind.settings.__doc__ or "").partition("\n")[0],
+        )
+        for word, kind in kinds.table().items()
+    ]
+    width = max(len(usage) for usage, _ in rows)
+    lines = [f"{verb.help[:1].upper()}{verb.help[1:]}.", "", f"Example:  deal-hw {verb.example}", ""]
+    lines += [f"usage: deal-hw {name} {kinds.noun.upper()} [options]", ""]
+    lines += [f"  {usage:<{width}}  {text}".rstrip() for usage, text in rows]
+    lines += ["", f"Options: one of these lines with --help, such as  {rows[0][0]} --help"]
+    return "\n".join(lines)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
+from deal_hw.workflows.kinds import sub_verbs
 from deal_hw.workflows.robot import CheckRobotSettings, NewRobotSettings, RobotCheck, check_robot, new_robot
 
 
@@ -25,7 +25,7 @@ class Check(CheckRobotSettings):
     robot: tyro.conf.Positional[Path]
 
 
-Robot = Annotated[New, tyro.conf.subcommand("new")] | Annotated[Check, tyro.conf.subcommand("check")]
+KINDS = sub_verbs(new=New, check=Check)
 
 
 def robot(config: New | Check) -> int | RobotCheck:

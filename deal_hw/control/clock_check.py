@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import IntArray
 
 WARN_SHARE: Final = 1e-3
@@ -32,14 +32,14 @@ def judge_clock(host_ns: IntArray, device_ns: IntArray) -> Finding:
     last = len(host_ns) - quarter + int(np.argmin(delay_ns[-quarter:]))
     span_s = float(host_ns[last] - host_ns[first]) * 1e-9
     if span_s <= 0:
-        return Finding("states", Level.NOTE, "too few states to compare the robot's clock with ours")
+        return Finding("states", Severity.NOTE, "too few states to compare the robot's clock with ours")
     drift = float(device_ns[last] - device_ns[first]) * 1e-9 / span_s - 1.0
     text = f"rate of the robot's clock against ours: {drift * 100:+.2f} %"
     sure = abs(drift) - RESOLUTION_S / span_s
     if sure > FAIL_SHARE:
         return Finding(
             "states",
-            Level.FAIL,
+            Severity.FAIL,
             f"{text}; at most 1 % can be used",
             "recordings would have wrong speeds and latencies; if it is a simulator slower than real time, "
             "give it a faster computer or real-time priority",
@@ -47,8 +47,8 @@ def judge_clock(host_ns: IntArray, device_ns: IntArray) -> Finding:
     if sure > WARN_SHARE:
         return Finding(
             "states",
-            Level.WARN,
+            Severity.WARN,
             f"{text}; a good clock is correct to 0.01 %",
             "listen longer (--seconds 30); if the difference stays, a calibrated latency will be wrong",
         )
-    return Finding("states", Level.OK, text)
+    return Finding("states", Severity.OK, text)

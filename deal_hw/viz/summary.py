@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.calibration import Alarm, CalibrationResult, percent
+from deal_hw.calibration import CalibrationResult, percent
 from deal_hw.description import RobotDescription
+from deal_hw.findings import Finding
 from deal_hw.sim.recordings.overlay import Overlay, Prediction
 from deal_hw.types import Trajectory
 
@@ -16,7 +17,7 @@ _WIDE = 3
 
 
 def verdict_markdown(
-    overlay: Overlay | None, verdict: str, alarms: Sequence[Alarm] = (), note: str = ""
+    overlay: Overlay | None, verdict: str, alarms: Sequence[Finding] = (), note: str = ""
 ) -> str:
     """Return the text at the top, as markdown: the verdict on the calibration, and its alarms.
 

@@ -88,6 +88,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
     from deal_hw.data.importing.table import table_of
+    from deal_hw.data.recording.episode_info import verdict_json
 
     _refuse_ignored(config)
     columns = None if config.columns is None else read_column_map(config.columns)
@@ -111,7 +112,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         described = dict(episodes[0].description)
     problems = {
         table.name: [
-            v.to_json()
+            verdict_json(v)
             for v in examine_recording(
                 table, facts, config.force, servo=_takes_positions(facts, table), say=say
             )

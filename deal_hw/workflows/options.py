@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_type_hints, overload
 
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Range, option
+from deal_hw.workflows.kinds import Kinds, one_kind, signature_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,9 @@ CARTPOLE = Only(("cartpole",))
 GO2 = Only(("go2", "go2_on_stand"))
 OWN_ROBOT = Only(("robot.yaml",))
 
+
+FROM_PYTHON = "from Python"
+"""Marks a field that is no option: only Python can give it."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -106,38 +110,30 @@ def refuse_others(settings: Any, verb: str, name: str) -> None:
         refuse(names, f"only {' and '.join(f'`{verb} {other}`' for other in only.names)} can use that")
 
 
-def _in_group(settings: Any, name: str) -> str:
-    """Return how Python gives an option that is in a group of options; empty if no group has it."""
-    for entry in dataclasses.fields(settings):
-        group = entry.default_factory
-        if dataclasses.is_dataclass(group) and name in {inner.name for inner in dataclasses.fields(group)}:
-            return f"{entry.name}={getattr(group, '__name__', '')}({name}=...)"
-    return ""
+@overload
+def from_settings(settings: Kinds) -> Callable[[Callable[[Any], R]], Callable[..., R]]: ...
 
 
-def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Callable[P, R]]:
+@overload
+def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Callable[P, R]]: ...
+
+
+def from_settings(settings: Any) -> Any:
     """Let a function of settings take them as arguments, with the same checks as the verb.
 
     Args:
-        settings: The settings' class; the function gets its signature, and refuses unknown names by
-            :class:`UnknownNameError`. The function's attribute ``settings`` is the class, for the reference.
+        settings: The settings' class, or the kinds of a verb, from which the arguments choose one. The
+            function gets the signature (of all kinds together), and refuses unknown names by
+            :class:`UnknownNameError`. Its attribute ``settings`` is the class or the kinds.
     """
-    signature = inspect.signature(settings)
+    signature = signature_of(settings) if isinstance(settings, Kinds) else inspect.signature(settings)
 
-    def with_arguments(function: Callable[[S], R]) -> Callable[P, R]:
+    kinds = settings if isinstance(settings, Kinds) else one_kind(settings)
+
+    def with_arguments(function: Callable[[Any], R]) -> Callable[..., R]:
         @functools.wraps(function)
-        def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            for name in kwargs:
-                if name not in signature.parameters:
-                    error = UnknownNameError(f"argument of {function.__name__}", name, signature.parameters)
-                    if group := _in_group(settings, name):
-                        error.args = (f"{error}; did you mean {group}?",)
-                    raise error
-            try:
-                signature.bind(*args, **kwargs)
-            except TypeError as err:
-                raise TypeError(f"{function.__name__}(): {err}") from None
-            return function(settings(*args, **kwargs))
+        def call(*args: Any, **kwargs: Any) -> R:
+            return function(kinds.make(function.__name__, *args, **kwargs))
 
         del call.__wrapped__
         call.__signature__ = signature  # type: ignore[attr-defined]

@@ -14,7 +14,7 @@ from deal_hw.data.files import dataset_of, write_bytes
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import DESCRIPTIONS, ROBOTS, parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Checked, Range
 from deal_hw.workflows.options import File, from_settings
@@ -75,7 +75,7 @@ class RobotCheck:
     @property
     def exit_code(self) -> int:
         """For the shell: 0, or 1 if a check failed."""
-        return int(any(finding.level is Level.FAIL for finding in self.findings))
+        return int(any(finding.severity is Severity.FAIL for finding in self.findings))
 
     def table(self) -> str:
         """Return one line per finding, as text."""
@@ -87,7 +87,7 @@ class RobotCheck:
         return html_table(_HEAD, self._cells())
 
     def _cells(self) -> list[tuple[str, ...]]:
-        return [(f.level.value, f.area, f.message, f.remedy) for f in self.findings]
+        return [(f.severity.value, f.code, f.seen, f.do) for f in self.findings]
 
 
 @from_settings(NewRobotSettings)
@@ -271,7 +271,7 @@ def _agreement(robot: UserRobot) -> list[Finding]:
     message = (
         f"{len(robot.file.joints)} joints, {driven} of them driven, {base} base; robot.yaml and MJCF agree"
     )
-    return [Finding(robot.mjcf.name, Level.OK, message)]
+    return [Finding(robot.mjcf.name, Severity.OK, message)]
 
 
 def _missing(robot: UserRobot) -> list[Finding]:
@@ -301,7 +301,7 @@ def _missing(robot: UserRobot) -> list[Finding]:
         ),
     )
     return [
-        Finding(name, Level.NOTE, f"missing for {', '.join(found)}", f"{why}")
+        Finding(name, Severity.NOTE, f"missing for {', '.join(found)}", f"{why}")
         for name, found, why in rows
         if found
     ]
@@ -313,12 +313,14 @@ def _held(robot: UserRobot) -> list[Finding]:
     found = hold(robot)
     what = f"holding for {found.seconds:g} s"
     if found.diverged:
-        return [Finding(what, Level.FAIL, "the simulation diverges", "reduce timestep or gains of the MJCF")]
+        return [
+            Finding(what, Severity.FAIL, "the simulation diverges", "reduce timestep or gains of the MJCF")
+        ]
     if found.unstable:
         return [
             Finding(
                 what,
-                Level.FAIL,
+                Severity.FAIL,
                 f"the speed of {', '.join(found.unstable)} keeps growing",
                 "reduce stiffness, or raise damping or armature, in the MJCF and in robot.yaml",
             )
@@ -328,4 +330,4 @@ def _held(robot: UserRobot) -> list[Finding]:
     unit = robot.file.joints[robot.joint_names.index(names[worst])].unit
     moved = "moved, without effort, by" if robot.file.actuation == "motor" else "is off by"
     message = f"stable; largest offset: {names[worst]} {moved} {found.sag[worst]:.3g} {unit}"
-    return [Finding(what, Level.OK, message)]
+    return [Finding(what, Severity.OK, message)]

@@ -24,7 +24,7 @@ from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_sim
 from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, ServiceClient
 from deal_hw.drivers.go2.state_stream import PERIOD_MS
 from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Message, TopicTransport
 
 ROUND_TRIPS: Final = 20
@@ -82,15 +82,15 @@ class Go2Doctor:
             subscribe=[topics.LOW_STATE, topics.LOW_COMMAND, topics.response(SWITCHER)],
         )
         with self._link:
-            yield Finding("link", Level.OK, "the transport is open")
+            yield Finding("link", Severity.OK, "the transport is open")
             heard = self._listen()
             yield from self._discovery()
             if self._simulated:
-                yield Finding("states", Level.NOTE, NOTICE.removeprefix("note: "))
+                yield Finding("states", Severity.NOTE, NOTICE.removeprefix("note: "))
             if not self._strict:
                 yield Finding(
                     "states",
-                    Level.WARN,
+                    Severity.WARN,
                     "head and checksum of the states are not checked",
                     "leave --state-check out if the robot's head and checksum are as deal-hw expects",
                 )
@@ -141,21 +141,21 @@ class Go2Doctor:
         if not seen.peers:
             yield Finding(
                 "dds",
-                Level.FAIL,
+                Severity.FAIL,
                 "no other participant is on the domain",
                 "is the robot on, is this its network (192.168.123.x), is the domain 0, does a firewall "
                 "block UDP 7400 to 7500?",
             )
         for peer in seen.peers:
-            yield Finding("dds", Level.OK, str(peer))
+            yield Finding("dds", Severity.OK, str(peer))
         for complaint in seen.complaints:
-            yield Finding("dds", Level.FAIL, complaint, f"see {page('how-to/go2-dds.md')}")
+            yield Finding("dds", Severity.FAIL, complaint, f"see {page('how-to/go2-dds.md')}")
         typed: dict[str, set[str]] = {}
         for end in seen.endpoints:
             if end.topic in topics.TYPES:
                 typed.setdefault(end.shown_hash, set()).add(end.topic)
         for shown, names in typed.items():
-            yield Finding("dds", Level.OK, f"{', '.join(sorted(names))}: {shown}")
+            yield Finding("dds", Severity.OK, f"{', '.join(sorted(names))}: {shown}")
 
     def _ask_mode(self) -> Generator[Finding, None, str | None]:
         """Yield the motion switcher's answer; return the active mode's name, None without an answer."""
@@ -171,13 +171,13 @@ class Go2Doctor:
             except TransportTimeoutError:
                 break
             except (RefusedError, FrameError) as error:
-                yield Finding("services", Level.WARN, str(error), "restart the robot if it persists")
+                yield Finding("services", Severity.WARN, str(error), "restart the robot if it persists")
                 return None
             times.append((self._clock.now_ns() - begun_ns) * 1e-9)
         if name is None:
             yield Finding(
                 "services",
-                Level.WARN,
+                Severity.WARN,
                 f"the service {SWITCHER} does not answer",
                 "older firmware has the service robot_state instead; deal-hw tries that one, too",
             )
@@ -203,7 +203,7 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     if len(heard.stamps) < 2 and heard.repeated:
         yield Finding(
             "states",
-            Level.FAIL,
+            Severity.FAIL,
             f"states arrive, but do not change: {heard.repeated} times the same",
             "let the simulation run: it is paused",
         )
@@ -211,7 +211,7 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     if len(heard.stamps) < 2:
         yield Finding(
             "states",
-            Level.FAIL,
+            Severity.FAIL,
             f"no states came on {topics.LOW_STATE} within {seconds:g} s",
             "check that the robot is on and has started up (one minute), the interface or end point, and "
             "the firewall",
@@ -231,14 +231,14 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     ticks = np.diff(np.array(heard.ticks, dtype=np.int64).astype(np.uint32))
     steps = ticks.astype(np.int32)
     if (steps == 0).all():
-        yield Finding("states", Level.FAIL, "the robot's clock (tick) stands still", "restart the robot")
+        yield Finding("states", Severity.FAIL, "the robot's clock (tick) stands still", "restart the robot")
         return
     missing = int(np.sum(np.maximum(steps // PERIOD_MS - 1, 0)))
     back = int(np.sum(steps <= 0))
     if missing or back:
         yield Finding(
             "states",
-            Level.NOTE,
+            Severity.NOTE,
             f"{missing} states lost and {back} repeated or out of order of {len(heard.ticks)}",
         )
     device_ms = np.concatenate(((0,), np.cumsum(steps.astype(np.int64))))
@@ -259,14 +259,14 @@ def _judge_refused(refused: Refusals, sound: int) -> Finding:
         )
     else:
         remedy = refused.remedy
-    return Finding("states", Level.FAIL if share > _FEW_REFUSED else Level.WARN, text, remedy)
+    return Finding("states", Severity.FAIL if share > _FEW_REFUSED else Severity.WARN, text, remedy)
 
 
 def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str | None) -> Iterator[Finding]:
     if heard.commands and mode is None:
         yield Finding(
             "commands",
-            Level.WARN,
+            Severity.WARN,
             f"{heard.commands} motor commands came; the robot did not say whether its sport mode sends them",
             "look for other programs that command the motors; an observer's certificate may not ask the "
             "robot: run doctor with a controller's",
@@ -274,7 +274,7 @@ def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str | None) -
     elif heard.commands and mode:
         yield Finding(
             "commands",
-            Level.NOTE,
+            Severity.NOTE,
             f"{heard.commands} motor commands came while sport mode {mode!r} is active, probably its own",
             "run doctor again after the release: then no program may command the motors",
         )
@@ -282,19 +282,19 @@ def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str | None) -
         who = f" ({'; '.join(writers)})" if writers else ""
         yield Finding(
             "commands",
-            Level.FAIL,
+            Severity.FAIL,
             f"another program commands the motors: {heard.commands} messages{who}",
             "stop that program",
         )
     elif writers:
         yield Finding(
             "commands",
-            Level.WARN,
+            Severity.WARN,
             f"silent writers of {topics.LOW_COMMAND}: {'; '.join(writers)}",
             "stop them if they are not deal-hw's own",
         )
     else:
-        yield Finding("commands", Level.OK, "nobody else commands the motors")
+        yield Finding("commands", Severity.OK, "nobody else commands the motors")
 
 
 def _judge_supply(frame: LowStateFrame) -> Iterator[Finding]:
@@ -313,20 +313,20 @@ def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
     if remote is None:
         yield Finding(
             "robot",
-            Level.NOTE,
+            Severity.NOTE,
             "no remote is heard: L2+B cannot stop the robot",
             "switch the remote on and pair it before you arm",
         )
     else:
-        yield Finding("robot", Level.OK, "the remote is heard: L2+B makes the robot passive")
+        yield Finding("robot", Severity.OK, "the remote is heard: L2+B makes the robot passive")
 
 
 def _judge_mode(name: str) -> Finding:
     if not name:
-        return Finding("services", Level.OK, "no sport mode is active: the low level is free")
+        return Finding("services", Severity.OK, "no sport mode is active: the low level is free")
     return Finding(
         "services",
-        Level.NOTE,
+        Severity.NOTE,
         f"sport mode {name!r} is active",
         "deal-hw releases it when it arms, after the robot has lain down; keep the robot on the floor",
     )

@@ -20,8 +20,8 @@ from deal_hw.bench.settings import FixedRange, Loop, Mismatch, Paper
 from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import bench
 from deal_hw.drivers.cartpole.description import SPACES
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.workflows.shipped import shipped_policy

@@ -12,7 +12,6 @@ from deal_hw.bench.rows import Cells, load_rows
 from deal_hw.bench.settings import (
     BENCHES,
     FirstAnswer,
-    Mismatch,
     Paper,
     Real,
     Verdict,
@@ -75,11 +74,33 @@ def test_some_benches_take_one_ratio(name: str) -> None:
         typed(f"{name} --range-ratio 3,5")
 
 
-def test_the_mismatch_has_its_profile() -> None:
-    """No other one has effects that no simulator here models."""
-    assert Mismatch().profile == "realistic"
-    with pytest.raises(ConfigurationError, match="--profile"):
-        typed("mismatch --profile ideal")
+@pytest.mark.parametrize(
+    ("line", "owners"),
+    [
+        ("loop --model m.xml", "`bench real` has it"),
+        ("fixed-range --steps 10", "`bench go2-loop` and `bench transfer` have it"),
+        (
+            "speed --refine-all",
+            "`bench fixed-range`, `bench mismatch`, `bench paper` and `bench real` have it",
+        ),
+        ("verdict --real recordings", "`bench first-answer` has it"),
+        ("transfer --no-train", "`bench loop` and `bench go2-loop` have it"),
+        ("go2-codec --faults sign", "`bench verdict` has it"),
+        # The mismatch's profile is no choice, and what describes a bench is no option.
+        (
+            "mismatch --profile ideal",
+            "`bench loop`, `bench go2-loop`, `bench fixed-range`, `bench paper` and `bench speed` have it",
+        ),
+        ("loop --work a:b", ""),
+    ],
+)
+def test_an_option_of_another_bench_names_the_benches_that_have_it(line: str, owners: str) -> None:
+    """One line: what was given, who has it."""
+    name, flag, *_ = line.split()
+    with pytest.raises(ConfigurationError) as caught:
+        typed(line)
+    said = f"{flag}: `deal-hw bench {name}` has no such option; {owners}; all options: "
+    assert str(caught.value).startswith(said.replace("; ;", ";"))
 
 
 @pytest.mark.parametrize("name", sorted({*BENCHES} - {"real", "go2-codec"}))

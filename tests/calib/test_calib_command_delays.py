@@ -31,7 +31,7 @@ from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.random_delay import fit_delays
 from deal_hw.calib.validation.signatures import signatures
 from deal_hw.calibration import Budget
-from deal_hw.drivers.cartpole.profiles import PROFILES
+from deal_hw.drivers.cartpole.plant.profiles import PROFILES
 from deal_hw.parameters import Parameter
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray

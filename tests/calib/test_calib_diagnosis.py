@@ -17,10 +17,10 @@ from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
-from deal_hw.calib.validation.cause_words import SearchedKinds
+from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, fit_play, name_causes
+from deal_hw.calib.validation.diagnosis import Evidence, evidence, find_play, fit_play, name_causes
 from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.residual_place import densest_stretch
@@ -119,15 +119,15 @@ def test_friction_at_low_speed() -> None:
     """A force against the motion that dies out with speed."""
     v, _ = _motion()
     found = _named(_moved_by(-1.0 * np.sign(v) * np.exp(-np.abs(v) / 0.1)))
-    assert found[0].cause == "friction" and found[0].joints == ("knee",)
-    assert found[0].share > 0.5 and "dof_friction_creep" in found[0].alarm.do
+    assert found[0].code == "friction" and found[0].subject == ("knee",)
+    assert found[0].share > 0.5 and "dof_friction_creep" in found[0].do
 
 
 def test_sensor_on_the_motors_side_of_the_play() -> None:
     """0.4 mrad of play: an offset with the direction of motion."""
     v, _ = _motion()
     found = _named(2e-4 * np.sign(v))
-    assert found[0].cause == "backlash" and "the gear of knee" in found[0].alarm.do
+    assert found[0].code == "backlash" and "the gear of knee" in found[0].do
     assert found[0].share > 0.5
 
 
@@ -136,7 +136,7 @@ def test_damping_that_no_parameter_has() -> None:
     v, _ = _motion()
     wrong = _moved_by(-0.3 * v)
     found = _named(wrong)
-    assert found[0].cause == "damping" and found[0].share > 0.8
+    assert found[0].code == "damping" and found[0].share > 0.8
     assert _named(wrong, (wrong,)) == []
 
 
@@ -146,7 +146,7 @@ def test_damping_that_no_parameter_has() -> None:
 def test_forces_of_size_and_acceleration(cause: Cause, force: Callable[[FloatArray], FloatArray]) -> None:
     """A constant force is a load, one in proportion to acceleration an inertia."""
     found = _named(_moved_by(force(_motion()[1])))
-    assert found[0].cause == cause and found[0].share > 0.8
+    assert found[0].code == cause and found[0].share > 0.8
     assert len(found) == 1
 
 
@@ -154,7 +154,7 @@ def test_two_causes_are_named_and_the_larger_first() -> None:
     """A load of 0.3 and a damping of a third of its effect."""
     v, _ = _motion()
     found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
-    assert [f.cause for f in found] == ["load", "damping"]
+    assert [f.code for f in found] == ["load", "damping"]
     assert found[0].deviance > found[1].deviance > MISMATCH.evidence
 
 
@@ -170,9 +170,9 @@ def test_no_mass_below_zero_is_named() -> None:
     v, _ = _motion()
     effect = _moved_by(v * np.abs(v) + 0.3)
     found = name_causes(_with_masses(-1.6 * effect, cart=effect, pole=-effect))
-    assert found[0].cause == "mass" and found[0].joints == ("cart",)
-    assert "cart 160 % heavier" in found[0].alarm.seen and "pole" not in found[0].alarm.seen
-    assert not any(f.cause == "mass" for f in name_causes(_with_masses(-1.6 * effect, pole=-effect)))
+    assert found[0].code == "mass" and found[0].subject == ("cart",)
+    assert "cart 160 % heavier" in found[0].seen and "pole" not in found[0].seen
+    assert not any(f.code == "mass" for f in name_causes(_with_masses(-1.6 * effect, pole=-effect)))
 
 
 def test_a_rotor_is_named_beside_the_mass_that_moves_alike() -> None:
@@ -182,9 +182,9 @@ def test_a_rotor_is_named_beside_the_mass_that_moves_alike() -> None:
     known = _with_masses(effect, cart=-effect)
     rotor = Signature("inertia", "slide", ((effect + _moved_by(0.002 + 0 * a))[..., None] / STD,))
     (found,) = name_causes(dataclasses.replace(known, found=[*known.found, rotor]))[:1]
-    assert found.cause == "mass" and "cart 100 % heavier" in found.alarm.seen
-    assert "another inertia at slide explains as much" in found.alarm.seen
-    assert "free dof_armature of slide" in found.alarm.do
+    assert found.code == "mass" and "cart 100 % heavier" in found.seen
+    assert "another inertia at slide explains as much" in found.seen
+    assert "free dof_armature of slide" in found.do
 
 
 def test_advice_frees_only_what_is_not_free() -> None:
@@ -193,11 +193,11 @@ def test_advice_frees_only_what_is_not_free() -> None:
     known = _evidence(_moved_by(-0.3 * v))
     free = frozenset({("dof_damping", "knee"), ("servo_damping", "knee")})
     searched = dataclasses.replace(known, searched=SearchedKinds(free))
-    assert "searched already" in name_causes(searched)[0].alarm.do
+    assert "searched already" in name_causes(searched)[0].do
     half = dataclasses.replace(known, searched=SearchedKinds(frozenset({("dof_damping", "knee")})))
-    assert name_causes(half)[0].alarm.do == "Free servo_damping of knee (--parameters)."
+    assert name_causes(half)[0].do == "Free servo_damping of knee (--parameters)."
     ended = SearchedKinds(free, (("knee.damping", "dof_damping", "knee"),))
-    alarm = name_causes(dataclasses.replace(known, searched=ended))[0].alarm
+    alarm = name_causes(dataclasses.replace(known, searched=ended))[0]
     assert "knee.damping ended at the bound" in alarm.means and "--range" in alarm.do
 
 
@@ -212,7 +212,7 @@ def test_a_value_that_compensates_for_a_cause_is_marked(small_problem: Callable[
     known = uncertainty_at(problem, fit)
     std = np.sqrt(np.diag(known.covariance))
     shift = np.array([2 * std[0], 0.1 * std[1], 0.0])
-    wider = biased(problem, known, [dataclasses.replace(found, cause="load", shift=shift)])
+    wider = biased(problem, known, [dataclasses.replace(found, code="load", shift=shift)])
     names = problem.space.names
     assert wider.biased == {names[0]: "load"} and "identifiable" != wider.verdicts[0] != known.verdicts[0]
     (low, high), center = problem.space.to_scale(wider.interval.T), problem.space.to_scale(known.theta)
@@ -226,11 +226,11 @@ def test_contact_comes_in_bursts() -> None:
     rng = np.random.default_rng(2)
     for window, sample in ((2, 40), (8, 0)):
         wrong[window, sample : sample + 12] = 20 * STD * rng.normal(size=12)
-    found = {f.cause: f for f in _named(wrong)}
+    found = {f.code: f for f in _named(wrong)}
     assert "contact" in found
-    assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].alarm.do
+    assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].do
     # Far above the noise they are a part of what the model lacks.
-    assert not [f for f in name_causes(_evidence(wrong), 1000.0) if f.cause == "contact"]
+    assert not [f for f in name_causes(_evidence(wrong), 1000.0) if f.code == "contact"]
 
 
 def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:
@@ -238,10 +238,10 @@ def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:
     load = _moved_by(np.full((WINDOWS, SAMPLES), 0.3))
     strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
     known = _evidence(load + 2 * np.std(load) / np.std(strange) * strange)
-    assert [f.cause for f in name_causes(known, 5.0)] == ["load"]
+    assert [f.code for f in name_causes(known, 5.0)] == ["load"]
     assert name_causes(known, 100.0) == []
     # What explains most of it stands, however large it is.
-    assert [f.cause for f in name_causes(_evidence(load), 100.0)] == ["load"]
+    assert [f.code for f in name_causes(_evidence(load), 100.0)] == ["load"]
 
 
 def test_play_alone_stands_in_a_poor_fit() -> None:
@@ -253,7 +253,7 @@ def test_play_alone_stands_in_a_poor_fit() -> None:
     strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
     strange *= np.std(effect) / np.std(strange)
     (found,) = name_causes(_evidence(effect + 0.8 * strange), 100.0)
-    assert found.cause == "backlash" and 0.3 < found.share < 0.5
+    assert found.code == "backlash" and 0.3 < found.share < 0.5
     # With another cause near to it nothing is named, nor where it explains little.
     load = _moved_by(np.full((WINDOWS, SAMPLES), 1.0))
     near = 0.7 * load * np.std(effect) / np.std(load)
@@ -315,7 +315,7 @@ def test_lost_samples_are_no_evidence() -> None:
     """With 40 % of the samples lost, a load gains about 60 % of the deviance of all samples."""
     known = _evidence(_moved_by(np.full((WINDOWS, SAMPLES), 0.3)))
     whole, part = (name_causes(k)[0] for k in (known, _with_gaps(known, 0.4)))
-    assert part.cause == whole.cause == "load"
+    assert part.code == whole.code == "load"
     assert part.deviance == pytest.approx(0.6 * whole.deviance, rel=0.15)
 
 
@@ -439,10 +439,10 @@ def test_faults_of_a_simulated_robot_are_named(truth: Callable[[str, Fault | Non
     """Stribeck friction, and commands that are late by up to twice the mean delay."""
     _, problem, fit = truth("pendulum", "friction")
     friction = name_causes(evidence(problem, fit))
-    assert friction[0].cause == "friction" and friction[0].joints == ("pivot",)
+    assert friction[0].code == "friction" and friction[0].subject == ("pivot",)
     _, problem, fit = truth("pendulum", "jitter")
     jitter = name_causes(evidence(problem, fit))
-    assert jitter[0].cause == "delay" and "its own delay" in jitter[0].alarm.seen
+    assert jitter[0].code == "delay" and "its own delay" in jitter[0].seen
 
 
 def test_a_link_crosses_its_play_as_a_free_body() -> None:
@@ -463,9 +463,9 @@ def test_play_behind_the_motors_encoder_is_named(truth: Callable[[str, Fault | N
     """1 degree in the elbow, which no set-point's play explains: backlash there, not a heavier link."""
     _, problem, fit = truth("double-pendulum", "motor-play")
     found = name_causes(evidence(problem, fit))
-    assert found[0].cause == "backlash" and found[0].joints == ("elbow",)
-    assert "servo_play" in found[0].alarm.do and "on either side" in found[0].alarm.means
-    assert not any(f.cause == "mass" for f in found)
+    assert found[0].code == "backlash" and found[0].subject == ("elbow",)
+    assert "servo_play" in found[0].do and "on either side" in found[0].means
+    assert not any(f.code == "mass" for f in found)
 
 
 @pytest.mark.slow
@@ -473,10 +473,10 @@ def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Trut
     """The last link weighs 50 % more."""
     _, problem, fit = truth("double-pendulum", "mass")
     found = name_causes(evidence(problem, fit))
-    assert found[0].cause == "mass" and "fore" in found[0].joints
-    assert "Weigh" in found[0].alarm.do and "heavier" in found[0].alarm.seen
+    assert found[0].code == "mass" and "fore" in found[0].subject
+    assert "Weigh" in found[0].do and "heavier" in found[0].seen
     known = uncertainty_at(problem, fit, fixed_latency=False)
-    assert known.alarms and with_causes(problem, fit, known, found)[0].alarms[0] == found[0].alarm
+    assert known.alarms and with_causes(problem, fit, known, found)[0].alarms[0] == found[0]
 
 
 @pytest.mark.slow
@@ -517,8 +517,8 @@ def test_play_is_found_and_measured(
     found = find_play(problem, fit, fitted)
     assert found is not None and found.explains
     cause = found.diagnosis
-    assert cause.cause == "backlash" and cause.joints == ("pivot",)
-    assert "0.06 rad at pivot" in cause.alarm.seen and "servo_play" in cause.alarm.do
+    assert cause.code == "backlash" and cause.subject == ("pivot",)
+    assert "0.06 rad at pivot" in cause.seen and "servo_play" in cause.do
     assert cause.share > diagnosis.SETTINGS.decisive
 
 
@@ -564,9 +564,9 @@ def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Pa
     assert "pivot.armature" not in problem.space.names and unexplained(fit)
     assert [p.name for p in zero_parameters(problem)] == ["pivot.armature"]
     (found,) = diagnosis.find_zero(problem, fit, zero_parameters(problem))
-    value = float(re.findall(r"pivot.armature = (\S+) kg", found.alarm.seen)[0])
+    value = float(re.findall(r"pivot.armature = (\S+) kg", found.seen)[0])
     assert value == pytest.approx(0.01, rel=0.1)
-    assert found.cause == "inertia" and found.joints == ("pivot",) and found.share > 0.5
-    assert "was not searched" in found.alarm.means and "MJCF" in found.alarm.do
+    assert found.code == "inertia" and found.subject == ("pivot",) and found.share > 0.5
+    assert "was not searched" in found.means and "MJCF" in found.do
     # The others made up for it.
     assert np.abs(found.shift[:-1]).max() > 0.1

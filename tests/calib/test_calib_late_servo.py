@@ -13,13 +13,13 @@ from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.validation.diagnosis import diagnose
 from deal_hw.calib.validation.signatures import signatures
-from deal_hw.drivers.cartpole.controller import Controller
+from deal_hw.drivers.cartpole.chips.controller import Controller
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.chips.servo import Servo
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.mechanics import Mechanics
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, unique_id
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate
@@ -62,6 +62,6 @@ def test_a_servo_whose_damping_acts_late_is_named() -> None:
     theta = np.array([truth.parameters[name] for name in problem.space.names])
     fit = with_rows(refine(problem, theta, truth.latency_s))
     found = diagnose(problem, fit)
-    assert found[0].cause == "lag" and found[0].joints == ("cart",) and found[0].share > 0.5
-    assert "speed of cart" in found[0].alarm.do
+    assert found[0].code == "lag" and found[0].subject == ("cart",) and found[0].share > 0.5
+    assert "speed of cart" in found[0].do
     assert [s.where for s in signatures(problem, fit) if s.cause == "lag"] == ["cart"]

@@ -30,9 +30,10 @@ from deal_hw.calib.report.page import (
 )
 from deal_hw.calib.report.panels import envelope
 from deal_hw.calib.report.verdict import trust
-from deal_hw.calibration import Alarm, CalibrationResult, read_result
+from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
@@ -152,7 +153,7 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
     found = result(
         searched,
         method=HOSTILE,
-        alarms=(Alarm(HOSTILE, HOSTILE, HOSTILE),),
+        alarms=(Finding.alarm(HOSTILE, HOSTILE, HOSTILE),),
         null_directions=(HOSTILE,),
         trace=({HOSTILE: 1.0}, {HOSTILE: 2.0}),
         provenance={
@@ -186,7 +187,7 @@ def drawing(name: str = "now") -> RobotDrawing:
 
 def test_the_story_comes_first_then_the_verdict_then_alarms() -> None:
     """Result, bars and robot; whether it can be used; alarms in three parts; parameters; then the charts."""
-    found = result(space(), alarms=(Alarm("the rail is bent by 2 mm", "friction", "buy one"),))
+    found = result(space(), alarms=(Finding.alarm("the rail is bent by 2 mm", "friction", "buy one"),))
     page = Tags(render(dataclasses.replace(inputs(found), drawing=drawing("after 0.2 s"))))
     order = (
         "5.0 times better than the nominal model",
@@ -212,9 +213,9 @@ def test_the_story_comes_first_then_the_verdict_then_alarms() -> None:
 def test_alarms_with_one_remedy_are_one_entry() -> None:
     """Three alarms, two of them with the same remedy and meaning: two entries, each remedy once."""
     alarms = (
-        Alarm("a jitters", "worn out", "buy one"),
-        Alarm("b sticks", "rust", "oil it"),
-        Alarm("c jitters", "worn out", "buy one"),
+        Finding.alarm("a jitters", "worn out", "buy one"),
+        Finding.alarm("b sticks", "rust", "oil it"),
+        Finding.alarm("c jitters", "worn out", "buy one"),
     )
     text = Tags(render(inputs(result(space(), alarms=alarms)))).text()
     assert "3 alarms" in text
@@ -312,7 +313,7 @@ HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
         ({"chi2": float("nan")}, "amber", "does not test"),
         ({"null_directions": ("a and b",)}, "amber", "hardly tell some parameters apart"),
         ({"verdicts": ("not identifiable",) * 2}, "amber", "do not identify all parameters"),
-        ({"alarms": (Alarm("x", "y", "z"),)}, "amber", "There is 1 alarm."),
+        ({"alarms": (Finding.alarm("x", "y", "z"),)}, "amber", "There is 1 alarm."),
         ({"heldout_nrmse": {}}, "amber", "no held-out recording"),
     ],
 )

@@ -15,7 +15,8 @@ import pytest
 
 from deal_hw.calib.report.gather import OverlayPanel, ReportInputs, Residuals
 from deal_hw.calib.report.page import render
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -105,7 +106,7 @@ def test_nothing_is_off_the_screen_of_a_phone(tmp_path: Path) -> None:
         LONG,
         verdicts=("not identifiable",),
         null_directions=(f"{LONG} and {LONG}",),
-        alarms=(Alarm(LONG, LONG, LONG),),
+        alarms=(Finding.alarm(LONG, LONG, LONG),),
         advice=({"parameter": LONG, "std": 1.0, "std_after": 0.5, "excitation": "x", "sentence": LONG},),
         heldout_nrmse={"nominal": 0.1, "calibrated": 0.02, "null": 0.3},
         covariance=np.eye(1),

@@ -18,7 +18,7 @@ from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
 from deal_hw.workflows.calibration.prepare import prepare

@@ -7,11 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate_output import ALARM_LINES, other_alarms, print_result, print_verdict
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
 
-CAUSE = Alarm(
+CAUSE = Finding.alarm(
     "With hand 57 % heavier the model predicts left-out motion with 83 % less residual: another mass.",
     "The ratio of the bodies' masses is not the model's.",
     "Weigh hand, correct the model, or free body_mass there (--parameters).",
@@ -19,7 +20,7 @@ CAUSE = Alarm(
 LONG = "Residuals of the elbow are larger than the sensor's noise by a factor of 3.1 in each recording. "
 
 
-def doubtful(*alarms: Alarm) -> CalibrationResult:
+def doubtful(*alarms: Finding) -> CalibrationResult:
     """Return a result with alarms, better than nominal on held-out motion."""
     space = ParameterSpace(
         [Parameter.around("elbow.stiffness", "servo_stiffness", ["elbow"], "N·m/rad", 30.0)]
@@ -40,7 +41,7 @@ def doubtful(*alarms: Alarm) -> CalibrationResult:
 
 def test_the_first_alarm_is_the_last_thing_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """Six alarms of three lines each: at most 20 lines, and what to do about the first is the last line."""
-    others = [Alarm(f"{k}: {2 * LONG}", "It is wrong.", f"Repair it, way {k}.") for k in range(5)]
+    others = [Finding.alarm(f"{k}: {2 * LONG}", "It is wrong.", f"Repair it, way {k}.") for k in range(5)]
     print_verdict(doubtful(CAUSE, *others))
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= ALARM_LINES
@@ -58,7 +59,8 @@ def test_the_first_alarm_is_the_last_thing_printed(capsys: pytest.CaptureFixture
 def test_alarms_with_one_remedy_are_one_entry() -> None:
     """Two values at bounds ask for one thing; nothing is hidden where there is room."""
     widen = "Widen the range."
-    alarms = [Alarm("a ended there.", "x", widen), Alarm("b jitters.", "x", "y"), Alarm("c did.", "x", widen)]
+    words = [("a ended there.", widen), ("b jitters.", "y"), ("c did.", widen)]
+    alarms = [Finding.alarm(seen, "x", do) for seen, do in words]
     assert other_alarms(alarms, 80, 20) == ["alarm: b jitters.", "alarm: a ended there. c did."]
     assert other_alarms(alarms, 80, 2) == [
         "1 more alarm: see result.json or the report",

@@ -12,7 +12,7 @@ import pytest
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, InsufficientDataError
 from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole

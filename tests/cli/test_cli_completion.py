@@ -54,7 +54,7 @@ def offered(script: Path, folder: Path, *words: str) -> set[str]:
         (("cal",), {"calibrate"}),
         (("data", "inf"), {"info"}),
         (("calibrate", "--metho"), {"--method"}),
-        (("calibrate", "--model", "rob"), {"robot.xml"}),
+        (("calibrate", "--model", "rob"), set()),
         (("data", "info", "--js"), {"--json"}),
         (("collect", "cart"), {"cartpole"}),
         (("bench", "fixed"), {"fixed-range"}),
@@ -65,8 +65,7 @@ def offered(script: Path, folder: Path, *words: str) -> set[str]:
     ],
 )
 def test_tab_completes(script: Path, tmp_path: Path, words: tuple[str, ...], expected: set[str]) -> None:
-    """Verbs, sub-verbs, options, choices, robots and files."""
-    (tmp_path / "robot.xml").touch()
+    """Verbs, sub-verbs, options, choices and robots."""
     assert offered(script, tmp_path, *words) == expected
 
 

@@ -30,9 +30,9 @@ from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
 from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.control.supervisor import Supervisor
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
+from deal_hw.findings import Finding, Severity
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
@@ -212,7 +212,7 @@ def test_the_demo_ends_with_the_right_remedy(
 
 def test_a_recording_with_a_clock_jump_is_made_again(loaded: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that calibration would refuse is as good as none; of several episodes each must be sound."""
-    jump = CheckResult("clock", Severity.FAIL, "1 clock jumps (+60.0 ms at 3.00 s)")
+    jump = Finding("clock", Severity.FAIL, "1 clock jumps (+60.0 ms at 3.00 s)")
     left = [[], [jump], [], [], *([[jump]] * 5)]
     monkeypatch.setattr(demo_runs, "check_recording", lambda _: left.pop(0))
     two = run_of(ended(0), ended(1))

@@ -16,12 +16,12 @@ import pytest
 from deal_hw.cli import doctor as verb
 from deal_hw.cli.doctor import Doctor, doctor
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.workflows.doctor import machine
 from deal_hw.workflows.doctor.examine import DoctorReport, judge_interfaces
@@ -30,22 +30,25 @@ from deal_hw.workflows.doctor.robot import examine_robot
 pytestmark = pytest.mark.real_time
 
 
-def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[Level]:
+def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[Severity]:
     """Return the levels of an area's findings."""
-    return {f.level for f in findings if f.area == area}
+    return {f.severity for f in findings if f.code == area}
 
 
 def test_this_computer_is_examined(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Every area is looked at, the file has the same findings, and what is wrong has a remedy."""
     out = tmp_path / "findings.json"
     report = doctor(Doctor(json=out))
-    areas = {f.area for f in report.findings}
+    areas = {f.code for f in report.findings}
     assert areas >= {"system", "packages", "scheduling", "memory", "clock", "network", "interfaces"}
-    assert json.loads(out.read_text()) == [f.to_json() for f in report.findings]
-    assert all(f.remedy for f in report.findings if f.level in (Level.WARN, Level.FAIL))
+    assert json.loads(out.read_text()) == [
+        {"area": f.code, "level": f.severity.value, "message": f.seen, "remedy": f.do}
+        for f in report.findings
+    ]
+    assert all(f.do for f in report.findings if f.severity in (Severity.WARN, Severity.FAIL))
     said = capsys.readouterr()
     words = " ".join(said.out.split())
-    assert all(" ".join(f.message.split()) in words for f in report.findings)
+    assert all(" ".join(f.seen.split()) in words for f in report.findings)
     assert "all is well" in said.err or "worst:" in said.err
 
 
@@ -73,10 +76,10 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
         machine, "_read", lambda path: {"rmem_max": "1000"}.get(path.rpartition("/")[2], "acpi_pm")
     )
     findings = tuple(machine.examine_machine())
-    assert levels(findings, "scheduling") == levels(findings, "memory") == {Level.WARN}
-    assert levels(findings, "packages") == {Level.NOTE}
-    assert levels(findings, "network") == {Level.WARN}
-    text = " ".join(f.remedy for f in findings)
+    assert levels(findings, "scheduling") == levels(findings, "memory") == {Severity.WARN}
+    assert levels(findings, "packages") == {Severity.NOTE}
+    assert levels(findings, "network") == {Severity.WARN}
+    text = " ".join(f.do for f in findings)
     for word in ("limits.conf", "rtprio", "memlock", "[dds]", "rmem_max", "tsc"):
         assert word in text
 
@@ -90,7 +93,7 @@ def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[st
     ):
         report = doctor(Doctor(robot=robot, transport=transport, port=port))
         assert report.exit_code == 1
-        assert levels(report.findings, "link") == {Level.FAIL}
+        assert levels(report.findings, "link") == {Severity.FAIL}
         assert port in capsys.readouterr().out
 
 
@@ -116,11 +119,11 @@ def test_a_cable_that_is_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     monkeypatch.setattr(interfaces, "list_interfaces", lambda: known)
     found = list(judge_interfaces("192.168.123.99"))
-    assert [f.level for f in found] == [Level.FAIL, Level.WARN, Level.OK]
-    (lo,) = [f for f in judge_interfaces("127.0.0.1") if f.message.startswith("lo ")]
-    assert (lo.level, "ip link set lo multicast on" in lo.remedy) == (Level.NOTE, True)
-    assert "cable" in found[0].remedy
-    assert "multicast on" in found[1].remedy
+    assert [f.severity for f in found] == [Severity.FAIL, Severity.WARN, Severity.OK]
+    (lo,) = [f for f in judge_interfaces("127.0.0.1") if f.seen.startswith("lo ")]
+    assert (lo.severity, "ip link set lo multicast on" in lo.do) == (Severity.NOTE, True)
+    assert "cable" in found[0].do
+    assert "multicast on" in found[1].do
 
 
 def listened(drop: float = 0.0, corrupt: float = 0.0, local: bool = False) -> list[Finding]:
@@ -136,17 +139,17 @@ def listened(drop: float = 0.0, corrupt: float = 0.0, local: bool = False) -> li
 def test_a_serial_robot_is_greeted_and_listened_to() -> None:
     """Who it is, its states, the link's errors and its clock; its motor stays off."""
     found = listened()
-    assert {f.level for f in found} == {Level.OK}
-    text = "; ".join(f.message for f in found)
+    assert {f.severity for f in found} == {Severity.OK}
+    text = "; ".join(f.seen for f in found)
     for words in ("firmware (", "200 states a second of 200", "0 of 40", "+0.00 %"):
         assert words in text
 
 
 def test_a_bad_serial_cable_is_a_warning() -> None:
     """A fifth of the frames lost: fewer states, and their share."""
-    found = [f for f in listened(0.2) if f.area == "states"]
-    assert [f.level for f in found] == [Level.WARN, Level.WARN, Level.OK]
-    assert all("cable" in f.remedy for f in found[:2])
+    found = [f for f in listened(0.2) if f.code == "states"]
+    assert [f.severity for f in found] == [Severity.WARN, Severity.WARN, Severity.OK]
+    assert all("cable" in f.do for f in found[:2])
 
 
 @pytest.mark.parametrize("local", [False, True])
@@ -154,16 +157,16 @@ def test_a_link_on_which_no_run_lasts_is_a_failure(local: bool) -> None:
     """Three frames of ten corrupt, 46 % of the states: the exit code says so; an emulator has no cable."""
     found = listened(corrupt=0.3, local=local)
     assert DoctorReport(findings=tuple(found)).exit_code == 1
-    (worst,) = [finding for finding in found if finding.level is Level.FAIL]
-    assert "a run trips at 30%" in worst.message
-    assert ("check cable" in worst.remedy) is not local and ("--corrupt" in worst.remedy) is local
+    (worst,) = [finding for finding in found if finding.severity is Severity.FAIL]
+    assert "a run trips at 30%" in worst.seen
+    assert ("check cable" in worst.do) is not local and ("--corrupt" in worst.do) is local
 
 
 def test_what_is_printed_fits_the_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """80 columns, but for words that are longer; the second line of a remedy is below its first."""
-    long = Finding("states", Level.FAIL, "word " * 40, "remedy " * 30)
+    long = Finding("states", Severity.FAIL, "word " * 40, "remedy " * 30)
     monkeypatch.setattr(verb, "examine", lambda config: iter([long]))
     monkeypatch.setenv("COLUMNS", "80")
     assert doctor(Doctor()).exit_code == 1

@@ -24,9 +24,9 @@ from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.cli.main import main
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth as nominal_cartpole
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
-import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import pytest
 from verb_options import Option, dataclasses_of, options
 
 from deal_hw.cli.main import VERBS, parse
-from deal_hw.cli.parsing import Rules
 from deal_hw.clock import VirtualClock
 from deal_hw.control.loop import Outcome
 from deal_hw.drivers import driver_description, make_robot
@@ -188,23 +186,6 @@ def test_an_option_changes_something_or_is_refused(
     assert not isinstance(plain[line], DealHwError), plain[line]
     changed = outcome(done, [*line.split(), *option.words])
     assert isinstance(changed, DealHwError) or changed != plain[line], f"{' '.join(option.words)} did nothing"
-    if option.name in of_others(line):
-        assert isinstance(changed, DealHwError), f"{option.flag} is in no help page of this robot, but taken"
-
-
-def of_others(line: str) -> set[str]:
-    """Return the options that a line's help page leaves out, because other robots take them."""
-    verb, *words = line.split()
-    rules = Rules([*words, "--help"])
-    hidden: set[str] = set()
-    for settings in dataclasses_of(getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)):
-        for name, hint in typing.get_type_hints(settings, include_extras=True).items():
-            if rules.hides(hint):
-                hidden |= {
-                    name,
-                    *(field.name for group in dataclasses_of(hint) for field in dataclasses.fields(group)),
-                }
-    return hidden
 
 
 def test_every_option_of_every_verb_is_read() -> None:

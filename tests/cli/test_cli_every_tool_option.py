@@ -18,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from verb_options import Option, options, sub_verb
+from verb_options import Option, kind_of, options
 
 from deal_hw.cli.main import VERBS, main, parse
 from deal_hw.errors import DealHwError
@@ -172,7 +172,7 @@ def cases() -> Iterator[Any]:
     for line in LINES:
         verb, *words = line.split()
         config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
-        for option in options(sub_verb(config, words[0] if words else ""), VALUES):
+        for option in options(kind_of(config, *words), VALUES):
             if option.name not in TOLD_ELSEWHERE and not {option.flag, *option.words[:1]} & set(words):
                 yield pytest.param(line, option, id=f"{line} {option.name}")
 
@@ -301,10 +301,13 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     )
     for path in CARTPOLE_EMULATORS.values():
         monkeypatch.setattr(path.replace(":", "."), note("emulator", emulator))
-    from deal_hw.drivers.cartpole.truth import nominal_truth as nominal_cartpole
+    from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
 
-    for target, truth in (("cartpole.oracle", nominal_cartpole), ("go2.emulator.truth", nominal_go2)):
+    for target, truth in (
+        ("cartpole.emulator.oracle", nominal_cartpole),
+        ("go2.emulator.truth", nominal_go2),
+    ):
         drawn = note("drawn", truth("sensor", 0))
         monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 
 
@@ -135,14 +136,14 @@ def test_result_there_and_back() -> None:
         verdicts=("identifiable", "weak"),
         latency_s=0.012,
         latency_interval_s=(0.0115, 0.0125),
-        alarms=(Alarm("x", "y", "z"),),
+        alarms=(Finding.alarm("x", "y", "z"),),
         heldout_nrmse={"nominal": 0.3},
     )
     again = CalibrationResult.from_json(json.loads(json.dumps(result.to_json())))
     np.testing.assert_array_equal(again.interval, result.interval)
     assert (
         again.verdicts == result.verdicts
-        and again.alarms == (Alarm("x", "y", "z"),)
+        and again.alarms == (Finding.alarm("x", "y", "z"),)
         and again.latency_s == 0.012
     )
     covariance = again.distribution().covariance

@@ -29,7 +29,7 @@ from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers import make_topic_transport, make_transport
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.go2.emulator.sport_service import SportMode
 from deal_hw.errors import (
     ConfigurationError,

@@ -8,9 +8,9 @@ import pytest
 
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording.record import CycleRecord
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 
 

@@ -16,10 +16,10 @@ from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.safety import Safety
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.drivers.go2.emulator.device import Go2Device

@@ -18,7 +18,7 @@ from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.safety import Safety
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.types import FloatArray
 

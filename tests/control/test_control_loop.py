@@ -18,9 +18,9 @@ from deal_hw.control.passive import PassiveConfig
 from deal_hw.control.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.control.safety import Safety
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
-from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults

@@ -28,8 +28,8 @@ from deal_hw.control.loop import Outcome
 from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import (
     ConfigurationError,

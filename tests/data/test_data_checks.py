@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from deal_hw.data.recording.excitation import excitation
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, check, worst
+from deal_hw.data.recording.telemetry_checks import check
+from deal_hw.findings import Finding, Severity, worst
 from deal_hw.types import Status, Trajectory
 
 MakeTrajectory = Callable[..., Trajectory]
 
 
-def verdict(trajectory: Trajectory, name: str) -> CheckResult:
+def verdict(trajectory: Trajectory, name: str) -> Finding:
     """Return one verdict by its name."""
-    (found,) = [verdict for verdict in check(trajectory) if verdict.name == name]
+    (found,) = [verdict for verdict in check(trajectory) if verdict.code == name]
     return found
 
 
@@ -41,7 +42,7 @@ def test_sound_recording_passes(make_trajectory: MakeTrajectory) -> None:
     verdicts = check(make_trajectory())
     assert [v for v in verdicts if v.severity is not Severity.OK] == []
     assert worst(verdicts) is Severity.OK
-    assert len({v.name for v in verdicts}) == len(verdicts)
+    assert len({v.code for v in verdicts}) == len(verdicts)
 
 
 def test_short_recording_fails(make_trajectory: MakeTrajectory) -> None:

@@ -10,7 +10,7 @@ import pytest
 from deal_hw.data.checks.command_kind import command_kind
 from deal_hw.data.importing.load import load_tables
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import Severity
+from deal_hw.findings import Severity
 from deal_hw.types import FloatArray
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
@@ -68,7 +68,7 @@ def test_positions(seed: int) -> None:
     made = table(play(command, servo=True, seed=seed), command)
     assert command_kind(made, servo=True).severity is Severity.OK
     verdict = command_kind(made, servo=False)
-    assert verdict.severity is Severity.FAIL and verdict.name == "actuation"
+    assert verdict.severity is Severity.FAIL and verdict.code == "actuation"
     assert "look like positions (joint0, joint1)" in verdict.message and "<position joint=" in verdict.message
 
 

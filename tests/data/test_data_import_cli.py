@@ -22,8 +22,8 @@ from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.load import load_tables
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.data.recording.telemetry_checks import Severity, worst
 from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.findings import Severity, worst
 from deal_hw.install import install_line
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -308,6 +308,6 @@ def test_swapped_legs_of_a_real_robot_are_found() -> None:
         }
     )
     (table,) = load_tables(REAL / "go2_suspended" / "train.npz", columns)
-    found = next(v for v in examine(table) if v.name == "assignment")
+    found = next(v for v in examine(table) if v.code == "assignment")
     assert found.severity is Severity.FAIL
     assert "FR_hip follows the command of FL_hip" in found.message

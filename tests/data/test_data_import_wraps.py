@@ -18,8 +18,8 @@ from deal_hw.data.importing.load import load_tables, tables_of
 from deal_hw.data.importing.memory_source import read_memory
 from deal_hw.data.importing.table import Table
 from deal_hw.data.importing.wraps import unwrap
-from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.errors import ConfigurationError
+from deal_hw.findings import Severity
 from deal_hw.types import FloatArray
 
 TURN = 2 * np.pi

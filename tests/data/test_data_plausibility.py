@@ -17,17 +17,17 @@ from hypothesis.extra import numpy as hnp
 from deal_hw.data.checks.joint_match import best_assignment
 from deal_hw.data.checks.plausibility import examine, require
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, worst
 from deal_hw.errors import DatasetError, MissingExtraError
+from deal_hw.findings import Finding, Severity, worst
 from deal_hw.install import install_line
 
 MakeTable = Callable[..., Table]
 LIMITS = np.array([[-1.0, 1.0]] * 3)
 
 
-def verdict(table: Table, name: str, limits: np.ndarray | None = None) -> CheckResult:
+def verdict(table: Table, name: str, limits: np.ndarray | None = None) -> Finding:
     """Return one verdict on a recording."""
-    return next(verdict for verdict in examine(table, limits) if verdict.name == name)
+    return next(verdict for verdict in examine(table, limits) if verdict.code == name)
 
 
 def test_sound_recording_passes(make_table: MakeTable) -> None:
@@ -142,7 +142,7 @@ def test_degrees_are_one_cause_in_one_short_paragraph(make_table: MakeTable) -> 
     """Positions in degrees lie far from their commands and outside the limits: no second cause."""
     sound = make_table()
     found = examine(make_table(position=np.rad2deg(sound.position)), LIMITS)
-    assert [v.name for v in found if v.severity is Severity.FAIL] == ["units"]
+    assert [v.code for v in found if v.severity is Severity.FAIL] == ["units"]
     with pytest.raises(DatasetError) as refused:
         require(found, "rec.csv")
     text = str(refused.value)

@@ -11,8 +11,8 @@ import pytest
 from fakes.simulated_episode import simulated_episode
 
 from deal_hw.data.checks.slip import ALIKE, LEAST_S, Slip, find_slip, slip_verdict
-from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.findings import Severity
 from deal_hw.testing.plain_robots import make_robot, record
 from deal_hw.types import FloatArray
 

@@ -15,7 +15,8 @@ from deal_hw.data.checks.plausibility import despiked, examine
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.spikes import SpikeSettings, describe, find_spikes, sound, without_spikes
-from deal_hw.data.recording.telemetry_checks import Severity, check
+from deal_hw.data.recording.telemetry_checks import check
+from deal_hw.findings import Severity
 from deal_hw.types import FloatArray, Trajectory
 
 TIME_S = np.arange(200, dtype=np.float64) * 0.01
@@ -174,7 +175,7 @@ def test_check_of_an_imported_recording(make_table: Callable[..., Table]) -> Non
     table = make_table(position=position)
     limits = np.array([[-1.0, 1.0]] * 3)
     (found,) = [v for v in examine(table, limits) if v.severity is not Severity.OK]
-    assert found.name == "spikes" and found.severity is Severity.WARN
+    assert found.code == "spikes" and found.severity is Severity.WARN
     assert (
         "hip +300 rad at 3.000 s, foot -2.84 rad at 7" in found.message and "--spike-ratio" in found.message
     )
@@ -182,14 +183,14 @@ def test_check_of_an_imported_recording(make_table: Callable[..., Table]) -> Non
     assert np.array_equal(kept.time_s, np.delete(table.time_s, [300, 700]))
     assert len(kept.target) == len(table.target)
     overruled = examine(table, limits, None, SpikeSettings(ratio=1e6))
-    assert any(v.name == "units" and v.severity is Severity.FAIL for v in overruled)
+    assert any(v.code == "units" and v.severity is Severity.FAIL for v in overruled)
 
 
 def test_a_sensor_that_fails_is_refused(make_table: Callable[..., Table]) -> None:
     """26 of 1200 samples are more than 2 %."""
     position = make_table().position.copy()
     position[40:1200:45, 1] += 3.0
-    found = next(v for v in examine(make_table(position=position)) if v.name == "spikes")
+    found = next(v for v in examine(make_table(position=position)) if v.code == "spikes")
     assert found.severity is Severity.FAIL and "26 samples" in found.message and "2.2%" in found.message
 
 
@@ -201,7 +202,7 @@ def test_check_of_our_own_recording(make_trajectory: Callable[..., Trajectory]) 
     position[100, 1] += 3.0
     recorded = make_trajectory(position=position)
     (found,) = [v for v in check(recorded) if v.severity is not Severity.OK]
-    assert found.name == "spikes" and "pole +3 rad at 0.500 s" in found.message
+    assert found.code == "spikes" and "pole +3 rad at 0.500 s" in found.message
     kept = without_spikes(recorded)
     assert np.array_equal(kept.device_s, np.delete(clean.device_s, 100))
     assert np.array_equal(kept.position, np.delete(clean.position, 100, axis=0))

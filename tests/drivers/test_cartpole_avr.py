@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.avr_device import AvrDevice, Chip, eeprom, library
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.host_firmware import Settings
-from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
-from deal_hw.drivers.cartpole.rig_device import Rig
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.avr_device import AvrDevice, Chip, eeprom, library
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.chips.host_firmware import Settings
+from deal_hw.drivers.cartpole.chips.rig_device import Rig
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.protocol import Ack, Info, Result, State, Target
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.fake_device import FakeDevice

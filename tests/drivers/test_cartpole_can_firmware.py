@@ -14,21 +14,22 @@ from hypothesis import strategies as st
 
 from deal_hw.cli.emulate import Emulate
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.can_emulator import can_device, can_devices
-from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept, database, frame_id
-from deal_hw.drivers.cartpole.can_robot import CanFrames
-from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
-from deal_hw.drivers.cartpole.faults import CanFaults
-from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, library, settings_of
-from deal_hw.drivers.cartpole.odrive_drive import OdriveFirmware
-from deal_hw.drivers.cartpole.odrive_emulator import PoleEncoder, odrive_device
-from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
-from deal_hw.drivers.cartpole.protocol import Target
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.truth import candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.controller import Controller, Firmware, Mode
+from deal_hw.drivers.cartpole.chips.host_firmware import CanHostFirmware, Settings, library, settings_of
+from deal_hw.drivers.cartpole.emulator.can_emulator import can_device, can_devices
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults
+from deal_hw.drivers.cartpole.emulator.odrive_drive import OdriveFirmware
+from deal_hw.drivers.cartpole.emulator.odrive_emulator import PoleEncoder, odrive_device
+from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
+from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.plant.truth import candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.robots.can_robot import CanFrames
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, CanLink, accept, database, frame_id
+from deal_hw.drivers.cartpole.wire.odrive_link import OdriveSettings
+from deal_hw.drivers.cartpole.wire.protocol import Target
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError, VersionMismatchError, WrongDeviceError

@@ -11,9 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage, accept, database, frame_id
-from deal_hw.drivers.cartpole.protocol import MessageType, Result
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import (
+    FRAME,
+    Angle,
+    CanLink,
+    CanMessage,
+    accept,
+    database,
+    frame_id,
+)
+from deal_hw.drivers.cartpole.wire.protocol import MessageType, Result
 from deal_hw.errors import ConfigurationError, FrameError
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "protocol-cartpole-can.md").read_text(

@@ -20,17 +20,17 @@ from deal_hw.cli.emulate import Emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers import claim_name, make_robot
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_emulator import can_device, can_devices, can_emulator
-from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept, frame_id
-from deal_hw.drivers.cartpole.can_robot import CanFrames, can_robot
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
-from deal_hw.drivers.cartpole.faults import CanFaults, Hazards
-from deal_hw.drivers.cartpole.link import SerialLink
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.emulator.can_emulator import can_device, can_devices, can_emulator
+from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults, Hazards
+from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.can_robot import CanFrames, can_robot
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, CanLink, accept, frame_id
+from deal_hw.drivers.cartpole.wire.link import SerialLink
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport, encode_line
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import (

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.controller import WATCHDOG_TICKS
+from deal_hw.drivers.cartpole.chips.controller import WATCHDOG_TICKS
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.mechanics import HOMING_TICKS, Mechanics
-from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.plant.mechanics import HOMING_TICKS, Mechanics
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.protocol import Ack, Info, Result, State, Target
 from deal_hw.types import Status
 
 MS = 1_000_000

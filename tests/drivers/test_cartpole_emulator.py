@@ -11,12 +11,12 @@ import pytest
 from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import adopt_robot, make_robot
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
-from deal_hw.drivers.cartpole.faults import Hazards
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.emulator.faults import Hazards
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import (
     ConfigurationError,

@@ -17,8 +17,12 @@ from firmware_inputs import IntegerServo, outputs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.controller import Controller, Firmware, Mode
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.chips.firmwares import FIRMWARES, usable_firmware
+from deal_hw.drivers.cartpole.chips.host_firmware import HostFirmware, Settings, library, settings_of
+from deal_hw.drivers.cartpole.chips.servo import Servo
 from deal_hw.drivers.cartpole.description import (
     DAMPING_NS_M,
     EFFORT_LIMIT_N,
@@ -26,13 +30,10 @@ from deal_hw.drivers.cartpole.description import (
     STIFFNESS_N_M,
     parameter_space,
 )
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.firmwares import FIRMWARES, usable_firmware
-from deal_hw.drivers.cartpole.host_firmware import HostFirmware, Settings, library, settings_of
-from deal_hw.drivers.cartpole.protocol import Target
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.protocol import Target
 from deal_hw.errors import ConfigurationError
 
 needs_compiler = pytest.mark.skipif(

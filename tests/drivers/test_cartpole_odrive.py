@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import make_robot
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
-from deal_hw.drivers.cartpole.odrive_drive import OdriveFirmware
-from deal_hw.drivers.cartpole.odrive_emulator import odrive_device
-from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
-from deal_hw.drivers.cartpole.odrive_frames import CLOSED_LOOP, IDLE, AxisError, Command, pack
-from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveLink, OdriveSettings, drive_command
-from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot, odrive_settings
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.emulator.odrive_drive import OdriveFirmware
+from deal_hw.drivers.cartpole.emulator.odrive_emulator import odrive_device
+from deal_hw.drivers.cartpole.emulator.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.odrive_robot import OdriveRobot, odrive_settings
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, Angle, CanLink
+from deal_hw.drivers.cartpole.wire.odrive_frames import CLOSED_LOOP, IDLE, AxisError, Command, pack
+from deal_hw.drivers.cartpole.wire.odrive_link import ENCODER_KIND, OdriveLink, OdriveSettings, drive_command
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import (
     ConfigurationError,

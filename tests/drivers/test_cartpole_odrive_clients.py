@@ -10,13 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.cartpole.can_link import FRAME, REMOTE
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.faults import CanFaults, Hazards
-from deal_hw.drivers.cartpole.odrive_drive import BOOT_TICKS
-from deal_hw.drivers.cartpole.odrive_emulator import odrive_device, odrive_emulator
-from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, ENDPOINTS, flat_endpoints
-from deal_hw.drivers.cartpole.odrive_frames import (
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults, Hazards
+from deal_hw.drivers.cartpole.emulator.odrive_drive import BOOT_TICKS
+from deal_hw.drivers.cartpole.emulator.odrive_emulator import odrive_device, odrive_emulator
+from deal_hw.drivers.cartpole.emulator.odrive_endpoints import ENABLE_WATCHDOG, ENDPOINTS, flat_endpoints
+from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, REMOTE
+from deal_hw.drivers.cartpole.wire.odrive_frames import (
     CLOSED_LOOP,
     IDLE,
     LAYOUT,
@@ -27,9 +29,7 @@ from deal_hw.drivers.cartpole.odrive_frames import (
     Command,
     pack,
 )
-from deal_hw.drivers.cartpole.odrive_link import OdriveSettings
-from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.wire.odrive_link import OdriveSettings
 
 PARTS = OdriveSettings()
 MS = 1_000_000

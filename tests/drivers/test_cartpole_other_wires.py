@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from deal_hw.clock import Clock, VirtualClock
-from deal_hw.drivers.cartpole.can_emulator import can_device
-from deal_hw.drivers.cartpole.device import EmulatedDevice
+from deal_hw.drivers.cartpole.chips.device import EmulatedDevice
+from deal_hw.drivers.cartpole.chips.firmwares import device_of
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
-from deal_hw.drivers.cartpole.faults import CanFaults
-from deal_hw.drivers.cartpole.firmwares import device_of
-from deal_hw.drivers.cartpole.other_wires import name_other_wire
-from deal_hw.drivers.cartpole.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.emulator.can_emulator import can_device
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults
+from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.wire.other_wires import name_other_wire
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import PortBusyError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.transport import Transport
 
@@ -67,10 +67,10 @@ def found(what: str, transport: str, port: str = "/dev/x") -> list[Finding]:
 def test_the_wire_of_a_port_is_named(what: str, transport: str, says: str, remedy: str) -> None:
     """What answers, that it was opened as another wire, and the arguments to use instead."""
     (finding,) = found(what, transport, "slcan:/dev/x?bitrate=500000" if transport == "can" else "/dev/x")
-    assert finding.level is Level.FAIL
-    assert says in finding.message
-    assert f"--transport {transport} is the wrong wire" in finding.message
-    assert remedy in finding.remedy
+    assert finding.severity is Severity.FAIL
+    assert says in finding.seen
+    assert f"--transport {transport} is the wrong wire" in finding.seen
+    assert remedy in finding.do
 
 
 @pytest.mark.parametrize(("what", "transport"), [("adapter", "odrive"), ("servos", "dynamixel")])

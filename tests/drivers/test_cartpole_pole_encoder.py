@@ -13,21 +13,22 @@ from fakes.stm32_device import Stm32Chip
 from firmware_inputs import CAN, INSTALL_QEMU, MACHINE, RecordedCore, outputs, results_under_qemu
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage, frame_id
-from deal_hw.drivers.cartpole.controller import Mode
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings, flash_page
-from deal_hw.drivers.cartpole.odrive_drive import OdriveFirmware
-from deal_hw.drivers.cartpole.odrive_emulator import PoleEncoder
-from deal_hw.drivers.cartpole.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
-from deal_hw.drivers.cartpole.odrive_frames import IDLE, Command, pack
-from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveSettings
-from deal_hw.drivers.cartpole.odrive_robot import OdriveRobot
-from deal_hw.drivers.cartpole.protocol import Ack, Info, MessageType, Result
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.controller import Mode
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.chips.host_firmware import CanHostFirmware, Settings, flash_page
+from deal_hw.drivers.cartpole.chips.servo import Servo
+from deal_hw.drivers.cartpole.emulator.odrive_drive import OdriveFirmware
+from deal_hw.drivers.cartpole.emulator.odrive_emulator import PoleEncoder
+from deal_hw.drivers.cartpole.emulator.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
+from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.odrive_robot import OdriveRobot
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, Angle, CanLink, CanMessage, frame_id
+from deal_hw.drivers.cartpole.wire.odrive_frames import IDLE, Command, pack
+from deal_hw.drivers.cartpole.wire.odrive_link import ENCODER_KIND, OdriveSettings
+from deal_hw.drivers.cartpole.wire.protocol import Ack, Info, MessageType, Result
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultyTransport, OneBadFrame

@@ -10,8 +10,8 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.protocol import FrameDecoder, MessageType, Result
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.protocol import FrameDecoder, MessageType, Result
 from deal_hw.errors import FrameError, VersionMismatchError
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "protocol-cartpole-serial.md"

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.protocol import DELIMITER, Info
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.protocol import DELIMITER, Info
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
 from deal_hw.testing.fake_device import FakeDevice

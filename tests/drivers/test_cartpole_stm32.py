@@ -13,14 +13,15 @@ from fakes.stm32_device import Stm32Chip, Stm32Device
 from firmware_inputs import CAN, INSTALL_QEMU, MACHINE, SERIAL, RecordedCore, outputs, results_under_qemu
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole import native, protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, frame_id
-from deal_hw.drivers.cartpole.host_firmware import Settings, flash_page
-from deal_hw.drivers.cartpole.link import HostLink, SerialLink
-from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.truth import candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.host_firmware import Settings, flash_page
+from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.plant.truth import candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, CanLink, frame_id
+from deal_hw.drivers.cartpole.wire.link import HostLink, SerialLink
+from deal_hw.drivers.cartpole.wire.protocol import Ack, Info, Result, State, Target
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.fake_device import FakeDevice

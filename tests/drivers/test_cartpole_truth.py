@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES, k9_space
-from deal_hw.drivers.cartpole.lqr import design_lqr, linearise
-from deal_hw.drivers.cartpole.mechanics import Mechanics
-from deal_hw.drivers.cartpole.oracle import balances, draw_truth, oracle_balances
-from deal_hw.drivers.cartpole.profiles import PROFILES
-from deal_hw.drivers.cartpole.sensor import Sample, Sensor
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.emulator.lqr import design_lqr, linearise
+from deal_hw.drivers.cartpole.emulator.oracle import balances, draw_truth, oracle_balances
+from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
+from deal_hw.drivers.cartpole.plant.profiles import PROFILES
+from deal_hw.drivers.cartpole.plant.sensor import Sample, Sensor
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 

@@ -26,16 +26,16 @@ from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole.dynamixel.connect import dynamixel_robot, parse_port
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS
 from deal_hw.drivers.cartpole.dynamixel.emulator import ServoEmulator, dynamixel_emulator
 from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.faults import Hazards, ServoFaults
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.emulator.faults import Hazards, ServoFaults
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Transport
 
 pytestmark = pytest.mark.real_time
@@ -179,10 +179,10 @@ def findings(faults: ServoFaults, tmp_path: Path) -> list[Finding]:
 def test_doctor_lists_servos(tmp_path: Path) -> None:
     """Role, model, firmware, rate, mode, position and voltage of each."""
     found = findings(ServoFaults(), tmp_path)
-    assert [f.level for f in found] == [Level.OK, Level.OK]
-    assert found[0].message.startswith("id 1 (belt): XL330-M077, firmware 46, 1000000 baud, operating mode 5")
-    assert found[1].message.startswith("id 2 (pole): XL330-M077")
-    assert "5.0 V, 31 °C" in found[0].message
+    assert [f.severity for f in found] == [Severity.OK, Severity.OK]
+    assert found[0].seen.startswith("id 1 (belt): XL330-M077, firmware 46, 1000000 baud, operating mode 5")
+    assert found[1].seen.startswith("id 2 (pole): XL330-M077")
+    assert "5.0 V, 31 °C" in found[0].seen
 
 
 @pytest.mark.parametrize(
@@ -208,9 +208,9 @@ def test_doctor_lists_servos(tmp_path: Path) -> None:
 )
 def test_doctor_tells_what_is_wrong(faults: ServoFaults, says: str, remedy: str, tmp_path: Path) -> None:
     """Servos at another rate and with one id are found, with what to do."""
-    wrong = [f for f in findings(faults, tmp_path) if f.level is Level.FAIL]
-    assert says in wrong[0].message
-    assert re.search(remedy, wrong[0].remedy)
+    wrong = [f for f in findings(faults, tmp_path) if f.severity is Severity.FAIL]
+    assert says in wrong[0].seen
+    assert re.search(remedy, wrong[0].do)
 
 
 def test_doctor_finds_servos_of_another_rate_on_a_port(
@@ -220,7 +220,7 @@ def test_doctor_finds_servos_of_another_rate_on_a_port(
     monkeypatch.setattr("deal_hw.drivers.cartpole.dynamixel.doctor.BAUD_RATES", (57600, 1_000_000))
     with emulated(ServoFaults(servo_baud_rate=57600)) as (path, _):
         found = examine_servos(path + PATIENT, MonotonicClock(), tmp_path)
-        assert [f.message for f in found if f.level is Level.FAIL] == [
+        assert [f.seen for f in found if f.severity is Severity.FAIL] == [
             f"id {servo} is set to 57600 baud, but deal-hw expects 1000000" for servo in (1, 2)
         ]
         with SerialTransport(path):
@@ -232,10 +232,10 @@ def test_doctor_reads_the_latency_timer(tmp_path: Path) -> None:
     with emulated() as (path, _):
         timer = tmp_path / Path(path).name / "device" / "latency_timer"
         timer.parent.mkdir(parents=True)
-        for value, level in ((16, Level.NOTE), (1, Level.OK)):
+        for value, level in ((16, Severity.NOTE), (1, Severity.OK)):
             timer.write_text(f"{value}\n")
             first = next(examine_servos(path, MonotonicClock(), tmp_path))
-            assert (first.level, first.message) == (level, f"the adapter's latency timer is {value} ms")
+            assert (first.severity, first.seen) == (level, f"the adapter's latency timer is {value} ms")
 
 
 def test_settings_come_with_the_port_and_from_a_file(tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole.dynamixel import registers
-from deal_hw.drivers.cartpole.dynamixel.bus import Bus
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
-from deal_hw.drivers.cartpole.dynamixel.packets import (
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.servo_bus import registers
+from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.packets import (
     Instruction,
     Packet,
     PacketParser,
@@ -27,7 +28,7 @@ from deal_hw.drivers.cartpole.dynamixel.packets import (
     protocol_1_status,
     status,
 )
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.servo_bus.registers import (
     BLOCK_ADDRESS,
     BLOCK_BYTES,
     PRESENT_POSITION,
@@ -35,8 +36,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     Block,
     Register,
 )
-from deal_hw.drivers.cartpole.dynamixel.samples import SampleGrid, TickClock
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.servo_bus.samples import SampleGrid, TickClock
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
 from deal_hw.testing.fake_device import FakeDevice

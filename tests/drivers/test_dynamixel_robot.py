@@ -14,8 +14,12 @@ import pytest
 from deal_hw.clock import VirtualClock
 from deal_hw.control.passive import make_passive
 from deal_hw.drivers.cartpole.dynamixel.device import OVERLOAD, DynamixelDevice
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import EmulatedServo
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.wire.protocol import Target
+from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
+from deal_hw.drivers.servo_bus.registers import (
     DRIVE_MODE,
     ID,
     MODEL_NUMBER,
@@ -25,10 +29,6 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     TORQUE_ENABLE,
     Register,
 )
-from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.protocol import Target
-from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import (

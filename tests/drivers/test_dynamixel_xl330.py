@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.cartpole.dynamixel import registers as r
-from deal_hw.drivers.cartpole.dynamixel import xl330
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import BOOT_NS, EmulatedServo
-from deal_hw.drivers.cartpole.dynamixel.packets import BROADCAST, Error, Instruction, instruction, status
-from deal_hw.drivers.cartpole.dynamixel.registers import OperatingMode, Register
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.servo_bus import registers as r
+from deal_hw.drivers.servo_bus import xl330
+from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS, EmulatedServo
+from deal_hw.drivers.servo_bus.packets import BROADCAST, Error, Instruction, instruction, status
+from deal_hw.drivers.servo_bus.registers import OperatingMode, Register
 
 pytestmark = pytest.mark.real_time
 

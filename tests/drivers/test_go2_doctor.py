@@ -24,7 +24,7 @@ from deal_hw.drivers.go2.messages.rpc import decode_response, encode_response
 from deal_hw.drivers.go2.messages.simulated import Simulator
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import TransportError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 
 Tamper = Callable[[str, bytes], Iterable[bytes]]
 
@@ -75,17 +75,17 @@ def examine(
 
 def only(findings: Iterable[Finding], area: str, word: str) -> Finding:
     """Return the one finding of an area with a word in it."""
-    (found,) = [f for f in findings if f.area == area and word in f.message]
+    (found,) = [f for f in findings if f.code == area and word in f.seen]
     return found
 
 
 def test_a_sound_robot_has_nothing_to_complain_of() -> None:
     """500 states a second, a running clock, nobody else, a full battery, level, a remote."""
     findings = examine()
-    assert {f.level for f in findings} == {Level.OK}
-    assert "500 states a second" in only(findings, "states", "states a second").message
-    assert "nobody else" in only(findings, "commands", "nobody").message
-    assert "0 degrees" in only(findings, "robot", "leans").message
+    assert {f.severity for f in findings} == {Severity.OK}
+    assert "500 states a second" in only(findings, "states", "states a second").seen
+    assert "nobody else" in only(findings, "commands", "nobody").seen
+    assert "0 degrees" in only(findings, "robot", "leans").seen
     assert only(findings, "services", "low level is free")
 
 
@@ -96,15 +96,15 @@ def test_it_sends_no_motor_command() -> None:
     list(Go2Doctor(VirtualTopics(device, clock), clock, 1.0).run())
     assert (device.log.accepted, device.log.refused) == (0, 0)
     again = list(Go2Doctor(VirtualTopics(device, clock), clock, 1.0).run())
-    assert only(again, "services", "'normal' is active").level is Level.NOTE
+    assert only(again, "services", "'normal' is active").severity is Severity.NOTE
 
 
 def test_sport_modes_own_commands_are_told_from_a_strangers() -> None:
     """While a mode is active, commands are probably its own; without one, somebody else sends them."""
-    assert only(examine(sport="ai"), "commands", "sport mode 'ai'").level is Level.NOTE
+    assert only(examine(sport="ai"), "commands", "sport mode 'ai'").severity is Severity.NOTE
     said = {100 * k: (topics.LOW_COMMAND, b"whatever") for k in range(1, 6)}
     stranger = only(examine(said=said, others=("process walk",)), "commands", "5 messages (process walk)")
-    assert (stranger.level, stranger.remedy) == (Level.FAIL, "stop that program")
+    assert (stranger.severity, stranger.do) == (Severity.FAIL, "stop that program")
 
 
 def test_commands_of_a_robot_that_does_not_say_its_mode_are_nobodys() -> None:
@@ -114,28 +114,28 @@ def test_commands_of_a_robot_that_does_not_say_its_mode_are_nobodys() -> None:
         tamper=lambda topic, payload: () if topic == topics.response(topics.SERVICES[0]) else (payload,),
     )
     found = only(findings, "commands", "did not say whether its sport mode")
-    assert found.level is Level.WARN and "controller" in found.remedy
+    assert found.severity is Severity.WARN and "controller" in found.do
 
 
 def test_a_silent_writer_is_named() -> None:
     """Discovery knows somebody who has not said anything yet."""
-    assert only(examine(others=("process walk",)), "commands", "process walk").level is Level.WARN
+    assert only(examine(others=("process walk",)), "commands", "process walk").severity is Severity.WARN
 
 
 def test_no_states_is_said_with_what_to_look_at() -> None:
     """A robot that says nothing: the finding names the topic and the usual causes."""
     findings = examine(tamper=lambda topic, payload: ())
     silent = only(findings, "states", "no states came on rt/lowstate")
-    assert silent.level is Level.FAIL
-    assert "interface" in silent.remedy
-    assert only(findings, "services", "does not answer").level is Level.WARN
+    assert silent.severity is Severity.FAIL
+    assert "interface" in silent.do
+    assert only(findings, "services", "does not answer").severity is Severity.WARN
 
 
 def test_another_robot_on_the_topic_is_said() -> None:
     """Messages that are no Go2 states are counted, with the reason."""
     findings = examine(tamper=lambda topic, p: (p[:-4],) if topic == topics.LOW_STATE else (p,))
-    (found,) = [f for f in findings if f.area == "states"]
-    assert found.level is Level.FAIL and "1176 bytes" in found.message and "G1" in found.remedy
+    (found,) = [f for f in findings if f.code == "states"]
+    assert found.severity is Severity.FAIL and "1176 bytes" in found.seen and "G1" in found.do
 
 
 def other_rule(topic: str, payload: bytes) -> Iterable[bytes]:
@@ -145,19 +145,19 @@ def other_rule(topic: str, payload: bytes) -> Iterable[bytes]:
 
 def test_another_checksum_rule_is_one_finding() -> None:
     """However many states there are, each with a checksum of its own; it names the switch and its risk."""
-    (found,) = [f for f in examine(tamper=other_rule) if f.area == "states"]
-    assert found.level is Level.FAIL
+    (found,) = [f for f in examine(tamper=other_rule) if f.code == "states"]
+    assert found.severity is Severity.FAIL
     assert re.match(
-        r"\d+ of \d+ messages on rt/lowstate \(100\.0%\) .*the first: .*checksum is 0x", found.message
+        r"\d+ of \d+ messages on rt/lowstate \(100\.0%\) .*the first: .*checksum is 0x", found.seen
     )
-    assert "--state-check length" in found.remedy and "corrupted" in found.remedy
+    assert "--state-check length" in found.do and "corrupted" in found.do
 
 
 def test_with_the_switch_another_rule_is_a_warning() -> None:
     """What the states say is examined all the same."""
     findings = examine(tamper=other_rule, state_check="length")
-    assert only(findings, "states", "not checked").level is Level.WARN
-    assert only(findings, "states", "states a second").level is Level.OK
+    assert only(findings, "states", "not checked").severity is Severity.WARN
+    assert only(findings, "states", "states a second").severity is Severity.OK
 
 
 def test_a_few_corrupt_states_are_a_warning() -> None:
@@ -170,7 +170,7 @@ def test_a_few_corrupt_states_are_a_warning() -> None:
         return other_rule(topic, payload) if count % 200 == 0 else (payload,)
 
     found = only(examine(tamper=rarely), "states", "no Go2 states")
-    assert (found.level, "cable" in found.remedy) == (Level.WARN, True)
+    assert (found.severity, "cable" in found.do) == (Severity.WARN, True)
 
 
 def test_a_clock_that_stands_still_is_said() -> None:
@@ -181,7 +181,7 @@ def test_a_clock_that_stands_still_is_said() -> None:
             return (payload,)
         return (encode_low_state(dataclasses.replace(decode_low_state(payload).values(), tick_ms=7)),)
 
-    assert only(examine(tamper=stale), "states", "stands still").level is Level.FAIL
+    assert only(examine(tamper=stale), "states", "stands still").severity is Severity.FAIL
 
 
 def test_a_clock_that_runs_fast_is_a_failure() -> None:
@@ -194,7 +194,7 @@ def test_a_clock_that_runs_fast_is_a_failure() -> None:
         return (encode_low_state(dataclasses.replace(values, tick_ms=round(values.tick_ms * 1.0955))),)
 
     found = only(examine(tamper=fast), "states", "robot's clock against ours: +9.5")
-    assert found.level is Level.FAIL and "simulator" in found.remedy
+    assert found.severity is Severity.FAIL and "simulator" in found.do
 
 
 def test_lost_states_are_counted() -> None:
@@ -207,14 +207,14 @@ def test_lost_states_are_counted() -> None:
         return () if topic == topics.LOW_STATE and count % 5 == 0 else (payload,)
 
     findings = examine(tamper=lossy)
-    assert only(findings, "states", "states a second").level is Level.WARN
-    assert only(findings, "states", "states lost").level is Level.NOTE
+    assert only(findings, "states", "states a second").severity is Severity.WARN
+    assert only(findings, "states", "states lost").severity is Severity.NOTE
 
 
 def test_battery_heat_and_remote() -> None:
     """Each has its finding and remedy."""
     no_remote = only(examine(remote=None), "robot", "no remote")
-    assert (no_remote.level, "switch the remote on" in no_remote.remedy) == (Level.NOTE, True)
+    assert (no_remote.severity, "switch the remote on" in no_remote.do) == (Severity.NOTE, True)
 
     def sick(topic: str, payload: bytes) -> Iterable[bytes]:
         if topic != topics.LOW_STATE:
@@ -230,7 +230,7 @@ def test_battery_heat_and_remote() -> None:
 
     findings = examine(tamper=sick)
     for word in ("battery 7 %", "hottest motor", "leans"):
-        assert only(findings, "robot", word).level is Level.WARN
+        assert only(findings, "robot", word).severity is Severity.WARN
 
 
 def test_a_transport_without_topics_is_refused() -> None:
@@ -253,7 +253,7 @@ def test_other_answers_are_passed_over() -> None:
 def test_faults_of_the_emulator_reach_the_doctor() -> None:
     """A tenth of the states corrupt: they are refused by their checksum and reported."""
     findings = examine(plan=FaultPlan(corrupt=0.1))
-    assert any(f.level is Level.FAIL and "no Go2 states" in f.message for f in findings)
+    assert any(f.severity is Severity.FAIL and "no Go2 states" in f.seen for f in findings)
 
 
 def test_a_refused_question_is_not_taken_for_a_free_robot() -> None:
@@ -265,8 +265,8 @@ def test_a_refused_question_is_not_taken_for_a_free_robot() -> None:
         return (encode_response(dataclasses.replace(decode_response(payload), code=7006, data="")),)
 
     findings = examine(tamper=refuse)
-    assert only(findings, "services", "checking the mode failed").level is Level.WARN
-    assert not any("low level is free" in f.message for f in findings)
+    assert only(findings, "services", "checking the mode failed").severity is Severity.WARN
+    assert not any("low level is free" in f.seen for f in findings)
 
 
 # unitree_mujoco in the robot's place.
@@ -284,20 +284,20 @@ def simulated(simulator: Simulator, **attributes: Any) -> list[Finding]:
 def test_a_simulator_is_recognised_and_its_option_named() -> None:
     """One finding for all its states, with what to add and when not to."""
     found = only(simulated("none"), "states", "are no Go2 states")
-    assert found.level is Level.FAIL
-    assert "--simulator unitree_mujoco" in found.remedy and "A real Go2 never sends them" in found.remedy
+    assert found.severity is Severity.FAIL
+    assert "--simulator unitree_mujoco" in found.do and "A real Go2 never sends them" in found.do
 
 
 def test_a_simulator_that_is_named_is_well() -> None:
     """Services and battery that it lacks are no findings, and what is not checked is said once."""
     findings = simulated("unitree_mujoco")
-    assert {f.level for f in findings} == {Level.OK, Level.NOTE}
-    assert only(findings, "states", "states a second").message.startswith("500 ")
-    assert len([f for f in findings if "no head, clock, checksum and battery" in f.message]) == 1
-    assert not [f for f in findings if f.area == "services" or "battery 0" in f.message]
+    assert {f.severity for f in findings} == {Severity.OK, Severity.NOTE}
+    assert only(findings, "states", "states a second").seen.startswith("500 ")
+    assert len([f for f in findings if "no head, clock, checksum and battery" in f.seen]) == 1
+    assert not [f for f in findings if f.code == "services" or "battery 0" in f.seen]
 
 
 def test_a_simulator_that_is_paused_is_said() -> None:
     """Its states go on and do not change."""
     found = only(simulated("unitree_mujoco", paused=True), "states", "do not change")
-    assert (found.level, found.remedy) == (Level.FAIL, "let the simulation run: it is paused")
+    assert (found.severity, found.do) == (Severity.FAIL, "let the simulation run: it is paused")

@@ -10,9 +10,9 @@ from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.safety import Safety
 from deal_hw.drivers import adopt_robot, make_robot
-from deal_hw.drivers.cartpole.device import CartpoleDevice
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth as go2_truth
 from deal_hw.drivers.go2.messages import topics

@@ -21,6 +21,7 @@ import tyro
 from deal_hw.cli import main as cli
 from deal_hw.errors import ConfigurationError, MissingExtraError, PortNotFoundError, UnknownNameError
 from deal_hw.install import install_line
+from deal_hw.workflows.kinds import sub_verbs
 
 ROOT = Path(__file__).resolve().parents[2]
 WIRES_AND_SIMULATORS = (
@@ -124,8 +125,8 @@ def test_settings_reach_the_verb(add_verb: Callable[..., None]) -> None:
     assert seen == [Settings(count=7)]
 
 
-def test_union_of_settings_gives_sub_verbs(add_verb: Callable[..., None]) -> None:
-    """A union of dataclasses becomes sub-verbs named after them."""
+def test_kinds_of_settings_give_sub_verbs(add_verb: Callable[..., None]) -> None:
+    """The word names the kind, and is no part of its settings."""
 
     @dataclass(frozen=True)
     class Info:
@@ -140,7 +141,7 @@ def test_union_of_settings_gives_sub_verbs(add_verb: Callable[..., None]) -> Non
         path: tyro.conf.Positional[Path]
 
     seen: list[object] = []
-    add_verb(seen.append, config=Info | Repair)
+    add_verb(seen.append, config=sub_verbs(info=Info, repair=Repair))
     assert cli.main(["probe", "repair", "somewhere"]) == 0
     assert seen == [Repair(path=Path("somewhere"))]
 

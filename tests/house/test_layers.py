@@ -51,6 +51,13 @@ ROOMS = {
         {"design", "baselines"},
         {"pipeline", "report"},
     ),
+    "drivers.cartpole": (
+        {"description"},
+        {"wire", "plant"},
+        {"robots", "chips"},
+        {"emulator"},
+        {"dynamixel"},
+    ),
     "drivers.go2": (
         {"descriptions"},
         {"messages"},

@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model

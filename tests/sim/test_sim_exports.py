@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.calibrated import WITHOUT_VALUE_TEXT, write_calibrated_mjcf
@@ -194,7 +195,7 @@ def test_verdict_alarms_and_biased_values_stand_in_each_file(
     """Whoever takes a value into another program sees that a named cause moved it."""
     doubtful = dataclasses.replace(
         result,
-        alarms=(Alarm("0.25 kg at the tip.", "Another mass.", "Weigh it."),),
+        alarms=(Finding.alarm("0.25 kg at the tip.", "Another mass.", "Weigh it."),),
         biased={"shoulder.stiffness": "mass", "latency": "mass"},
     )
     for name in write_exports(tmp_path, robot, doubtful, {"verdict": "amber", "verdict_reason": "because"}):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from measure_cartpole_wires import WIRE_MS, measure, table
 
-from deal_hw.drivers.cartpole.can_link import database
+from deal_hw.drivers.cartpole.wire.can_link import database
 
 pytestmark = pytest.mark.real_time
 

@@ -9,8 +9,8 @@ import pytest
 from measure_wire_calibration import VIRTUAL_WIRE_S, measure, table, virtual_wire
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.cartpole.device import TICK_NS
-from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.chips.device import TICK_NS
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.robot import Robot
 from deal_hw.sim.recordings.episode import align

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from fakes.simulated_episode import simulated_episode
 
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording.reader import CycleTable
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.findings import Finding
 from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
 from deal_hw.types import Event, JointCommand, RobotState, Status, Trajectory
 from deal_hw.viz.episode_log import write_episode
@@ -50,7 +51,7 @@ def result() -> CalibrationResult:
         null_directions=("all masses together",),
         latency_s=LATENCY_S,
         latency_interval_s=(0.007, 0.009),
-        alarms=(Alarm("backlash of 2 mm", "play in the gear", "mend it"),),
+        alarms=(Finding.alarm("backlash of 2 mm", "play in the gear", "mend it"),),
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from deal_hw.data.importing.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands

@@ -18,7 +18,7 @@ from deal_hw.control.excitation_level import ExcitationLevelSearch
 from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.faults import CanFaults
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults
 from deal_hw.errors import ConfigurationError, PolicyMismatchError, TransportError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT

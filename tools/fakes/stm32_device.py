@@ -9,11 +9,9 @@ from __future__ import annotations
 import ctypes
 import functools
 
-from deal_hw.drivers.cartpole import native
-from deal_hw.drivers.cartpole.can_link import CanLink
-from deal_hw.drivers.cartpole.host_firmware import flash_page, settings_of
-from deal_hw.drivers.cartpole.link import SerialLink
-from deal_hw.drivers.cartpole.rig_device import (
+from deal_hw.drivers.cartpole.chips import native
+from deal_hw.drivers.cartpole.chips.host_firmware import flash_page, settings_of
+from deal_hw.drivers.cartpole.chips.rig_device import (
     BYTES_PER_TICK,
     NOMINAL_RIG,
     ChipOutputs,
@@ -22,7 +20,9 @@ from deal_hw.drivers.cartpole.rig_device import (
     RigDevice,
     delay_ticks,
 )
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.wire.can_link import CanLink
+from deal_hw.drivers.cartpole.wire.link import SerialLink
 
 _INSTALL = "apt-get install gcc libc6-dev, or set CC"
 
@@ -66,7 +66,7 @@ class Stm32Chip(RigChip):
     Args:
         page: Contents of the last page of its flash.
         can: Whether the jumper BOOT1 chooses CAN; bytes are then frames of
-            :data:`~deal_hw.drivers.cartpole.can_link.FRAME`.
+            :data:`~deal_hw.drivers.cartpole.wire.can_link.FRAME`.
         encoder: Whether it has the pole encoder node's program, which is always on CAN.
 
     Raises:

@@ -18,13 +18,14 @@ import yaml
 from mcap_ros2.writer import Writer
 
 from deal_hw.calib.search.resume import SearchCheckpoint, pack
-from deal_hw.calibration import Alarm, CalibrationResult, read_result
+from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.data.importing.columns import read_column_map
 from deal_hw.data.importing.grid import common_period, to_trajectories
 from deal_hw.data.importing.load import load_tables
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import ConfigurationError
+from deal_hw.findings import Finding
 from deal_hw.sim.engine.compiling import problem_of
 from deal_hw.sim.parameters.template import template
 from deal_hw.sim.parameters.yaml_space import read_space
@@ -271,7 +272,7 @@ def make_result(folder: Path) -> list[bytes]:
         latency_s=0.01,
         chi2=1.0,
         heldout_nrmse={"nominal": 0.1},
-        alarms=(Alarm("a", "b", "c"),),
+        alarms=(Finding.alarm("a", "b", "c"),),
         advice=({"sentence": "b"},),
         null_directions=("c",),
         provenance={"seed": 1},

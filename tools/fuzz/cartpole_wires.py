@@ -6,20 +6,20 @@ import random
 from collections.abc import Sequence
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_link import FRAME, REMOTE, Angle, CanLink, CanMessage
-from deal_hw.drivers.cartpole.controller import Controller, Firmware
-from deal_hw.drivers.cartpole.dynamixel import packets
-from deal_hw.drivers.cartpole.dynamixel.bus import Bus
-from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BYTES
-from deal_hw.drivers.cartpole.firmwares import usable_firmware
-from deal_hw.drivers.cartpole.host_firmware import CanHostFirmware, Settings
-from deal_hw.drivers.cartpole.odrive_emulator import odrive_device
-from deal_hw.drivers.cartpole.odrive_frames import BROADCAST_NODE, LAYOUT, NODE_SHIFT, Command, pack
-from deal_hw.drivers.cartpole.odrive_link import DRIVE_NODE, ENCODER_NODE, OdriveLink, OdriveSettings
-from deal_hw.drivers.cartpole.sensor import Motor
-from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.chips.controller import Controller, Firmware
+from deal_hw.drivers.cartpole.chips.firmwares import usable_firmware
+from deal_hw.drivers.cartpole.chips.host_firmware import CanHostFirmware, Settings
+from deal_hw.drivers.cartpole.chips.servo import Servo
+from deal_hw.drivers.cartpole.emulator.odrive_emulator import odrive_device
+from deal_hw.drivers.cartpole.plant.sensor import Motor
+from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.drivers.cartpole.wire import protocol
+from deal_hw.drivers.cartpole.wire.can_link import FRAME, REMOTE, Angle, CanLink, CanMessage
+from deal_hw.drivers.cartpole.wire.odrive_frames import BROADCAST_NODE, LAYOUT, NODE_SHIFT, Command, pack
+from deal_hw.drivers.cartpole.wire.odrive_link import DRIVE_NODE, ENCODER_NODE, OdriveLink, OdriveSettings
+from deal_hw.drivers.servo_bus import packets
+from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.registers import BLOCK_ADDRESS, BLOCK_BYTES
 from deal_hw.drivers.transports.slcan_transport import LineReader, decode_line, encode_line
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import FrameError, TransportTimeoutError

@@ -15,7 +15,7 @@ from fastcrc import crc16
 from deal_hw.data.recording.record import decode as decode_record
 from deal_hw.data.recording.record import encode as encode_record
 from deal_hw.data.recording.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
-from deal_hw.drivers.cartpole import protocol as serial
+from deal_hw.drivers.cartpole.wire import protocol as serial
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray
 
 LAG_S: Final = 0.3
@@ -43,7 +43,7 @@ STILL: Final = {"rad": 0.02, "m": 0.002}
 """A joint or a command with a standard deviation of a quarter of this or less is not checked [rad or m]."""
 
 
-def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> CheckResult:
+def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> Finding:
     """Check that commands are what the actuators of the model take, and that their unit is known.
 
     Args:
@@ -65,9 +65,9 @@ def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None)
     found = [table.actuated[c] for c, i in joints if test(position[:, i], command[:, c], period)]
     if not joints or len(found) < MOST * len(joints):
         if not servo and "unsaid" in table.source:
-            return CheckResult("actuation", Severity.FAIL, table.source["unsaid"])
-        return beyond or CheckResult("actuation", Severity.OK, "the commands fit the model's actuators")
-    return CheckResult("actuation", Severity.FAIL, _accusation(found, servo=servo))
+            return Finding("actuation", Severity.FAIL, table.source["unsaid"])
+        return beyond or Finding("actuation", Severity.OK, "the commands fit the model's actuators")
+    return Finding("actuation", Severity.FAIL, _accusation(found, servo=servo))
 
 
 def _accusation(names: Sequence[str], *, servo: bool) -> str:
@@ -86,7 +86,7 @@ def _accusation(names: Sequence[str], *, servo: bool) -> str:
     )
 
 
-def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> CheckResult | None:
+def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> Finding | None:
     """Return the finding on commands that the actuators would clip; None if there are hardly any."""
     if limits is None:
         return None
@@ -105,7 +105,7 @@ def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> CheckResult
         f"commands outside the actuators' ctrlrange: {', '.join(named)}; check for {other}, or another unit"
     )
     severe = float(np.max(share)) > BEYOND[1]
-    return CheckResult("actuation", Severity.FAIL if severe else Severity.WARN, text)
+    return Finding("actuation", Severity.FAIL if severe else Severity.WARN, text)
 
 
 def _on_grid(table: Table) -> tuple[FloatArray, FloatArray, FloatArray]:

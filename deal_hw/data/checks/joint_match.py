@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.errors import MissingExtraError
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray, IntArray
 
 WINDOW_S = 0.1
@@ -49,12 +49,12 @@ class _Match:
     near: FloatArray
 
 
-def match(table: Table) -> tuple[CheckResult, CheckResult]:
+def match(table: Table) -> tuple[Finding, Finding]:
     """Check order and sign of the joints, and that measurements follow commands."""
     found = _correlate(table)
     if found is None:
         text = "no joint's command and measurement both move enough to compare"
-        return CheckResult("assignment", Severity.WARN, text), CheckResult("delay", Severity.OK, text)
+        return Finding("assignment", Severity.WARN, text), Finding("delay", Severity.OK, text)
     follows = found.lags_s >= -1e-9
     own = np.abs(np.diagonal(found.correlation, axis1=1, axis2=2)).mean(axis=1)
     # If joints are swapped, the given pairs do not show the lag, so each joint takes its best partner.
@@ -107,7 +107,7 @@ def _correlations(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(a.T @ b / np.where(norm > 0, norm, np.inf))
 
 
-def _assignment(found: _Match, at: int) -> CheckResult:
+def _assignment(found: _Match, at: int) -> Finding:
     C = found.correlation[at]
     M = len(found.names)
     same = np.arange(M)
@@ -145,20 +145,20 @@ def _assignment(found: _Match, at: int) -> CheckResult:
         if best is None:
             best = gain, f"joints seem to be in another order: {pairs}"
     if best is not None:
-        return CheckResult("assignment", Severity.FAIL, best[1])
+        return Finding("assignment", Severity.FAIL, best[1])
     against = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < -GOOD]
     if against:
         text = f"a joint moves against its command: {', '.join(against)}; check order and sign of the joints"
-        return CheckResult("assignment", Severity.FAIL, text)
+        return Finding("assignment", Severity.FAIL, text)
     weak = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < CLEAR]
     if weak:
         text = f"command and measurement of a joint hardly move together: {', '.join(weak)}"
-        return CheckResult(
+        return Finding(
             "assignment",
             Severity.WARN,
             f"{text}; check whether it is free, blocked, or another joint's channel",
         )
-    return CheckResult(
+    return Finding(
         "assignment", Severity.OK, f"each of {M} joints follows its own command (at least {_least(C):.2f})"
     )
 
@@ -189,7 +189,7 @@ def _pairs(found: _Match, C: FloatArray, order: IntArray, moved: IntArray) -> st
     return ", ".join(parts)
 
 
-def _delay(found: _Match, own: FloatArray) -> CheckResult:
+def _delay(found: _Match, own: FloatArray) -> Finding:
     at = int(np.argmax(own))
     lag_s, period = float(found.lags_s[at]), float(found.lags_s[1] - found.lags_s[0])
     text = f"measurements follow commands by about {lag_s * 1e3:.0f} ms"
@@ -199,14 +199,14 @@ def _delay(found: _Match, own: FloatArray) -> CheckResult:
             f"measurements come {-lag_s * 1e3:.0f} ms before the commands that they follow; check that "
             "both have one clock, and that the target column contains the sent commands"
         )
-        return CheckResult("delay", Severity.FAIL, text)
+        return Finding("delay", Severity.FAIL, text)
     if lag_s > MAX_LAG_S - period:
-        return CheckResult(
+        return Finding(
             "delay",
             Severity.WARN,
             f"measurements follow commands by {lag_s:.2f} s or more; check the clocks and the target column",
         )
-    return CheckResult("delay", Severity.OK, text)
+    return Finding("delay", Severity.OK, text)
 
 
 def best_assignment(score: FloatArray) -> IntArray:

@@ -3,7 +3,7 @@
 ``recording/telemetry_checks`` checks files of our own recorder. These checks find the usual errors of other
 logs: a clock in the wrong unit or running backwards, degrees for radians, joints in another order or with
 another sign, a target that is a copy of the measurement. A check returns one
-:class:`~deal_hw.data.recording.telemetry_checks.CheckResult`; with "fail" the recording is refused.
+:class:`~deal_hw.data.recording.telemetry_checks.Finding`; with "fail" the recording is refused.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from deal_hw.data.checks.slip import slip_verdict
 from deal_hw.data.checks.speed import speed_verdict
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings, find_spikes, sound
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, spikes_verdict
+from deal_hw.data.recording.telemetry_checks import spikes_verdict
 from deal_hw.errors import DatasetError
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray
 
 MIN_RATE_HZ, GOOD_RATE_HZ = 20.0, 50.0
@@ -53,7 +54,7 @@ def examine(
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
     efforts: bool = False,
-) -> tuple[CheckResult, ...]:
+) -> tuple[Finding, ...]:
     """Run all checks on a recording; the order is fixed.
 
     If clock or values are unusable, the later checks are skipped: they would only repeat it. Spikes are
@@ -101,30 +102,30 @@ def despiked(table: Table, settings: SpikeSettings) -> Table:
     return table.rows(sound(found, table.time_s.size)) if found else table
 
 
-def require(verdicts: Sequence[CheckResult], name: str) -> None:
+def require(verdicts: Sequence[Finding], name: str) -> None:
     """Refuse a recording with a failed check.
 
     Raises:
         DatasetError: A check failed; the message contains the sentence of each failed check.
     """
     failed = [
-        f"{verdict.name}: {verdict.message}" for verdict in verdicts if verdict.severity is Severity.FAIL
+        f"{verdict.code}: {verdict.message}" for verdict in verdicts if verdict.severity is Severity.FAIL
     ]
     if failed:
         raise DatasetError(f"{name} cannot be used: {'; '.join(failed)}")
 
 
-def _verdict(name: str, severity: Severity, message: str) -> CheckResult:
-    return CheckResult(name, severity, message)
+def _verdict(name: str, severity: Severity, message: str) -> Finding:
+    return Finding(name, severity, message)
 
 
-def _size(table: Table) -> CheckResult:
+def _size(table: Table) -> Finding:
     count = table.time_s.size
     text = f"{count} samples, {table.command_s.size} commands, {len(table.joint_names)} joints"
     return _verdict("size", Severity.OK if count >= 3 else Severity.FAIL, text)
 
 
-def _finite(table: Table) -> CheckResult:
+def _finite(table: Table) -> Finding:
     counts = {
         f"{kind} of {joint}": (int(np.sum(~np.isfinite(values[:, column]))), kind)
         for kind, values, joints in (
@@ -152,7 +153,7 @@ def _finite(table: Table) -> CheckResult:
     return _verdict("finite", Severity.WARN, f"{text}; samples without a position are left out")
 
 
-def _clock(table: Table) -> CheckResult:
+def _clock(table: Table) -> Finding:
     for what, stamps in (("samples", table.time_s), ("commands", table.command_s)):
         steps = np.diff(stamps)
         back = np.flatnonzero(steps < 0)
@@ -177,7 +178,7 @@ def _steps(clock: FloatArray) -> FloatArray:
     return steps[steps > 0]
 
 
-def _rate(clock: FloatArray) -> CheckResult:
+def _rate(clock: FloatArray) -> Finding:
     steps = _steps(clock)
     if not steps.size:
         return _verdict("rate", Severity.FAIL, "the clock stands still")
@@ -202,7 +203,7 @@ def _rate(clock: FloatArray) -> CheckResult:
     return _verdict("rate", Severity.OK, text)
 
 
-def _gaps(clock: FloatArray) -> CheckResult:
+def _gaps(clock: FloatArray) -> Finding:
     steps = _steps(clock)
     period = float(np.median(steps))
     long = steps[steps > GAP_PERIODS * period]
@@ -222,7 +223,7 @@ def _moves(table: Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
     return np.asarray(np.nanmax(table.position, axis=0) - np.nanmin(table.position, axis=0) >= least)
 
 
-def _frozen(table: Table) -> CheckResult:
+def _frozen(table: Table) -> Finding:
     moves = _moves(table)
     commanded = np.zeros(len(table.joint_names), dtype=bool)
     if table.command_s.size:
@@ -270,7 +271,7 @@ def _longest_still(table: Table, joint: int) -> float:
     return longest
 
 
-def _commands(table: Table, efforts: bool) -> CheckResult:
+def _commands(table: Table, efforts: bool) -> Finding:
     if not table.command_s.size:
         text = (
             "no commanded positions, so nothing can be predicted; name them as `target` in the column map. "
@@ -295,7 +296,7 @@ def _commands(table: Table, efforts: bool) -> CheckResult:
     return _verdict("commands", Severity.OK, text)
 
 
-def _copy(table: Table) -> CheckResult:
+def _copy(table: Table) -> Finding:
     held, measured = table.target_at(table.time_s), table.position[:, list(table.actuated_index)]
     copied = []
     for column, name in enumerate(table.actuated):
@@ -315,7 +316,7 @@ def _copy(table: Table) -> CheckResult:
     return _verdict("copy", Severity.FAIL, text)
 
 
-def _slip(table: Table) -> CheckResult:
+def _slip(table: Table) -> Finding:
     # The clock's check reports repeated stamps; here the first of each counts.
     new = np.concatenate([[True], np.diff(table.time_s) > 0])
     return slip_verdict(
@@ -326,7 +327,7 @@ def _slip(table: Table) -> CheckResult:
 _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
 
 
-def _units(table: Table, limits: FloatArray | None) -> tuple[CheckResult, bool]:
+def _units(table: Table, limits: FloatArray | None) -> tuple[Finding, bool]:
     """Compare the spans of command and measurement, and both with the model's limits.
 
     Returns:
@@ -381,7 +382,7 @@ def _units(table: Table, limits: FloatArray | None) -> tuple[CheckResult, bool]:
     return _verdict("units", Severity.OK, "ranges of commands and measurements agree"), False
 
 
-def _levels(table: Table) -> CheckResult:
+def _levels(table: Table) -> Finding:
     held, found = table.target_at(table.time_s), []
     for column, index in enumerate(table.actuated_index):
         off = float(np.nanmedian(table.position[:, index] - held[:, column]))
@@ -433,7 +434,7 @@ def _normal_range(values: FloatArray) -> str:
     return "another unit"
 
 
-def _inside_limits(table: Table, limits: FloatArray | None) -> CheckResult:
+def _inside_limits(table: Table, limits: FloatArray | None) -> Finding:
     if limits is None:
         return _verdict("limits", Severity.OK, "not checked, since no joint limits are given")
     found, severe = [], False
@@ -480,7 +481,7 @@ def _at_extreme(values: FloatArray) -> float:
     return float(max(np.mean(values == np.max(values)), np.mean(values == np.min(values))))
 
 
-def _clipped_commands(table: Table, limits: FloatArray | None) -> CheckResult:
+def _clipped_commands(table: Table, limits: FloatArray | None) -> Finding:
     held, found = table.target_at(table.time_s), []
     for column, (index, name) in enumerate(zip(table.actuated_index, table.actuated, strict=True)):
         share = _at_extreme(held[:, column])
@@ -500,7 +501,7 @@ def _clipped_commands(table: Table, limits: FloatArray | None) -> CheckResult:
     return _verdict("clamped", Severity.WARN, text)
 
 
-def _saturated_effort(table: Table) -> CheckResult:
+def _saturated_effort(table: Table) -> Finding:
     if table.effort is None:
         return _verdict("saturated", Severity.OK, "no effort recorded")
     found = [
@@ -516,7 +517,7 @@ def _saturated_effort(table: Table) -> CheckResult:
     return _verdict("saturated", Severity.WARN, text)
 
 
-def _excitation(table: Table) -> CheckResult:
+def _excitation(table: Table) -> Finding:
     spans = [_span(column) for column in table.position.T]
     weak = [
         f"{name} {span:.2g} {unit}"
@@ -536,7 +537,7 @@ def _excitation(table: Table) -> CheckResult:
     return _verdict("excitation", Severity.OK, "every joint moves enough")
 
 
-def _quaternion(table: Table) -> CheckResult:
+def _quaternion(table: Table) -> Finding:
     values = np.asarray(table.orientation)
     off = float(np.max(np.abs(np.linalg.norm(values, axis=1) - 1)))
     if not off < 0.02:

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray, IntArray
 
 AHEAD_S: Final = 0.1
@@ -82,19 +82,19 @@ class Slip:
 
 def slip_verdict(
     time_s: FloatArray, position: FloatArray, command_s: FloatArray, target: FloatArray, actuated: IntArray
-) -> CheckResult:
+) -> Finding:
     """Check that one delay holds for the whole recording; arguments as of :func:`find_slip`."""
     found = find_slip(time_s, position, command_s, target, actuated)
     if found is None:
-        return CheckResult(
+        return Finding(
             "slip", Severity.OK, "not checked: too short, or too little motion, to find slips of the clocks"
         )
     if found.clear < CLEAR or found.agree < AGREE or abs(found.later_s) < LEAST_S:
-        return CheckResult("slip", Severity.OK, "one delay holds for the whole recording")
+        return Finding("slip", Severity.OK, "one delay holds for the whole recording")
     side = "later" if found.later_s > 0 else "sooner"
     glaring = found.clear >= GLARING and found.alike >= ALIKE
     other = "" if found.alike >= ALIKE else "; backlash looks similar where motions are small"
-    return CheckResult(
+    return Finding(
         "slip",
         Severity.FAIL if glaring else Severity.WARN,
         f"from {found.begin_s:.3g} s to {found.end_s:.3g} s measurements follow commands about "

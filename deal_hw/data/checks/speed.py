@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
+from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray
 
 OVER_S = 0.1
@@ -18,23 +18,21 @@ FACTOR = 1.5
 UNITS = {57.3: "degrees and radians", 1000.0: "millimetres and metres"}
 
 
-def speed_verdict(table: Table) -> CheckResult:
+def speed_verdict(table: Table) -> Finding:
     """Compare the velocities of a recording with its positions' slopes.
 
     Args:
         table: The recording; velocities that are not numbers are left out.
     """
     if table.velocity is None:
-        return CheckResult("velocity", Severity.OK, "no velocity recorded")
+        return Finding("velocity", Severity.OK, "no velocity recorded")
     ratios: dict[str, float] = {}
     for name, position, velocity in zip(table.joint_names, table.position.T, table.velocity.T, strict=True):
         ratio = _ratio(table.time_s, position, velocity)
         if ratio is not None and not 1 / FACTOR < ratio < FACTOR:
             ratios[name] = ratio
     if not ratios:
-        return CheckResult(
-            "velocity", Severity.OK, "velocities are the slopes of positions, or too noisy to say"
-        )
+        return Finding("velocity", Severity.OK, "velocities are the slopes of positions, or too noisy to say")
     found = ", ".join(f"{name} {ratio:.3g} times" for name, ratio in ratios.items())
     values = np.array(list(ratios.values()))
     if np.any(values < 0):
@@ -50,7 +48,7 @@ def speed_verdict(table: Table) -> CheckResult:
     else:
         what = "check the unit of its positions"
     text = f"recorded velocities are not the slopes of positions: {found}; {what}"
-    return CheckResult("velocity", Severity.WARN, text)
+    return Finding("velocity", Severity.WARN, text)
 
 
 def _ratio(time_s: FloatArray, position: FloatArray, velocity: FloatArray) -> float | None:

@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 from deal_hw.data.recording.clock_sync import synchronize
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import Episode, read_episode
-from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, check
+from deal_hw.data.recording.telemetry_checks import check
 from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
+from deal_hw.findings import Finding, Severity
 from deal_hw.schema import STRICT
 
 _MOST_JUMPS = 20
@@ -33,7 +34,7 @@ class EpisodeInfo:
         states: State samples.
         commands: Commands sent.
         cycles: Control cycles.
-        verdicts: The telemetry checks, as ``telemetry_checks.CheckResult.to_json`` writes them.
+        verdicts: The findings of the checks: ``name``, ``severity`` and ``message`` of each.
         excitation: Movement, as ``excitation.Excitation.to_json`` writes it.
         clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20 jumps at most;
             None if unknown.
@@ -108,7 +109,7 @@ def summarize(
             states=0,
             commands=0,
             cycles=0,
-            verdicts=(CheckResult("length", Severity.FAIL, str(error)).to_json(),),
+            verdicts=(verdict_json(Finding("length", Severity.FAIL, str(error))),),
             excitation=None,
             clock=None,
             note=note or "empty",
@@ -125,13 +126,18 @@ def summarize(
         states=trajectory.device_s.size,
         commands=trajectory.sent_s.size,
         cycles=episode.cycles.cycle.size,
-        verdicts=tuple(verdict.to_json() for verdict in check(trajectory)),
+        verdicts=tuple(map(verdict_json, check(trajectory))),
         excitation=excitation(trajectory).to_json(),
         clock=_clock(episode),
         note=note,
         facts=facts or {},
     )
     return info, episode
+
+
+def verdict_json(finding: Finding) -> Mapping[str, str]:
+    """Return a finding as the index has it."""
+    return {"name": finding.code, "severity": str(finding.severity), "message": finding.message}
 
 
 def _clock(episode: Episode) -> Mapping[str, Any] | None:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.calibration import Alarm, CalibrationResult, Progress, ProgressCallback, percent
+from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback, percent
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.say import Say, aloud, silent
@@ -83,7 +84,7 @@ class BestSoFar:
             chi2=progress.values.get("chi2", math.nan),
             heldout_nrmse=errors,
             alarms=(
-                Alarm(
+                Finding.alarm(
                     f"The calibration was interrupted after {progress.stage}, "
                     f"{time.monotonic() - self._began:.0f} s.",
                     "No interval was computed; the given ones are the search ranges.",

@@ -13,7 +13,7 @@ from deal_hw.types import FloatArray
 if TYPE_CHECKING:
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
-    from deal_hw.data.recording.telemetry_checks import CheckResult
+    from deal_hw.findings import Finding
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.joint_facts import JointFacts
     from deal_hw.sim.recordings.episode import SampledEpisode
@@ -74,7 +74,7 @@ def examine_recording(
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
     say: Callable[[str], None],
-) -> list[CheckResult]:
+) -> list[Finding]:
     """Check a recording and report problems; return the findings to keep.
 
     Args:
@@ -91,29 +91,29 @@ def examine_recording(
     """
     from deal_hw.data.checks.command_kind import command_kind
     from deal_hw.data.checks.plausibility import examine, require
-    from deal_hw.data.recording.telemetry_checks import Severity
     from deal_hw.errors import DatasetError
+    from deal_hw.findings import Severity
 
     limits = None
     if facts is not None:
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
     every = list(examine(table, limits, kept, spikes, efforts=not servo))
-    if facts is not None and {v.name for v in every} >= {"assignment"}:
+    if facts is not None and {v.code for v in every} >= {"assignment"}:
         # These checks run only if clock and values are valid.
         command = facts.command[[facts.names.index(name) for name in table.actuated]]
         every.append(command_kind(table, servo=servo, limits=command))
     found = [v for v in every if v.severity is not Severity.OK]
     if not servo:
-        found = [v for v in found if v.name in MOTOR_CHECKS]
+        found = [v for v in found if v.code in MOTOR_CHECKS]
     for verdict in found:
         # The error itself contains the failed ones.
         if force or verdict.severity is not Severity.FAIL:
-            say(f"{table.name}: {verdict.severity} {verdict.name}: {verdict.message}")
+            say(f"{table.name}: {verdict.severity} {verdict.code}: {verdict.message}")
     if not force:
         try:
             require(found, table.name)
         except DatasetError as err:
-            if any(v.severity is Severity.FAIL and v.name in REQUIRED_CHECKS for v in found):
+            if any(v.severity is Severity.FAIL and v.code in REQUIRED_CHECKS for v in found):
                 raise
             raise DatasetError(
                 f"{err}. Correct the recording or its column map, or use it all the same with --force"

@@ -136,7 +136,8 @@ def sound_recordings(
         InsufficientDataError: An episode cannot be used.
     """
     from deal_hw.data.recording.spikes import without_spikes
-    from deal_hw.data.recording.telemetry_checks import Severity, check
+    from deal_hw.data.recording.telemetry_checks import check
+    from deal_hw.findings import Severity
 
     verdicts = {index: check(trajectory, spikes) for index, trajectory in trajectories.items()}
     for index, found in verdicts.items():
@@ -146,7 +147,7 @@ def sound_recordings(
                 f"episode {index} of {folder} cannot be used: {'; '.join(failed)}; "
                 "record again with `deal-hw collect`"
             )
-        for jump in [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN][:1]:
+        for jump in [v.message for v in found if v.code == "spikes" and v.severity is Severity.WARN][:1]:
             say(f"episode {index}: {jump}")
     told = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
     return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, told

@@ -155,7 +155,7 @@ def prepare_model(
         holdout=judge,
         shown=fit_recordings[0][1].trajectory,
         telemetry=[
-            f"{name}: {verdict.severity} {verdict.name}: {verdict.message}"
+            f"{name}: {verdict.severity} {verdict.code}: {verdict.message}"
             for name, found in verdicts.items()
             for verdict in found
         ],

@@ -114,7 +114,7 @@ def common_rates(
             )
         # An invalid clock has no period; report it before anything else fails on it.
         found = examine(table, efforts=not model_has_servos(model))
-        require([v for v in found if v.name in REQUIRED_CHECKS], table.name)
+        require([v for v in found if v.code in REQUIRED_CHECKS], table.name)
     timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
     return sampling(common_period(tables), timestep, window_s)
 

@@ -14,7 +14,7 @@ from deal_hw.drivers.transports.can_bus import CanTransport
 from deal_hw.drivers.transports.can_transport import can_links
 from deal_hw.drivers.transports.slcan_transport import serial_adapters
 from deal_hw.errors import TransportTimeoutError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 
 _BUSY = 0.7
 """Bus load above which frames are expected to be late."""
@@ -26,7 +26,7 @@ def list_adapters() -> Iterator[Finding]:
     for name in can_links():
         yield _judge_link(name, details.get(name, {}))
     for device, kind in serial_adapters():
-        yield Finding("can", Level.OK, f"slcan:{device}: {kind}")
+        yield Finding("can", Severity.OK, f"slcan:{device}: {kind}")
 
 
 def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
@@ -58,7 +58,7 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
         trouble = f" ({transport.trouble})" if transport.trouble else ""
         yield Finding(
             "can",
-            Level.WARN,
+            Severity.WARN,
             f"{transport.port}: no frame within {seconds:g} s{rate}{trouble}",
             "check the device's power, this bit rate, CAN-H and CAN-L (not swapped), and the 120 ohm "
             "resistors at both ends",
@@ -74,19 +74,19 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
     )
     if foreign := sorted(set(frames) - set(nodes)):
         others = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])
-        yield Finding("can", Level.NOTE, f"other nodes on the bus: {others}", "they are filtered out")
+        yield Finding("can", Severity.NOTE, f"other nodes on the bus: {others}", "they are filtered out")
     if missing := sorted(set(nodes) - set(frames)):
         heard = ", ".join(map(str, sorted(frames)))
         yield Finding(
             "can",
-            Level.WARN,
+            Severity.WARN,
             f"no frame from node {', '.join(map(str, missing))}; heard: {heard}",
             f"give the number in the port: {transport.port.partition('?')[0]}?node=NUMBER",
         )
     if transport.error_frames:
         yield Finding(
             "can",
-            Level.WARN,
+            Severity.WARN,
             f"{transport.error_frames} errors on the bus; the last: {transport.trouble}",
             "check wiring, termination and bit rate",
         )
@@ -115,11 +115,11 @@ def _judge_link(name: str, details: dict[str, Any]) -> Finding:
     text = f"socketcan:{name}: {state.lower()}" + (f", {bitrate} bit/s" if bitrate else "")
     if state == "STOPPED":
         remedy = f"ip link set {name} up type can bitrate 500000 restart-ms 100"
-        return Finding("can", Level.WARN, text, remedy)
+        return Finding("can", Severity.WARN, text, remedy)
     if state in ("BUS-OFF", "ERROR-PASSIVE", "ERROR-WARNING"):
         remedy = f"check wiring, termination and bit rate; ip link set {name} type can restart-ms 100"
-        return Finding("can", Level.WARN, text, remedy)
+        return Finding("can", Severity.WARN, text, remedy)
     if details and not details.get("restart_ms"):
         remedy = f"to restart it after a bus-off: ip link set {name} type can restart-ms 100"
-        return Finding("can", Level.NOTE, text, remedy)
-    return Finding("can", Level.OK, text)
+        return Finding("can", Severity.NOTE, text, remedy)
+    return Finding("can", Severity.OK, text)

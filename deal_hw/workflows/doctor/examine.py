@@ -17,7 +17,7 @@ from deal_hw.drivers import (
     on_this_computer,
 )
 from deal_hw.errors import ConfigurationError, DealHwError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
@@ -78,13 +78,13 @@ class DoctorReport:
     findings: tuple[Finding, ...]
 
     def _repr_html_(self) -> str:
-        rows = [(f.area, f.level.value, f.message, f.remedy) for f in self.findings]
+        rows = [(f.code, f.severity.value, f.seen, f.do) for f in self.findings]
         return html_table(("area", "level", "what", "what to do"), rows)
 
     @property
     def exit_code(self) -> int:
         """For the shell: 0, or 1 if a check failed."""
-        return int(any(finding.level is Level.FAIL for finding in self.findings))
+        return int(any(finding.severity is Severity.FAIL for finding in self.findings))
 
 
 @from_settings(DoctorSettings)
@@ -131,9 +131,9 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
         link = make_topic_transport(name, config.port, clock, config.wire)
         yield from Go2Doctor(link, clock, config.seconds, config.state_check, config.simulator).run()
     except DealHwError as error:
-        yield Finding("link", Level.FAIL, str(error))
+        yield Finding("link", Severity.FAIL, str(error))
         if config.robot == "cartpole":
-            from deal_hw.drivers.cartpole.other_wires import name_other_wire
+            from deal_hw.drivers.cartpole.wire.other_wires import name_other_wire
 
             yield from name_other_wire(config.port, name, clock)
 
@@ -160,16 +160,16 @@ def judge_interfaces(port: str) -> Iterator[Finding]:
     from deal_hw.drivers.transports.interfaces import list_interfaces
 
     for interface in list_interfaces():
-        level, remedy = Level.OK, ""
+        level, remedy = Severity.OK, ""
         if port in (interface.name, *interface.addresses) and not interface.carrier:
-            level, remedy = Level.FAIL, "check the cable, and that the robot is switched on"
+            level, remedy = Severity.FAIL, "check the cable, and that the robot is switched on"
         elif not interface.multicast and not interface.loopback and interface.up:
-            level = Level.WARN
+            level = Severity.WARN
             remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
         elif (
             not interface.multicast and interface.loopback and port in (interface.name, *interface.addresses)
         ):
-            level = Level.NOTE
+            level = Severity.NOTE
             remedy = (
                 "deal-hw's own programs find each other; programs on the vendor's SDK need `ip link set "
                 f"{interface.name} multicast on`"

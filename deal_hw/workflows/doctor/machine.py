@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.control.realtime import FIFO_PRIORITY
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.install import install_line
 
 PACKAGES: Final = (
@@ -47,17 +47,17 @@ def _system() -> Finding:
     text = f"Python {platform.python_version()} on {platform.system()} {platform.release()}, "
     text += f"{platform.machine()}, {os.cpu_count()} processors"
     if sys.platform != "linux":
-        return Finding("system", Level.FAIL, text, "deal-hw drives robots from Linux only")
-    return Finding("system", Level.OK, text)
+        return Finding("system", Severity.FAIL, text, "deal-hw drives robots from Linux only")
+    return Finding("system", Severity.OK, text)
 
 
 def _packages() -> Iterator[Finding]:
     for name, extra in PACKAGES:
         if version := _version(name):
-            yield Finding("packages", Level.OK, f"{name} {version}")
+            yield Finding("packages", Severity.OK, f"{name} {version}")
         else:
             hint = f"if this computer needs it: {install_line(extra)}"
-            yield Finding("packages", Level.NOTE, f"{name} is not installed", hint)
+            yield Finding("packages", Severity.NOTE, f"{name} is not installed", hint)
 
 
 def _version(name: str) -> str:
@@ -70,10 +70,10 @@ def _version(name: str) -> str:
 def _scheduling() -> Finding:
     allowed = _may_use_fifo()
     if allowed:
-        return Finding("scheduling", Level.OK, f"SCHED_FIFO with priority {FIFO_PRIORITY} is permitted")
+        return Finding("scheduling", Severity.OK, f"SCHED_FIFO with priority {FIFO_PRIORITY} is permitted")
     return Finding(
         "scheduling",
-        Level.WARN,
+        Severity.WARN,
         "SCHED_FIFO is refused: cycles will be late when the computer is busy",
         f"write `{_user()} - rtprio {FIFO_PRIORITY + 20}` into /etc/security/limits.conf and log in again, "
         "or give the Python interpreter CAP_SYS_NICE",
@@ -95,10 +95,10 @@ def _may_use_fifo() -> bool:
 def _memory() -> Finding:
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if os.geteuid() == 0 or soft == resource.RLIM_INFINITY or soft >= _LEAST_LOCK_BYTES:
-        return Finding("memory", Level.OK, "memory can be locked")
+        return Finding("memory", Severity.OK, "memory can be locked")
     return Finding(
         "memory",
-        Level.WARN,
+        Severity.WARN,
         f"only {soft >> 20} MiB of memory can be locked: a page fault may delay a cycle",
         f"write `{_user()} - memlock unlimited` into /etc/security/limits.conf and log in again",
     )
@@ -110,15 +110,15 @@ def _clock() -> Iterator[Finding]:
     text = f"the monotonic clock has {resolution_s * 1e9:.0f} ns resolution, source {source}"
     if resolution_s > _COARSE_S or source in ("jiffies", "acpi_pm"):
         yield Finding(
-            "clock", Level.WARN, text, "time stamps will be coarse; choose the clock source tsc or hpet"
+            "clock", Severity.WARN, text, "time stamps will be coarse; choose the clock source tsc or hpet"
         )
     else:
-        yield Finding("clock", Level.OK, text)
+        yield Finding("clock", Severity.OK, text)
     governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     if governor and governor != "performance":
         yield Finding(
             "clock",
-            Level.NOTE,
+            Severity.NOTE,
             f"the processor's frequency governor is {governor}",
             "for faster wake-ups: `cpupower frequency-set -g performance`",
         )
@@ -128,8 +128,8 @@ def _receive_buffer() -> Finding:
     most = int(_read("/proc/sys/net/core/rmem_max") or 0)
     text = f"sockets may buffer {most // 1000} kB of received data"
     if most >= _LEAST_RECEIVE_BYTES:
-        return Finding("network", Level.OK, text)
-    return Finding("network", Level.WARN, text, "sysctl -w net.core.rmem_max=2097152")
+        return Finding("network", Severity.OK, text)
+    return Finding("network", Severity.WARN, text, "sysctl -w net.core.rmem_max=2097152")
 
 
 def _read(path: str) -> str:

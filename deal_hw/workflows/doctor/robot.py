@@ -12,7 +12,7 @@ from deal_hw.clock import Clock
 from deal_hw.control.clock_check import judge_clock
 from deal_hw.control.safety import SafetyConfig
 from deal_hw.errors import TransportTimeoutError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.robot import Robot
 from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
 
@@ -41,7 +41,7 @@ def examine_robot(
     """
     silent = "see what the emulator says" if local else "check the device's power and the cable"
     with robot:
-        yield Finding("link", Level.OK, f"{name} answers{_info_text(getattr(robot, 'info', None))}")
+        yield Finding("link", Severity.OK, f"{name} answers{_info_text(getattr(robot, 'info', None))}")
         errors = robot.transport_errors
         host_ns: list[int] = []
         device_ns: list[int] = []
@@ -50,7 +50,7 @@ def examine_robot(
             try:
                 state = robot.read_state(min(_PATIENCE_S, seconds))
             except TransportTimeoutError as error:
-                yield Finding("states", Level.FAIL, str(error), silent)
+                yield Finding("states", Severity.FAIL, str(error), silent)
                 return
             host_ns.append(state.receive_ns)
             device_ns.append(state.device_ns)
@@ -69,7 +69,7 @@ def examine_robot(
     due = max((host_ns[-1] - host_ns[0]) * 1e-9, _PATIENCE_S) * wanted_hz
     if errors > _TRIPS * due:
         advice = corrupt_advice(local, Load.now())
-        yield Finding("states", Level.FAIL, f"{text}; a run trips at {_TRIPS:.0%}", advice)
+        yield Finding("states", Severity.FAIL, f"{text}; a run trips at {_TRIPS:.0%}", advice)
     else:
         yield Finding.judged("states", share > _FEW_ERRORS, text, corrupt_advice(local, Load.now()))
     yield judge_clock(np.array(host_ns), np.array(device_ns))

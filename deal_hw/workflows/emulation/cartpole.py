@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deal_hw.drivers.cartpole.faults import Hazards
+from deal_hw.drivers.cartpole.emulator.faults import Hazards
 from deal_hw.errors import MissingExtraError
 from deal_hw.workflows.emulation.common import (
     choose_truth,
@@ -27,8 +27,8 @@ from deal_hw.workflows.emulation.settings import (
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
-    from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
-    from deal_hw.drivers.cartpole.truth import CartpoleTruth
+    from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
+    from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 
 
 def emulate_cartpole(
@@ -54,7 +54,7 @@ def emulate_cartpole(
     own: dict[str, str] = {}
     runs = ""
     if (config.transport or "serial") in WITH_FIRMWARE:
-        from deal_hw.drivers.cartpole.firmwares import usable_firmware
+        from deal_hw.drivers.cartpole.chips.firmwares import usable_firmware
 
         own["firmware"] = usable_firmware(config.firmware)
         runs = f", firmware: {own['firmware']}"
@@ -87,8 +87,8 @@ def emulate_cartpole(
 
 
 def _truth(config: EmulateSettings) -> CartpoleTruth:
-    from deal_hw.drivers.cartpole.oracle import draw_truth
-    from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
+    from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
+    from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 
     return choose_truth(config, nominal_truth, draw_truth, CartpoleTruth.from_json, CARTPOLE_RANGE_RATIO)
 

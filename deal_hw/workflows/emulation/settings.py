@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from deal_hw.drivers.cartpole.faults import CanFaults, ServoFaults
+from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.ranges import Checked, Range, check_ranges
@@ -84,9 +84,9 @@ class Go2Options(Checked):
 
 
 CARTPOLE_EMULATORS = {
-    "serial": "deal_hw.drivers.cartpole.emulator:serial_emulator",
-    "can": "deal_hw.drivers.cartpole.can_emulator:can_emulator",
-    "odrive": "deal_hw.drivers.cartpole.odrive_emulator:odrive_emulator",
+    "serial": "deal_hw.drivers.cartpole.emulator.emulator:serial_emulator",
+    "can": "deal_hw.drivers.cartpole.emulator.can_emulator:can_emulator",
+    "odrive": "deal_hw.drivers.cartpole.emulator.odrive_emulator:odrive_emulator",
     "dynamixel": "deal_hw.drivers.cartpole.dynamixel.emulator:dynamixel_emulator",
 }
 """Wires of the cart-pole -> "module:function"; the function is called as

@@ -21,9 +21,9 @@ from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice, TrueTrajectory
-from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.chips.device import CartpoleDevice, EmulatedDevice, TrueTrajectory
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.robot import Robot
 from deal_hw.sim.recordings.episode import SampledEpisode

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from deal_hw.drivers.cartpole.dynamixel import registers as r
-from deal_hw.drivers.cartpole.dynamixel import xl330
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import EmulatedServo
-from deal_hw.drivers.cartpole.dynamixel.registers import OperatingMode
+from deal_hw.drivers.cartpole.chips.servo import Servo
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.protocol import Target
-from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.wire.protocol import Target
+from deal_hw.drivers.servo_bus import registers as r
+from deal_hw.drivers.servo_bus import xl330
+from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
+from deal_hw.drivers.servo_bus.registers import OperatingMode
 
 _NO_LIMIT_M_S = 1000.0
 _FREE_M = 10.0

@@ -7,12 +7,17 @@ import math
 
 import numpy as np
 
+from deal_hw.drivers.cartpole.chips.device import TICK_NS, EmulatedDevice
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.device import TICK_NS, EmulatedDevice
 from deal_hw.drivers.cartpole.dynamixel.belt import BeltMotor
-from deal_hw.drivers.cartpole.dynamixel.emulated_bus import EmulatedBus
-from deal_hw.drivers.cartpole.dynamixel.emulated_servo import EmulatedServo
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.cartpole.emulator.faults import ServoFaults
+from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
+from deal_hw.drivers.cartpole.plant.sensor import Motor
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
+from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
+from deal_hw.drivers.servo_bus.registers import (
     GOAL_POSITION,
     HARDWARE_ERROR,
     ID,
@@ -21,11 +26,6 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     RAD_S_PER_COUNT,
     OperatingMode,
 )
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.faults import ServoFaults
-from deal_hw.drivers.cartpole.mechanics import Mechanics
-from deal_hw.drivers.cartpole.sensor import Motor
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
 OVERLOAD = 1 << 5
 

@@ -8,10 +8,11 @@ from typing import Final
 
 from deal_hw.clock import Clock
 from deal_hw.documentation import page
-from deal_hw.drivers.cartpole.dynamixel.bus import Answer, Bus
 from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
 from deal_hw.drivers.cartpole.dynamixel.examine import model_name
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.servo_bus.bus import Answer, Bus
+from deal_hw.drivers.servo_bus.registers import (
     BAUD_RATES,
     HARDWARE_ERROR,
     OPERATING_MODE,
@@ -23,10 +24,9 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     Register,
     explain_hardware_error,
 )
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
-from deal_hw.findings import Finding, Level
+from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Transport
 
 AREA: Final = "servos"
@@ -64,7 +64,7 @@ def examine_servos(
         except DealHwError as error:
             if rate == settings.baud_rate:
                 raise
-            yield Finding(AREA, Level.NOTE, f"{rate} baud: the port does not support this rate ({error})")
+            yield Finding(AREA, Severity.NOTE, f"{rate} baud: the port does not support this rate ({error})")
             continue
         with transport:
             bus = Bus(transport, clock, rate, settings.answer_s)
@@ -79,7 +79,7 @@ def examine_servos(
     if not found:
         yield Finding(
             AREA,
-            Level.FAIL,
+            Severity.FAIL,
             f"no servo answers on {path} at any of {len(BAUD_RATES)} baud rates",
             "switch their supply on (USB does not power them), check the 3-pin cables, and that this is the "
             "adapter's port",
@@ -101,7 +101,7 @@ def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelS
         except (TransportTimeoutError, FrameError):
             yield Finding(
                 AREA,
-                Level.FAIL,
+                Severity.FAIL,
                 f"id {servo} at {rate} baud answers pings, but its other answers are corrupt",
                 "two servos may have the same id: connect one alone and give it another",
             )
@@ -109,7 +109,7 @@ def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelS
     role = {settings.cart_id: "belt", settings.pole_id: "pole"}.get(servo, "not used")
     yield Finding(
         AREA,
-        Level.OK,
+        Severity.OK,
         f"id {servo} ({role}): {model_name(answer.model)}, firmware {answer.firmware}, {rate} baud, "
         f"operating mode {values[OPERATING_MODE]}, position {values[PRESENT_POSITION] % 4096} of 4096, "
         f"{values[PRESENT_INPUT_VOLTAGE] / 10:.1f} V, {values[PRESENT_TEMPERATURE]} °C",
@@ -117,7 +117,7 @@ def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelS
     if rate != settings.baud_rate:
         yield Finding(
             AREA,
-            Level.FAIL,
+            Severity.FAIL,
             f"id {servo} is set to {rate} baud, but deal-hw expects {settings.baud_rate}",
             "set its register Baud Rate (8) with Dynamixel Wizard"
             + (f", or give --port 'PORT?baud_rate={rate}' if both have it" if rate >= _FAST_BAUD else ""),
@@ -126,14 +126,14 @@ def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelS
     if delay_us > _LONG_DELAY_US:
         yield Finding(
             AREA,
-            Level.WARN,
+            Severity.WARN,
             f"id {servo} waits {delay_us} us before each answer",
             "set its register Return Delay Time (9) to 0",
         )
     if values[HARDWARE_ERROR]:
         yield Finding(
             AREA,
-            Level.FAIL,
+            Severity.FAIL,
             f"id {servo} reports: {explain_hardware_error(values[HARDWARE_ERROR])}",
             "then switch it off and on",
         )
@@ -149,7 +149,7 @@ def _read(bus: Bus, servo: int, register: Register) -> int:
 def _old(servo: int, rate: int) -> Finding:
     return Finding(
         AREA,
-        Level.FAIL,
+        Severity.FAIL,
         f"id {servo} at {rate} baud speaks Dynamixel protocol 1.0",
         "set its register Protocol Type (13) to 2 with Dynamixel Wizard, or update its firmware",
     )
@@ -165,7 +165,7 @@ def _latency_timer(path: str, sysfs: Path) -> Iterator[Finding]:
     # The driver sets 1 ms when it opens the port; without permission for that the answers are late.
     yield Finding(
         AREA,
-        Level.NOTE if slow else Level.OK,
+        Severity.NOTE if slow else Severity.OK,
         f"the adapter's latency timer is {timer_ms} ms",
         f"deal-hw sets it to 1 ms while it runs; for other programs: echo 1 > /sys/class/tty/"
         f"{Path(path).resolve().name}/device/latency_timer, or the udev rule "

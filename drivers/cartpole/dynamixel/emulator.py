@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
-from deal_hw.drivers.cartpole.dynamixel.registers import BAUD_RATES
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
-from deal_hw.drivers.cartpole.faults import Hazards
-from deal_hw.drivers.cartpole.truth import CartpoleTruth
+from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
+from deal_hw.drivers.cartpole.emulator.faults import Hazards
+from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+from deal_hw.drivers.servo_bus.registers import BAUD_RATES
 
 _SPEEDS: Final = {
     code: rate for rate in BAUD_RATES if (code := getattr(termios, f"B{rate}", None)) is not None

@@ -10,8 +10,9 @@ from typing import TypeVar
 
 from deal_hw.clock import Clock
 from deal_hw.documentation import page
-from deal_hw.drivers.cartpole.dynamixel.bus import Answer, Bus
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.servo_bus.bus import Answer, Bus
+from deal_hw.drivers.servo_bus.registers import (
     BAUD_RATE,
     BLOCK_ADDRESS,
     BLOCK_BYTES,
@@ -28,8 +29,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     TORQUE_ENABLE,
     Register,
 )
-from deal_hw.drivers.cartpole.dynamixel.sdk import ControlTable, DxlRuntimeError
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.servo_bus.sdk import ControlTable, DxlRuntimeError
 from deal_hw.errors import (
     ConfigurationError,
     FrameError,

@@ -10,14 +10,14 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.control.behaviours import position_command
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.servos import PoleAngle, Servos
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
+from deal_hw.drivers.servo_bus.registers import (
     PULSES,
     WATCHDOG_TRIPPED,
     Block,
     explain_hardware_error,
 )
-from deal_hw.drivers.cartpole.dynamixel.servos import PoleAngle, Servos
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.errors import SafetyError, TransportTimeoutError
 
 _PERIOD_NS = 10_000_000

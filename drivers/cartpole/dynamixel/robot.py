@@ -12,19 +12,19 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.dynamixel.bus import Bus
 from deal_hw.drivers.cartpole.dynamixel.examine import DynamixelInfo, Examination
 from deal_hw.drivers.cartpole.dynamixel.homing import Homing
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
+from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.registers import (
     PROFILE_ONGOING,
     RAD_S_PER_COUNT,
     WATCHDOG_TRIPPED,
     Block,
     explain_hardware_error,
 )
-from deal_hw.drivers.cartpole.dynamixel.samples import SampleGrid, TickClock
-from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
+from deal_hw.drivers.servo_bus.samples import SampleGrid, TickClock
 from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.schema import from_values

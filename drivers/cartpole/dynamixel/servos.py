@@ -7,8 +7,9 @@ import struct
 from collections.abc import Sequence
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.cartpole.dynamixel.bus import Bus
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
+from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.registers import (
     BLOCK_ADDRESS,
     BLOCK_BYTES,
     BUS_WATCHDOG,
@@ -24,7 +25,6 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     WATCHDOG_UNIT_S,
     Block,
 )
-from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.errors import FrameError, TransportTimeoutError
 
 WATCHDOG_S = 0.2

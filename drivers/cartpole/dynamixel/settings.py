@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from deal_hw.drivers.cartpole.dynamixel.registers import (
+from deal_hw.drivers.servo_bus.registers import (
     BAUD_RATES,
     PULSES,
     RAD_S_PER_COUNT,

@@ -1,0 +1,274 @@
+"""Reads a command line by the options of a verb: which kind of input it names, and what is wrong with it.
+
+The parser prints a box around an error, for people. So everything that it would refuse is found here before.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import difflib
+import inspect
+import itertools
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+from deal_hw.errors import ConfigurationError, short
+from deal_hw.ranges import option
+from deal_hw.workflows.kinds import Arguments, groups, has, listed
+from deal_hw.workflows.options import FROM_PYTHON
+
+BOOLEANS = ("True", "False")
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option or argument of a verb.
+
+    Attributes:
+        name: The field.
+        owner: The settings with that field.
+        kinds: Types of its value; of each value, if there may be several.
+        values: How many values it takes; 0 for a flag, None for any number.
+        required: Whether it must be given.
+        positional: Whether it is an argument without a name.
+        on: Whether it is a flag that is on by default, which ``--no-NAME`` switches off.
+    """
+
+    name: str
+    owner: type[Any]
+    kinds: tuple[Any, ...]
+    values: int | None
+    required: bool
+    positional: bool
+    on: bool
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """The words that give it; none for an argument."""
+        if self.positional:
+            return ()
+        flag = option(self.name)
+        return (flag, f"--no-{flag[2:]}") if self.on else (flag,)
+
+    @property
+    def shown(self) -> str:
+        """Its name in messages."""
+        return self.name.upper() if self.positional else option(self.name)
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The names that it takes; empty if it takes others."""
+        found = [one for kind in self.kinds if get_origin(kind) is Literal for one in get_args(kind)]
+        return BOOLEANS if bool in self.kinds and self.values else tuple(map(str, found))
+
+    def check(self, value: str) -> None:
+        """Refuse a value of the wrong type; the settings check ranges and choices.
+
+        Raises:
+            ConfigurationError: The value is no number, or neither True nor False.
+        """
+        if NoneType in self.kinds and value == "None":
+            return
+        kinds = set(self.kinds) - {NoneType}
+        wrong = ""
+        if kinds == {bool} and value not in BOOLEANS:
+            wrong = "is neither True nor False"
+        elif kinds <= {int, float}:
+            try:
+                (float if float in kinds else int)(value)
+            except ValueError:
+                wrong = "is no number" if float in kinds else "is no whole number"
+        if wrong:
+            raise ConfigurationError(f"{self.shown}: {short(value)!r} {wrong}; {self.meaning}")
+
+    @property
+    def meaning(self) -> str:
+        """What it is, for the end of a message."""
+        return f"{self.shown} is: {_meaning(self.owner, self.name)}".rstrip(". ")
+
+
+def options_of(settings: type[Any]) -> dict[str, Option]:
+    """Return the options and arguments of settings by field name, those of groups included."""
+    found: dict[str, Option] = {}
+    hints = get_type_hints(settings, include_extras=True)
+    for entry in dataclasses.fields(settings):
+        hint = hints[entry.name]
+        kinds = tuple(_kinds(hint))
+        if not is_option(hint):
+            continue
+        if inner := list(groups(hint)):
+            found |= {name: one for group in inner for name, one in options_of(group).items()}
+            continue
+        tuples = [kind for kind in kinds if get_origin(kind) is tuple]
+        count: int | None = 0 if kinds == (bool,) else 1
+        for several in tuples:
+            parts = get_args(several)
+            endless = parts[-1] is Ellipsis
+            count = None if endless or count is None else len(parts)
+            kinds = tuple(_kinds(parts[0])) if endless or len(set(parts)) == 1 else (str,)
+            kinds = (str,) if any(get_origin(kind) is tuple for kind in kinds) else kinds
+        if any(isinstance(mark, PrimitiveConstructorSpec) for mark in get_args(hint)[1:]):
+            # It has a parser of its own, such as for several numbers in one word.
+            kinds, count = (str,), 1
+        missing = dataclasses.MISSING
+        found[entry.name] = Option(
+            name=entry.name,
+            owner=settings,
+            kinds=kinds,
+            values=count,
+            required=entry.default is missing and entry.default_factory is missing,
+            positional=is_positional(settings, entry.name, hint),
+            on=count == 0 and entry.default is True,
+        )
+    return found
+
+
+def is_positional(owner: Any, name: str, hint: Any) -> bool:
+    """Return whether a field is an argument without a name: marked so, or not keyword-only."""
+    fields: Mapping[str, Any] = getattr(owner, "__dataclass_fields__", {})
+    if tyro.conf.Positional in get_args(hint)[1:]:
+        return True
+    return name in fields and not fields[name].kw_only and any(one.kw_only for one in fields.values())
+
+
+def is_option(hint: Any) -> bool:
+    """Return whether the command line has a field: not one that only Python can give."""
+    marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    return (
+        tyro.conf.Suppress not in marks
+        and FROM_PYTHON not in marks
+        and not any(get_origin(kind) is Callable for kind in _kinds(hint))
+    )
+
+
+def _kinds(hint: Any) -> Iterator[Any]:
+    """Yield the types that a field takes."""
+    if get_origin(hint) is Annotated:
+        yield from _kinds(get_args(hint)[0])
+    elif get_origin(hint) in (UnionType, Union):
+        for part in get_args(hint):
+            yield from _kinds(part)
+    else:
+        yield hint
+
+
+def _meaning(owner: type[Any], name: str) -> str:
+    """Return a field's description on one line, from the sources."""
+    for part in owner.__mro__:
+        try:
+            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(part))).body
+        except (OSError, TypeError):
+            continue
+        body = tree.body if isinstance(tree, ast.ClassDef) else []
+        for line, text in itertools.pairwise(body):
+            if isinstance(line, ast.AnnAssign) and getattr(line.target, "id", "") == name:
+                value = text.value if isinstance(text, ast.Expr) else None
+                if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                    return " ".join(value.value.split())
+    return ""
+
+
+def _is_option_word(word: str) -> bool:
+    """Return whether a word is an option, and not a value such as -1."""
+    return word.startswith("--") or (word.startswith("-") and word[1:2].isalpha())
+
+
+class CommandLine:
+    """The words behind a verb, by the options of its kinds.
+
+    Args:
+        words: The words.
+        known: The options that its kinds have together, by field name.
+    """
+
+    def __init__(self, words: Sequence[str], known: Iterable[Option]) -> None:
+        flags = {flag: one for one in known for flag in one.flags}
+        self.positional: list[str] = []
+        self.given: list[tuple[str, Option | None, list[str]]] = []
+        """Each option word, what it is (None if unknown), and its values, in order."""
+        room: int | None = 0
+        for word in words:
+            name, equals, value = word.partition("=")
+            if _is_option_word(word):
+                entry = flags.get(name.replace("_", "-"))
+                self.given.append((name, entry, [value] if equals else []))
+                room = 0 if equals else 1 if entry is None else entry.values
+            elif room is None or room > 0:
+                self.given[-1][2].append(word)
+                room = None if room is None else room - 1
+            else:
+                self.positional.append(word)
+
+    @property
+    def arguments(self) -> Arguments:
+        """What was given, to find the kind by."""
+        options: dict[str, Any] = {}
+        for flag, entry, values in self.given:
+            if entry is not None:
+                value: Any = values if entry.values is None or entry.values > 1 else "".join(values)
+                options[entry.name] = (not flag.startswith("--no-")) if entry.values == 0 else value
+        return Arguments(self.positional[0] if self.positional else None, options)
+
+
+def check(line: str, words: Sequence[str], settings: type[Any], others: Callable[[str], list[str]]) -> None:
+    """Refuse words that the parser would refuse, each by one line.
+
+    Args:
+        line: The command without its options, such as ``deal-hw collect go2``.
+        words: The words behind it.
+        settings: The settings to make of them.
+        others: Returns the commands whose kinds have an option, by its field name.
+
+    Raises:
+        ConfigurationError: An option is unknown or lacks a value, a value is no number, or one is missing.
+    """
+    options = options_of(settings)
+    given = CommandLine(words, options.values())
+    for flag, entry, values in given.given:
+        if entry is None:
+            raise ConfigurationError(_unknown(line, flag, values, options, others))
+        if entry.values == 0 and values:
+            raise ConfigurationError(f"{flag} takes no value, and {short(values[0])!r} was given")
+        wanted = "a value" if entry.values in (1, None) else f"{entry.values} values"
+        if entry.values != 0 and len(values) < (1 if entry.values is None else entry.values):
+            raise ConfigurationError(f"{flag} needs {wanted}; {entry.meaning}")
+        for value in values:
+            entry.check(value)
+    arguments = [one for one in options.values() if one.positional]
+    room = sum(len(given.positional) if one.values is None else 1 for one in arguments)
+    if len(given.positional) > room:
+        extra = " ".join(short(word) for word in given.positional[room:])
+        raise ConfigurationError(f"`{line}` takes no {extra!r} there; options begin with --")
+    named = {entry.name for _, entry, _ in given.given if entry is not None}
+    for number, one in enumerate(arguments):
+        if one.required and number >= len(given.positional):
+            raise ConfigurationError(f"`{line}` needs {one.shown}; {one.meaning}")
+    for one in options.values():
+        if one.required and not one.positional and one.name not in named:
+            raise ConfigurationError(f"`{line}` needs {one.shown}; {one.meaning}")
+
+
+def _unknown(
+    line: str,
+    flag: str,
+    values: Sequence[str],
+    options: Mapping[str, Option],
+    others: Callable[[str], list[str]],
+) -> str:
+    """Return the message on an unknown option: which kinds have it, or which option has a similar name."""
+    flag = flag.replace("_", "-")
+    plain = flag.removeprefix("--")
+    found = others(plain.replace("-", "_")) or others(plain.removeprefix("no-").replace("-", "_"))
+    text = f"{short(flag)}: `{line}` has no such option"
+    if found:
+        return f"{text}; {listed(iter(found))} {has(found)} it"
+    flags = {name: one for one in options.values() for name in one.flags}
+    near = difflib.get_close_matches(flag, flags, n=1, cutoff=0.7)
+    return f"{text}; did you mean {near[0]}? {flags[near[0]].meaning}" if near else text

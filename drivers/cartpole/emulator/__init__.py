@@ -1,0 +1,1 @@
+"""Emulated cart-poles behind a wire, and the balancer that chooses their hidden truth."""

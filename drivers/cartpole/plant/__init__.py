@@ -1,0 +1,1 @@
+"""The emulated mechanics with their sensors, and the hidden truth behind them."""

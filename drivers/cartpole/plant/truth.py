@@ -1,0 +1,131 @@
+"""The hidden truth of an emulated cart-pole; for emulator and benches, never for a calibrator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.drivers.cartpole.description import k9_space, parameter_space
+from deal_hw.drivers.cartpole.plant.profiles import profile as find_profile
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.reading import number, reading
+
+MOST_TICKS = 1000
+"""Longest latency of one side [device ticks]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CartpoleTruth:
+    """Hidden values that a calibration should find.
+
+    Attributes:
+        profile: Name of the profile.
+        seed: Seed of the draw, of noise and of the start angles.
+        parameters: Every parameter by name, known ones included [SI units of ``parameter_space()``].
+        actuation_ticks: A command acts that many device ticks after it was received, before jitter.
+        sensing_ticks: A frame reports the state of that many device ticks ago, before jitter.
+        refused: Draws before this one that the oracle policy could not balance.
+    """
+
+    profile: str
+    seed: int
+    parameters: Mapping[str, float]
+    actuation_ticks: int = 0
+    sensing_ticks: int = 0
+    refused: int = 0
+
+    @property
+    def latency_s(self) -> float:
+        """Mean total latency: actuation plus sensing, and the mean of the profile's jitter [s].
+
+        Jitter only delays. So the mean, which a calibration finds, is later than the constant part.
+        """
+        return (
+            self.actuation_ticks + self.sensing_ticks + find_profile(self.profile).mean_jitter_ticks
+        ) * 1e-3
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "profile": self.profile,
+            "seed": self.seed,
+            "parameters": dict(self.parameters),
+            "actuation_ticks": self.actuation_ticks,
+            "sensing_ticks": self.sensing_ticks,
+            "latency_s": self.latency_s,
+            "refused": self.refused,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> CartpoleTruth:
+        """Return the truth that :meth:`to_json` wrote.
+
+        Raises:
+            ConfigurationError: A value is missing or invalid.
+        """
+        with reading(
+            "the values", "the truth of a cart-pole", "--reveal-to writes one", error=ConfigurationError
+        ):
+            ticks = {
+                key: int(number(values[key], key, 0, MOST_TICKS))
+                for key in ("actuation_ticks", "sensing_ticks")
+            }
+            return cls(
+                profile=find_profile(values["profile"]).name,
+                seed=int(number(values["seed"], "seed", 0)),
+                parameters={
+                    p.name: number(values["parameters"][p.name], p.name, 0.1 * p.low, 10 * p.high)
+                    for p in parameter_space().parameters
+                },
+                refused=int(number(values["refused"], "refused", 0)),
+                **ticks,
+            )
+
+
+def unique_id(truth: CartpoleTruth) -> int:
+    """Return the serial number of the device with this truth."""
+    return 0xE000_0000 + truth.seed % 2**28
+
+
+def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> CartpoleTruth:
+    """Return a truth that equals the description, without latency unless given among the changes."""
+    parameters = {p.name: p.nominal for p in parameter_space().parameters}
+    return CartpoleTruth(profile=profile, seed=seed, parameters=parameters, **changes)
+
+
+def candidate_truth(
+    profile: str,
+    rng: np.random.Generator,
+    *,
+    seed: int,
+    range_ratio: float,
+    refused: int,
+    space: ParameterSpace | None = None,
+) -> CartpoleTruth:
+    """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency.
+
+    ``space`` says which parameters are free, and around which values; without it K9. Parameters that it does
+    not have keep their nominal values.
+    """
+    chosen = space or k9_space()
+    space = chosen.with_ratio(range_ratio).with_known(chosen.known)
+    values = space.unnormalize(rng.uniform(0.1, 0.9, len(space)))
+    low, high = find_profile(profile).latency_ticks
+    total = int(rng.integers(low, high + 1))
+    sensing = int(rng.integers(0, total + 1))
+    return CartpoleTruth(
+        profile=profile,
+        seed=seed,
+        parameters={
+            **{p.name: p.nominal for p in parameter_space().parameters},
+            **space.known,
+            **dict(zip(space.names, map(float, values), strict=True)),
+        },
+        actuation_ticks=total - sensing,
+        sensing_ticks=sensing,
+        refused=refused,
+    )

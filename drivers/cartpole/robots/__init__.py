@@ -1,0 +1,1 @@
+"""The drivers of the cart-pole: serial line, CAN, ODrive."""

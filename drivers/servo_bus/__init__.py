@@ -1,0 +1,1 @@
+"""A bus of Dynamixel servos, for any robot: packets, registers, the host's side, and emulated servos."""

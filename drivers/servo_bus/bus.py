@@ -1,0 +1,403 @@
+"""Dynamixel packets over a byte stream: ROBOTIS' SDK encodes and decodes them, our transport carries them.
+
+The SDK's own port waits in a busy loop on the wall clock, and 34 ms for an absent servo. Here its packet
+handler gets our port: the transport waits, on a monotonic clock, and an answer may take its time on the wire
+plus an allowance. A group's answer is read without blocking: bytes are collected as they arrive, and the SDK
+gets them when the last packet is complete.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeAlias
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.servo_bus.registers import Register
+from deal_hw.drivers.servo_bus.sdk import COMM_SUCCESS, PacketHandler, Protocol2PacketHandler
+from deal_hw.errors import FrameError, ProtocolError, TransportTimeoutError
+from deal_hw.transport import Message, Transport
+
+HEADER: Final = b"\xff\xff\xfd\x00"
+_BROADCAST: Final = 0xFE
+_SYNC_READ, _FAST_SYNC_READ, _STATUS = 0x82, 0x8A, 0x55
+_STATUS_BYTES = 11
+"""A status packet without data: header 4, id, length 2, instruction, error, CRC 2."""
+_PING_BYTES = _STATUS_BYTES + 3
+_BITS_PER_BYTE = 10
+_QUEUE = 4096
+_ALERT = 0x80
+
+
+class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
+    """The SDK's codec, with one error corrected."""
+
+    def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
+        """Return an answer without the stuffing bytes; the SDK then checks its CRC.
+
+        SDK 4.1 does it in place, and after the first such byte compares with bytes that it has already
+        overwritten: FF FF FD FD FF FD FD lost its last byte, and all registers behind it were shifted.
+        """
+        whole = bytes(packet)
+        body = whole[7:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+        return [*whole[:5], *(len(body) + 2).to_bytes(2, "little"), *body, *whole[-2:]]
+
+
+Writes: TypeAlias = Sequence[tuple[int, Mapping[int, bytes]]]
+"""Sync writes: an address, and the bytes that each servo gets there."""
+
+
+class Answer(NamedTuple):
+    """A servo's answer to a ping."""
+
+    model: int
+    firmware: int
+
+
+class _Wanted(NamedTuple):
+    """A requested answer: servos, bytes of each, whether in one packet, deadline [ns]."""
+
+    ids: tuple[int, ...]
+    size: int
+    fast: bool
+    until_ns: int
+
+
+class _Port:
+    """The port interface of the SDK's packet handler."""
+
+    is_using = property(lambda self: False, lambda self, value: None)
+    """The SDK's lock stays taken after a read that raises; this bus has one user."""
+
+    def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
+        self.baud_rate, self.answer_s = baud_rate, answer_s
+        self.wire: deque[Message] = deque(maxlen=_QUEUE)
+        self.buffer = bytearray()
+        self.written = bytearray()
+        self.heard = self.stamp_ns = 0
+        self._transport, self._clock = transport, clock
+        self._deadline_ns = 0
+
+    # The names below are the SDK's.
+
+    def clearPort(self) -> None:  # noqa: N802
+        """Keep the received bytes; :meth:`drop` discards them before a new request."""
+
+    def getBaudRate(self) -> int:  # noqa: N802
+        """Return the bits per second."""
+        return self.baud_rate
+
+    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
+        """Keep a packet until :meth:`flush`."""
+        self.written += bytes(packet)
+        return len(packet)
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Return up to that many bytes, waiting for the first until the deadline."""
+        self.flush()
+        if not self.buffer and length > 0:
+            self.receive(self._deadline_ns)
+        # A corrupt length field makes the SDK request a negative number.
+        length = max(length, 0)
+        taken = bytes(self.buffer[:length])
+        del self.buffer[:length]
+        return taken
+
+    def setPacketTimeout(self, length: int) -> None:  # noqa: N802
+        """Begin to wait for an answer of that many bytes."""
+        self._deadline_ns = self._clock.now_ns() + self.answer_ns(length)
+
+    def setPacketTimeoutMillis(self, milliseconds: float) -> None:  # noqa: N802
+        """Begin to wait for this time [ms]."""
+        self._deadline_ns = self._clock.now_ns() + round(milliseconds * 1e6)
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        """Return whether the time is over and all received bytes are read."""
+        return not self.buffer and self._clock.now_ns() >= self._deadline_ns
+
+    # Methods that the bus adds.
+
+    def answer_ns(self, length: int) -> int:
+        """Return how long an answer of that many bytes may take [ns]."""
+        return round((length * _BITS_PER_BYTE / self.baud_rate + self.answer_s) * 1e9)
+
+    def expire(self) -> None:
+        """Stop waiting; the SDK then reads the buffer."""
+        self._deadline_ns = 0
+
+    def flush(self) -> None:
+        """Send the written packets as one message."""
+        if self.written:
+            data, self.written = bytes(self.written), bytearray()
+            message = Message("tx", data, self._clock.now_ns())
+            self._transport.send(Message("", data, message.stamp_ns))
+            self.wire.append(message)
+
+    def receive(self, deadline_ns: int) -> bool:
+        """Wait for bytes; return whether any arrived."""
+        try:
+            message = self._transport.receive(max(0, deadline_ns - self._clock.now_ns()) / 1e9)
+        except TransportTimeoutError:
+            return False
+        self.buffer += message.payload
+        self.heard += len(message.payload)
+        self.stamp_ns = message.stamp_ns
+        self.wire.append(Message("rx", message.payload, message.stamp_ns))
+        return True
+
+    def drop(self) -> None:
+        """Discard bytes that arrived too late for the previous answer."""
+        while self.receive(0):
+            pass
+        self.buffer.clear()
+
+
+@contextlib.contextmanager
+def _short_is_corrupt(servo: int) -> Iterator[None]:
+    """Raise FrameError if the SDK reads beyond the end of an answer with a valid CRC."""
+    try:
+        yield
+    except IndexError as error:
+        raise FrameError(f"servo {servo}: a short answer") from error
+
+
+class Bus:
+    """Reads and writes servos' registers.
+
+    Attributes:
+        errors: Corrupt or missing answers so far.
+        heard: Received bytes so far, valid or not.
+
+    Args:
+        transport: A byte stream, open.
+        clock: The clock of its stamps.
+        baud_rate: Baud rate of the bus, for the time of bytes.
+        answer_s: Additional time for an answer [s].
+    """
+
+    def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
+        self.errors = 0
+        self._clock = clock
+        self._port = _Port(transport, clock, baud_rate, answer_s)
+        self._sdk: Any = _Packets()
+        self._wanted: deque[_Wanted] = deque()
+
+    @property
+    def heard(self) -> int:
+        """Received bytes so far, valid or not."""
+        return self._port.heard
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the newest bytes [ns]."""
+        return self._port.stamp_ns
+
+    @property
+    def wire(self) -> deque[Message]:
+        """Messages sent and received; the newest few thousand."""
+        return self._port.wire
+
+    def ping(self, servo: int) -> Answer:
+        """Return model and firmware of a servo.
+
+        Raises:
+            TransportTimeoutError: It is silent.
+            FrameError: Its answer is corrupt.
+        """
+        self._port.drop()
+        packet = [0, 0, 0, 0, servo, 3, 0, 1, 0, 0]
+        with _short_is_corrupt(servo):
+            answer, result, _ = self._sdk.txRxPacket(self._port, packet)
+        # Error, model (2), firmware, CRC (2).
+        self._check(servo, result, result != COMM_SUCCESS or len(answer) >= _PING_BYTES)
+        return Answer(answer[9] | answer[10] << 8, answer[11])
+
+    def ping_protocol_1(self, servo: int) -> bool:
+        """Return whether a servo answers in the older protocol 1.0."""
+        self._port.drop()
+        try:
+            _, result, _ = PacketHandler(1.0).ping(self._port, servo)
+        except IndexError:
+            return False
+        return bool(result == COMM_SUCCESS)
+
+    def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
+        """Return all servos that answer a broadcast ping within a time [s]."""
+        self._port.drop()
+        self._sdk.txPacket(self._port, [0, 0, 0, 0, _BROADCAST, 3, 0, 1, 0, 0])
+        self._port.flush()
+        self._port.setPacketTimeoutMillis(1e3 * seconds)
+        found: dict[int, Answer] = {}
+        while not self._port.isPacketTimeout():
+            # Packet by packet, since the SDK's own function waits for all 252 servos, 1.3 s.
+            try:
+                packet, result = self._sdk.rxPacket(self._port, False)
+            except IndexError:
+                self.errors += 1
+                continue
+            if result == COMM_SUCCESS and len(packet) >= _PING_BYTES:
+                found[packet[4]] = Answer(packet[9] | packet[10] << 8, packet[11])
+            elif result != COMM_SUCCESS and packet:
+                self.errors += 1
+        return found
+
+    def read(self, servo: int, register: Register) -> int:
+        """Return a register, without sign; raises as :meth:`ping`."""
+        self._port.drop()
+        with _short_is_corrupt(servo):
+            data, result, _ = self._sdk.readTxRx(self._port, servo, register.address, register.size)
+        self._check(servo, result, len(data) == register.size)
+        return int.from_bytes(bytes(data), "little")
+
+    def write(self, servo: int, register: Register, value: int) -> None:
+        """Write a register and wait for the servo's confirmation; raises as :meth:`ping`.
+
+        Raises:
+            ProtocolError: The servo refuses the value.
+        """
+        self._port.drop()
+        data = list((value % (1 << 8 * register.size)).to_bytes(register.size, "little"))
+        with _short_is_corrupt(servo):
+            result, error = self._sdk.writeTxRx(self._port, servo, register.address, register.size, data)
+        self._check(servo, result)
+        if error & ~_ALERT:
+            said = self._sdk.getRxPacketError(error & ~_ALERT).removeprefix("[RxPacketError] ")
+            raise ProtocolError(
+                f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {said}"
+            )
+
+    def post(self, writes: Writes) -> int:
+        """Write registers in one message without waiting; return the send time [ns].
+
+        Args:
+            writes: Sync writes, in order: an address, and the bytes of each servo.
+        """
+        self._write(writes)
+        now_ns = self._clock.now_ns()
+        self._port.flush()
+        return now_ns
+
+    def _write(self, writes: Writes) -> None:
+        for address, values in writes:
+            size = len(next(iter(values.values())))
+            params = [byte for servo, data in values.items() for byte in (servo, *data)]
+            self._sdk.syncWriteTxOnly(self._port, address, size, params, len(params))
+
+    def ask(
+        self,
+        servos: Sequence[int],
+        address: int,
+        size: int,
+        *,
+        fast: bool,
+        writes: Writes = (),
+        behind: bool = False,
+    ) -> int:
+        """Request the same registers of servos in one message; return the send time [ns].
+
+        Args:
+            servos: Their ids.
+            address: The first register.
+            size: Number of bytes of each.
+            fast: Whether they answer in one packet (Fast Sync Read) or each in its own.
+            writes: Sync writes before it in the same message, as in :meth:`post`.
+            behind: Wait for this answer after the one before it; otherwise that one is forgotten.
+        """
+        if not behind:
+            self._port.drop()
+            self._wanted.clear()
+        self._write(writes)
+        self._sdk.syncReadTx(self._port, address, size, list(servos), len(servos), fast)
+        now_ns = self._clock.now_ns()
+        self._port.flush()
+        until_ns = now_ns + self._port.answer_ns(self.answer_bytes(len(servos), size, fast) + 16)
+        self._wanted.append(_Wanted(tuple(servos), size, fast, until_ns))
+        return now_ns
+
+    @staticmethod
+    def answer_bytes(servos: int, size: int, fast: bool) -> int:
+        """Return the number of bytes of a group's answer."""
+        return 8 + servos * (size + 4) if fast else servos * (size + _STATUS_BYTES)
+
+    def take(self, deadline_ns: int) -> dict[int, bytes] | None:
+        """Return the registers of the oldest question by id, waiting for them until a deadline at most.
+
+        Returns:
+            None if no complete answer arrived until the deadline, but may still arrive.
+
+        Raises:
+            TransportTimeoutError: The servos are silent.
+            FrameError: The answer is corrupt.
+        """
+        wanted = self._wanted[0]
+        while not self._whole(wanted):
+            if self._clock.now_ns() >= wanted.until_ns:
+                self.errors += 1
+                self._wanted.popleft()
+                if self._port.buffer:
+                    raise FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
+                raise TransportTimeoutError(f"servos {wanted.ids} do not answer")
+            if not self._port.receive(min(deadline_ns, wanted.until_ns)) and (
+                self._clock.now_ns() >= deadline_ns
+            ):
+                return None
+        self._port.expire()
+        self._wanted.popleft()
+        try:
+            return self._fast_answer(wanted) if wanted.fast else self._answers(wanted)
+        except (IndexError, FrameError) as error:
+            self.errors += 1
+            raise FrameError(f"the answer of servos {wanted.ids} is corrupt") from error
+
+    def _whole(self, answer: _Wanted) -> bool:
+        """Return whether the buffer contains all requested packets; the SDK checks their content."""
+        at, wanted = 0, 1 if answer.fast else len(answer.ids)
+        while wanted:
+            at = self._port.buffer.find(HEADER, at)
+            if at < 0 or len(self._port.buffer) < at + 7:
+                return False
+            at += 7 + int.from_bytes(self._port.buffer[at + 5 : at + 7], "little")
+            if len(self._port.buffer) < at:
+                return False
+            wanted -= 1
+        return True
+
+    def _fast_answer(self, wanted: _Wanted) -> dict[int, bytes]:
+        packet, result = self._sdk.rxPacket(self._port, True)
+        if result != COMM_SUCCESS or packet[4] != _BROADCAST or packet[7] != _STATUS:
+            raise FrameError("no sound packet")
+        if len(packet) > self.answer_bytes(len(wanted.ids), wanted.size, True):
+            # The SDK expects such answers without stuffing; the length shows whether a servo stuffs them.
+            packet = self._sdk.removeStuffing(packet)
+        found = {}
+        for k, servo in enumerate(wanted.ids):
+            at = 8 + k * (wanted.size + 4)
+            if packet[at + 1] != servo:
+                raise FrameError("another servo's answer")
+            found[servo] = bytes(packet[at + 2 : at + 2 + wanted.size])
+        return _sized(found, wanted.size)
+
+    def _answers(self, wanted: _Wanted) -> dict[int, bytes]:
+        found = {}
+        for servo in wanted.ids:
+            packet, result = self._sdk.rxPacket(self._port, False)
+            if result != COMM_SUCCESS or packet[4] != servo:
+                raise FrameError("no sound packet")
+            found[servo] = bytes(packet[9 : 9 + wanted.size])
+        return _sized(found, wanted.size)
+
+    def _check(self, servo: int, result: int, whole: bool = True) -> None:
+        if result == COMM_SUCCESS and whole:
+            return
+        self.errors += 1
+        said = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ")
+        if "no status packet" in said:
+            raise TransportTimeoutError(f"servo {servo} does not answer")
+        raise FrameError(f"servo {servo}: {said or 'a short answer'}")
+
+
+def _sized(found: dict[int, bytes], size: int) -> dict[int, bytes]:
+    if any(len(data) != size for data in found.values()):
+        raise FrameError("too short")
+    return found
