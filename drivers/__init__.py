@@ -20,9 +20,9 @@ from deal_hw.transport import TopicTransport, Transport, WireOptions
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.control.balance import BalanceResult
-    from deal_hw.control.velocity_error import Track
     from deal_hw.drivers.go2.claim import WireClaim
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.velocity_error import Track
 
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robots.robot:CartpoleRobot",
@@ -51,7 +51,7 @@ SPACES: Final = {
 """Tables of parameter sets, name -> function; the first of each is the default."""
 ODOMETRY: Final = {"go2": "deal_hw.drivers.go2.odometry:walked"}
 """Robots with odometry -> function that returns the walked track of a recording."""
-BALANCE: Final = {"cartpole": "deal_hw.control.balance:recorded_balance"}
+BALANCE: Final = {"cartpole": "deal_hw.motions.scores.balance:recorded_balance"}
 """Robots whose policies balance a pole -> function that judges a recording."""
 TRANSPORTS: Final = {
     "serial": "deal_hw.drivers.transports.serial_transport:SerialTransport",

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.control.balance import CART, POLE
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.scores.balance import CART, POLE
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import ServoVectorEnv, check_task

@@ -13,9 +13,9 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import UnknownNameError
+from deal_hw.motions.behaviours import centre
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray

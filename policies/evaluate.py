@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.control.balance import TASK_SECONDS, BalanceResult, balance_result
 from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.motions.scores.balance import TASK_SECONDS, BalanceResult, balance_result
 from deal_hw.parameters import ParameterSpace
 from deal_hw.policies.demonstration import BatchPolicy
 from deal_hw.policies.servo_loop import ServoLoop

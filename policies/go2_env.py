@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.control.safety_filter import SafetyFilter
+from deal_hw.control.safety.filter import SafetyFilter
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution

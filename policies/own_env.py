@@ -15,9 +15,9 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError, short
+from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.vector_env import TaskKnowledge
 from deal_hw.policy import ObservationTerm, PolicySpec

@@ -27,9 +27,9 @@ import numpy as np
 from typing_extensions import Self
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import MissingExtraError, PolicyError
+from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.policies.trial_states import GivenVelocity, Probe, ProbeStates
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray

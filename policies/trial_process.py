@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.control.realtime import die_with_parent
+from deal_hw.control.process.realtime import die_with_parent
 from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 

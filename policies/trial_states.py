@@ -9,8 +9,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from deal_hw.control.velocity import LARGEST
 from deal_hw.description import RobotDescription
+from deal_hw.motions.velocity import LARGEST
 from deal_hw.types import BodyState, FloatArray, RobotState, Status
 
 Kind = Literal["nominal", "extreme", "random"]

@@ -13,9 +13,9 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec

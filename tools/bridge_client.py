@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.realtime import FIFO_PRIORITY, priority
+from deal_hw.control.process.realtime import FIFO_PRIORITY, priority
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder

@@ -25,7 +25,7 @@ from fakes.go2 import FakeGo2
 from measuring import head, spread, write_document
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.realtime import become_realtime
+from deal_hw.control.process.realtime import become_realtime
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE, TYPES

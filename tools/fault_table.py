@@ -26,7 +26,7 @@ from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case,
 from measuring import head, hear_signals, load, parser, write_document
 from stall_monitor import watch_stalls
 
-from deal_hw.control.realtime import priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.errors import DealHwError
 

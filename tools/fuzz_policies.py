@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 from measuring import parser
 
-from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import driver_description
 from deal_hw.errors import PolicyError
+from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.trial import TrialSettings, check_policy
 from deal_hw.policies.trial_states import ProbeStates

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.loop_timing import LoopTiming, Spread
-from deal_hw.control.realtime import become_realtime, die_with_parent
+from deal_hw.control.loop.timing import LoopTiming, Spread
+from deal_hw.control.process.realtime import become_realtime, die_with_parent
 from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import DealHwError, TransportError, TransportLostError, TransportTimeoutError

@@ -19,7 +19,7 @@ from typing import Any
 from measuring import Rows, markdown, parser, read_rows, spread
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.realtime import priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.drivers import make_robot
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.testing.robot_suite import default_command

@@ -22,7 +22,7 @@ import tyro
 from measuring import Rows, spread
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.realtime import become_realtime
+from deal_hw.control.process.realtime import become_realtime
 from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.servo_bus.bus import Bus

@@ -30,13 +30,13 @@ import numpy as np
 from measuring import head, parser, program, write_document
 
 from deal_hw.bench.rows import Cells, Row, run_cells
-from deal_hw.control.loop import Outcome
-from deal_hw.control.planned_end import PlannedEnd
-from deal_hw.control.posture import PostureConfig
-from deal_hw.control.velocity_error import velocity_error
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.drivers.go2.descriptions.driver import DRIVER, LEG_LIMITS
 from deal_hw.drivers.go2.emulator.profiles import PROFILES
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.motions.planned_end import PlannedEnd
+from deal_hw.motions.posture import PostureConfig
+from deal_hw.motions.scores.velocity_error import velocity_error
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.types import FloatArray, RobotState
 from deal_hw.workflows.emulation.virtual_go2 import VirtualWalk, walk

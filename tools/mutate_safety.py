@@ -24,17 +24,17 @@ WORK = ROOT / "build" / "mutation"
 PAGE = ROOT / "docs" / "results" / "safety-mutation.md"
 SETS = {
     "safety": (
-        ("deal_hw/control/safety*.py", "deal_hw/control/leg_checks.py"),
+        tuple(f"deal_hw/control/safety/{name}.py" for name in ("safety", "filter", "machine", "leg_checks")),
         ("tests/control/test_control_safety*.py",),
     ),
     # Without the tests through the whole loop, which take most of the time.
     "passive": (
-        ("deal_hw/control/passive.py",),
+        ("deal_hw/control/safety/passive.py",),
         ("tests/control/test_control_exit_passive.py",),
         ("-k", "not go2"),
     ),
     "processes": (
-        tuple(f"deal_hw/control/{name}.py" for name in ("supervisor", "vigil", "claim")),
+        tuple(f"deal_hw/control/process/{name}.py" for name in ("supervisor", "vigil", "claim")),
         ("tests/control/test_control_exit_[sv]*.py", "tests/control/test_control_words.py"),
     ),
 }

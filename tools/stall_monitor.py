@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from deal_hw.control.realtime import become_realtime
+from deal_hw.control.process.realtime import become_realtime
 from deal_hw.errors import ConfigurationError
 
 PERIOD_NS = 1_000_000

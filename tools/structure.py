@@ -45,6 +45,10 @@ Numeric module constants of the folder
     class attributes without annotation do not count. literal: those whose value is written with literals,
     arithmetic and containers alone. UPPER_CASE: how many are so written.
 
+Settings of the folder
+    `settings_count` defines settings classes, fields that nobody sets and what tests replace by name. Tests'
+    replacements are those of the whole tree.
+
 Own least-squares loops of the folder: candidates for a person to judge
     Functions that solve a linear system repeatedly: a loop or comprehension whose body calls a solver of
     numpy, scipy or torch: ``solve``, ``lstsq``, ``cho_solve``, ``lu_solve``, ``solve_triangular`` or
@@ -79,6 +83,7 @@ from import_graph import (
     read_sources,
     targets,
 )
+from settings_count import replaced_by_tests, settings_classes
 
 from deal_hw.bench.rows import describe_call
 
@@ -154,6 +159,8 @@ def count(root: Path, folder: str = "calib", verb: str = "calibrate") -> dict[st
     }
     constants = numeric_constants(inside, sources)
     candidates = solve_loops(inside, sources)
+    settings = settings_classes(inside, sources, root)
+    replaced = replaced_by_tests(root)
     return {
         "format": FORMAT,
         "folder": folder,
@@ -174,6 +181,11 @@ def count(root: Path, folder: str = "calib", verb: str = "calibrate") -> dict[st
             f"{folder}/ numeric module constants": len(constants),
             f"{folder}/ numeric module constants, literal": sum(c["literal"] for c in constants),
             f"{folder}/ numeric module constants, UPPER_CASE": sum(c["name"].isupper() for c in constants),
+            f"{folder}/ settings classes": len(settings),
+            f"{folder}/ settings classes that nobody gives an argument": sum(not s.set_by for s in settings),
+            f"{folder}/ settings fields": sum(len(s.fields) for s in settings),
+            f"{folder}/ settings fields that nobody sets": sum(len(s.unset) for s in settings),
+            "constants and settings that tests replace": len(replaced),
             f"{folder}/ least-squares candidates": len(candidates),
             f"{folder}/ least-squares candidates, accepting": sum(c["accepting"] for c in candidates),
             "lines of tools/": _lines_below(root / "tools"),
@@ -186,6 +198,8 @@ def count(root: Path, folder: str = "calib", verb: str = "calibrate") -> dict[st
         "circles_without_types": circles(seen),
         "circles_of_rooms": circles(rooms),
         "numeric_constants": constants,
+        "settings": [one.as_row() for one in settings],
+        "replaced_by_tests": replaced,
         "least_squares_candidates": candidates,
     }
 
@@ -394,6 +408,13 @@ def print_counts(counted: Mapping[str, Any]) -> None:
     ):
         print(f"\n{title}")
         print("\n".join(f"  {', '.join(circle)}" for circle in counted[key]) or "  none")
+    print("\nsettings fields that nobody sets")
+    for row in counted["settings"]:
+        unset = [name for name, places in row["fields"].items() if not places]
+        if unset:
+            print(f"  {row['file']} {row['class']}: {', '.join(unset)}")
+    print("\nreplaced by tests")
+    print("\n".join(f"  {row}" for row in counted["replaced_by_tests"]) or "  none")
     print("\nleast-squares candidates, for a person to judge")
     for row in counted["least_squares_candidates"]:
         mark = "accepting" if row["accepting"] else ""

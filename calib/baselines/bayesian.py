@@ -36,10 +36,24 @@ from scipy.stats.qmc import Sobol
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
-from deal_hw.calib.search.fitness import FitnessSettings
 from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
+
+FIT_ITERATIONS = 60
+"""Most iterations of the process's fit."""
+
+ACQUISITION_ITERATIONS = 30
+"""Most iterations of the acquisition's optimiser."""
+
+ACQUISITION_STARTS = 2
+"""Starts of the acquisition's optimiser."""
+
+ACQUISITION_DRAWS = 64
+"""Draws from which these starts are chosen."""
+
+PROCESS_DRAWS = 64
+"""Draws of the process for the mean improvement."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,31 +66,16 @@ class BoSettings:
             error. With a changing fitness each generation scores a part of the earlier members again beside
             the new ones (the budget's population in total), and the process sees only these.
         batch: New members of a generation after the first, q.
-        trust_region: Whether batches are taken near the best point; off is the textbook's search of the whole
-            range.
         most_points: Most points of the Gaussian process.
         elite: Size of the result's population, best first.
-        fit_iterations: Most iterations of the process's fit.
-        acquisition_iterations: Most iterations of the acquisition's optimiser.
-        acquisition_starts: Number of its starts.
-        acquisition_draws: Draws from which the starts are chosen.
-        process_draws: Draws of the process for the mean improvement.
-        scoring: Settings of the fitness.
         linear: Whether the range is linear, as in the paper; off is uniform in each parameter's own scale.
         latency: Whether a latency that is not given is one more coordinate.
     """
 
     fitness: str = "trajectory"
     batch: int = 8
-    trust_region: bool = True
     most_points: int = 300
     elite: int = 10
-    fit_iterations: int = 60
-    acquisition_iterations: int = 30
-    acquisition_starts: int = 2
-    acquisition_draws: int = 64
-    process_draws: int = 64
-    scoring: FitnessSettings = field(default_factory=FitnessSettings)
     linear: bool = False
     latency: bool = True
 
@@ -208,7 +207,7 @@ class GaussianProcessSearch(Stateful):
         points, fitness = self._points[kept], self._fitness[kept]
         found = None
         if len(np.unique(fitness[np.isfinite(fitness)])) > 1:
-            side = self.region.length if self._settings.trust_region else None
+            side = self.region.length
             seed = self._seed + self._generation
             found = _largest_improvement(points, _quantiles(fitness), batch, side, seed, self._settings)
         if found is None:
@@ -227,7 +226,7 @@ def _quantiles(fitness: FloatArray) -> FloatArray:
 
 
 def _largest_improvement(
-    points: FloatArray, value: FloatArray, batch: int, side: float | None, seed: int, settings: BoSettings
+    points: FloatArray, value: FloatArray, batch: int, side: float, seed: int, settings: BoSettings
 ) -> FloatArray | None:
     """Return the batch of the largest qLogEI, (batch, C), or None where the process could not be fitted.
 
@@ -258,18 +257,18 @@ def _largest_improvement(
         try:
             model = SingleTaskGP(x, y, outcome_transform=None)
             likelihood = ExactMarginalLogLikelihood(model.likelihood, model)
-            options = {"maxiter": settings.fit_iterations}
+            options = {"maxiter": FIT_ITERATIONS}
             fit_gpytorch_mll(likelihood, optimizer_kwargs={"options": options})
-            sampler = SobolQMCNormalSampler(torch.Size([settings.process_draws]), seed=seed)
+            sampler = SobolQMCNormalSampler(torch.Size([PROCESS_DRAWS]), seed=seed)
             acquisition = qLogExpectedImprovement(model, best_f=y.max(), sampler=sampler)
             found, _ = optimize_acqf(
                 acquisition,
                 bounds=torch.from_numpy(_box(points, value, model, side)),
                 q=batch,
-                num_restarts=settings.acquisition_starts,
-                raw_samples=settings.acquisition_draws,
+                num_restarts=ACQUISITION_STARTS,
+                raw_samples=ACQUISITION_DRAWS,
                 options={
-                    "maxiter": settings.acquisition_iterations,
+                    "maxiter": ACQUISITION_ITERATIONS,
                     "seed": seed,
                     "sample_around_best": True,
                     **moved,
@@ -280,11 +279,9 @@ def _largest_improvement(
     return np.asarray(found.detach().numpy(), dtype=float)
 
 
-def _box(points: FloatArray, value: FloatArray, model: Any, side: float | None) -> FloatArray:
+def _box(points: FloatArray, value: FloatArray, model: Any, side: float) -> FloatArray:
     """Return the bounds of the batch, (2, C): longer where the process varies less."""
     C = points.shape[1]
-    if side is None:
-        return np.stack([np.zeros(C), np.ones(C)])
     scale = model.covar_module.lengthscale.detach().numpy().reshape(C)
     half = 0.5 * side * scale / np.exp(np.mean(np.log(scale)))
     best = points[np.argmax(value)]

@@ -15,10 +15,15 @@ import numpy as np
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.fitness import FitnessSettings
 from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
+
+GROWTH = 2
+"""Factor of the population from one restart to the next (IPOP: 2)."""
+
+FIRST_SIGMA = 0.3
+"""First step size, in widths of the range."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,28 +35,18 @@ class CmaSettings:
         population: Members of the first run; None for pycma's own 4 + 3 ln C, at most the budget's. With
             equally many simulated members, many small populations get far nearer than few large ones
             (measured, 10 coordinates, 1200 members: 28 and 13 against 78 and 30 in log_error_x100).
-        growth: Factor of the population from one restart to the next (IPOP: 2).
-        sigma: First step size, in widths of the range.
         least_step: A run ends when no coordinate moves more than this, in widths of the range.
-        scoring: Settings of the fitness.
     """
 
     fitness: str = "trajectory"
     population: int | None = None
-    growth: int = 2
-    sigma: float = 0.3
     least_step: float = 1e-6
-    scoring: FitnessSettings = field(default_factory=FitnessSettings)
 
     def __post_init__(self) -> None:
         if self.population is not None and self.population < 2:
             raise ConfigurationError(f"population must be at least 2 or None, got {self.population}")
-        if self.growth < 1:
-            raise ConfigurationError(f"growth must be at least 1, got {self.growth}")
-        if not (self.sigma > 0 and self.least_step > 0):
-            raise ConfigurationError(
-                f"sigma and least_step must be above 0, got {self.sigma:g} and {self.least_step:g}"
-            )
+        if not self.least_step > 0:
+            raise ConfigurationError(f"least_step must be above 0, got {self.least_step:g}")
 
 
 class RestartedCma(Stateful):
@@ -75,7 +70,7 @@ class RestartedCma(Stateful):
         # Each run has its own stream, so that the end of one does not shift the draws of the next.
         rng = np.random.default_rng([self._seed, self.restarts])
         start = np.full(self._count, 0.5) if self.restarts == 0 else rng.random(self._count)
-        self.population = self._first * self._settings.growth**self.restarts
+        self.population = self._first * GROWTH**self.restarts
         options = {
             "bounds": [0.0, 1.0],
             "popsize": self.population,
@@ -87,7 +82,7 @@ class RestartedCma(Stateful):
             "verb_log": 0,
             "verb_disp": 0,
         }
-        self._strategy: Any = _pycma().CMAEvolutionStrategy(start, self._settings.sigma, options)
+        self._strategy: Any = _pycma().CMAEvolutionStrategy(start, FIRST_SIGMA, options)
 
     @property
     def mean(self) -> FloatArray:

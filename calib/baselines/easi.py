@@ -23,6 +23,9 @@ from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
+BATCH_PER_MEMBER = 16
+"""Transitions in a batch of the critic per member of the population (16)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EasiSettings:
@@ -35,8 +38,6 @@ class EasiSettings:
             upper end. Off is uniform in each parameter's own scale (log for positive ones).
         latency: Whether a latency that is not given is one more coordinate; EASI has none.
         critic: The published critic (two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation).
-        batch_per_member: Transitions in a batch of the critic per member of the population (16).
-        scoring: Settings of the fitness, except the critic.
     """
 
     fitness: str = "critic"
@@ -44,8 +45,6 @@ class EasiSettings:
     linear: bool = True
     latency: bool = False
     critic: CriticSettings = field(default_factory=lambda: CriticSettings(hidden=(128, 128)))
-    batch_per_member: int = 16
-    scoring: FitnessSettings = field(default_factory=FitnessSettings)
 
     def __post_init__(self) -> None:
         if not 0 < self.survive_rate <= 0.5:
@@ -108,8 +107,8 @@ class _Easi(ScoredStepper):
         self._search = EliteGaussian(start, settings.survive_rate, rng)
 
     def scoring(self) -> FitnessSettings:
-        batch = self.settings.batch_per_member * self.log.budget.population
-        return replace(self.settings.scoring, critic=replace(self.settings.critic, batch=batch))
+        batch = BATCH_PER_MEMBER * self.log.budget.population
+        return FitnessSettings(critic=replace(self.settings.critic, batch=batch))
 
     def step(self) -> None:
         """Roll out, train the critic, score by the trained critic, select."""

@@ -18,7 +18,13 @@ import numpy as np
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.intervals import intervals
-from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
+from deal_hw.calib.fit.residual import (
+    LATENCY_STEP_S,
+    PARAMETER_STEP,
+    POSITION_STEP,
+    VELOCITY_STEP,
+    value_bounds,
+)
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import Z90, CalibrationResult
 from deal_hw.findings import Finding
@@ -78,6 +84,10 @@ class ExtendedKalman:
         self.covariance[:n, :n] = np.diag(std**2)
 
 
+DIVERGED = 3.0
+"""Ratio of the innovations to their own variance above which the filter does not follow the recording."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfSettings:
     """Settings of `ekf`.
@@ -86,19 +96,13 @@ class EkfSettings:
         passes: Runs along all recordings, at most the budget's generations. Each starts at the last one's
             parameters and with the first one's covariance, so that no sample counts twice.
         parameter_drift: Standard deviation of a parameter's drift in one second, in parts of its range.
-        velocity_noise: Standard deviation of the model's error in a velocity per sample, in parts of the
-            start states' uncertainty.
         first_noise_factor: Factor on the sensors' standard deviations in the first pass. It falls by equal
             ratios to 1 in the last. Far from the truth, nonlinearity outweighs the noise.
-        diverged: Ratio of the innovations to their own variance above which the filter does not follow the
-            recording.
     """
 
     passes: int = 8
     parameter_drift: float = 1e-3
-    velocity_noise: float = 0.0
     first_noise_factor: float = 30.0
-    diverged: float = 3.0
 
 
 class _Passes(Stepper):
@@ -165,14 +169,14 @@ class _Passes(Stepper):
         covariance[n:, n:] = np.diag(self._prior_std**2)
         steps = np.concatenate(
             [
-                np.full(C, DIFFERENCES.position),
-                np.full(C, DIFFERENCES.velocity),
-                np.append(np.full(len(problem.space), DIFFERENCES.parameter), DIFFERENCES.latency_s)[:P],
+                np.full(C, POSITION_STEP),
+                np.full(C, VELOCITY_STEP),
+                np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)[:P],
             ]
         )
         drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)
-        model = settings.velocity_noise * problem.starts[0].typical_std[C:]
-        noise = np.concatenate([np.zeros(C), model, drift]) ** 2
+        # Q: the simulation of one sample counts as exact, so only the parameters drift.
+        noise = np.append(np.zeros(n), drift) ** 2
         return ExtendedKalman(np.append(np.zeros(n), self._value[:P]), covariance, n, steps, noise)
 
     def _along(self, filter_: ExtendedKalman, data: WindowData, factor: float) -> Iterator[float]:
@@ -218,7 +222,7 @@ class _Passes(Stepper):
         covariance = self._covariance[:K, :K]
         latency, clip = float(self._value[-1]), self.coordinates.clip_latency
         alarms = []
-        if not self._misfit < self.settings.diverged:
+        if not self._misfit < DIVERGED:
             alarms.append(
                 Finding.alarm(
                     f"The filter's innovations are {self._misfit:.1f} times their own variance.",

@@ -23,11 +23,27 @@ from deal_hw.calib.data.innovations import (
 )
 from deal_hw.calib.data.problem import Problem, measurements
 from deal_hw.calib.fit.intervals import kinks_of, uncertainty
-from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
+from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
+
+DRAW_SHARE = 3
+"""Inverse of the largest part of a small budget's generations for draws."""
+
+NOISY_TICKS = (5, 20)
+"""Window lengths of the stages for noisy positions [control periods]."""
+
+CLEAN_TICKS = (5, 10)
+"""Window lengths of the stages for positions without noise [control periods]."""
+
+SOLVER = SolverSettings(reach=30.0)
+"""Solver of the refinement. The prior around the start is wide: insensitive parameters are drawn, not
+held."""
+
+CONVERGED = 1e-3
+"""Relative gain of the residual below which no further round follows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,27 +52,16 @@ class GaussNewtonSettings:
 
     Attributes:
         draws: Parameter vectors that are scored before each multi-start.
-        draw_share: Inverse of the largest part of a small budget's generations for draws.
         starts: Number of the best draws that are refined.
         survivors: Number of starts in each further stage.
-        noisy_ticks: Window lengths of the stages for noisy positions [control periods].
-        clean_ticks: The same for positions without noise.
         rounds: Refinements of a start in one stage, each whitened around the present point.
-        solver: Solver of the refinement. The prior around the start is wide: insensitive parameters are
-            drawn, not held.
-        converged: Relative gain of the residual below which no further round follows.
         restart_chi2: Chi2 above which new starts are drawn.
     """
 
     draws: int = 500
-    draw_share: int = 3
     starts: int = 10
     survivors: int = 4
-    noisy_ticks: tuple[int, ...] = (5, 20)
-    clean_ticks: tuple[int, ...] = (5, 10)
     rounds: int = 3
-    solver: SolverSettings = field(default_factory=lambda: SolverSettings(reach=30.0))
-    converged: float = 1e-3
     restart_chi2: float = 3.0
 
 
@@ -84,7 +89,7 @@ class Innovations:
                     linearise(problem, around, data, whitening.next_offset(data.measured))
                     for data, whitening in zip(self.windows, self._whitenings, strict=True)
                 ]
-        steps = np.append(np.full(len(problem.space), DIFFERENCES.parameter), DIFFERENCES.latency_s)
+        steps = np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)
         self._steps = steps[: len(steps) - (problem.fixed_latency_s is not None)]
         mean, std = problem.space.prior
         self._expected = np.flatnonzero(np.isfinite(std))
@@ -129,9 +134,8 @@ class _MultiStart(Stepper):
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
-        settings = self.settings
         self._bounds = value_bounds(self.problem)
-        self._ticks = settings.noisy_ticks if is_noisy(self.problem) else settings.clean_ticks
+        self._ticks = NOISY_TICKS if is_noisy(self.problem) else CLEAN_TICKS
         self._midpoint = self._values_of(self.coordinates.midpoint)[0]
         self._restarts, self._explained = 0, False
         self._best = (math.inf, self._midpoint)
@@ -178,7 +182,7 @@ class _MultiStart(Stepper):
         self._drawn += len(values)
         self._note(f"{self._drawn} draws: best {math.sqrt(self._chi2[0]):.3g}", members)
         self._keep_best()
-        share = max(budget.generations // settings.draw_share, 1)
+        share = max(budget.generations // DRAW_SHARE, 1)
         if self._drawn >= min(settings.draws, share * budget.population):
             self._begin_stage(0)
 
@@ -193,9 +197,9 @@ class _MultiStart(Stepper):
         fixed = self.problem.fixed_latency_s is not None
         for _ in range(settings.rounds):
             innovations = Innovations(self.problem, ticks, value, follow=follow)
-            value, _ = minimise(innovations, value, self._bounds, settings.solver, fixed_latency=fixed)
+            value, _ = minimise(innovations, value, self._bounds, SOLVER, fixed_latency=fixed)
             before, chi2 = chi2, float(np.sum(innovations.residual(value) ** 2)) / innovations.count
-            if not chi2 < before * (1 - settings.converged):
+            if not chi2 < before * (1 - CONVERGED):
                 break
         self._values[number], self._chi2[number] = value, chi2 if math.isfinite(chi2) else math.inf
         self._keep_best()

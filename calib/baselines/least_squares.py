@@ -26,7 +26,7 @@ from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
-from deal_hw.calib.fit.residual import DIFFERENCES
+from deal_hw.calib.fit.residual import PARAMETER_STEP
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
 from deal_hw.calibration import CalibrationResult
@@ -36,19 +36,21 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
 
+TOLERANCE = 1e-8
+"""Relative change of cost and parameters at which the search ends."""
+
+DIVERGED = 1e3
+"""Residual of a diverged simulation [typical changes]: scipy takes no infinities."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeastSquaresSettings:
     """Settings of `least-squares`.
 
     Attributes:
-        tolerance: Relative change of cost and parameters at which the search ends.
-        diverged: Residual of a diverged simulation [typical changes]: scipy takes no infinities.
         random_start: Whether it starts from a random point, uniform in the linear range.
     """
 
-    tolerance: float = 1e-8
-    diverged: float = 1e3
     random_start: bool = False
 
 
@@ -167,8 +169,8 @@ class LeastSquaresBaseline(OneShotSearch):
         problem, space, settings = log.problem, log.problem.space, self.settings
         latency_s = log.coordinates.clip_latency(0.0)
         start = rng.uniform(space.low, space.high) if settings.random_start else space.center
-        error = OneStep(problem, latency_s, settings.diverged)
-        ends: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), settings.tolerance)
+        error = OneStep(problem, latency_s, DIVERGED)
+        ends: dict[str, Any] = dict.fromkeys(("ftol", "xtol", "gtol"), TOLERANCE)
         ends["max_nfev"] = max(log.budget.generations, 1)
         solution = _minimise(error, 0.0, space.to_scale(start), ends)
         count = len(solution.fun)
@@ -208,7 +210,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
     space = error.space
     mean, std = space.prior
     expected = np.isfinite(std) & (weight > 0)
-    step = DIFFERENCES.parameter * np.eye(len(space))
+    step = PARAMETER_STEP * np.eye(len(space))
 
     def rows(values: FloatArray) -> FloatArray:
         found = error.residual(values)
@@ -220,7 +222,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
 
     def jacobian(value: FloatArray) -> FloatArray:
         r = rows(np.concatenate([value[None], value + step]))
-        return np.asarray((r[1:] - r[0]).T / DIFFERENCES.parameter)
+        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
 
     bounds = space.to_scale(space.low), space.to_scale(space.high)
     return least_squares(residual, start, jac=jacobian, bounds=bounds, **ends)
@@ -270,6 +272,19 @@ class OneStep:
         return np.asarray(np.nan_to_num(whole, nan=far, posinf=far, neginf=-far))
 
 
+WINDOW_S = 0.4
+"""Length of the windows [s]."""
+
+FIRST_S = 12.0
+"""Length of data of the first fits, evenly spread [s]."""
+
+PART_S = 2.5
+"""Length of the parts into which the recordings are cut for the first fits [s]."""
+
+FIRST_ITERATIONS = 8
+"""Iterations of each first fit."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MultiStartSettings:
     """Settings of `least-squares-multistart`.
@@ -277,18 +292,10 @@ class MultiStartSettings:
     Attributes:
         starts: Number of starts: the nominal values, and draws over all ranges.
         survivors: Number of the best starts that continue with all recordings.
-        window_s: Length of the windows [s].
-        first_s: Length of data of the first fits, evenly spread [s].
-        part_s: Length of the parts into which the recordings are cut for that [s].
-        first_iterations: Iterations of each first fit.
     """
 
     starts: int = 8
     survivors: int = 2
-    window_s: float = 0.4
-    first_s: float = 12.0
-    part_s: float = 2.5
-    first_iterations: int = 8
 
 
 @dataclass(frozen=True)
@@ -309,10 +316,10 @@ class MultiStartLeastSquares(OneShotSearch):
         drawn = log.coordinates.members(log.coordinates.sample(rng, settings.starts - 1))
         nominal = problem.space.nominal, log.coordinates.clip_latency(0.0)
         starts = [nominal, *zip(drawn.theta, map(float, drawn.latency_s), strict=True)]
-        recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
-        parts = [p for e in problem.episodes for p in stretches(e, settings.part_s)]
-        part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
-        few, most = settings.first_iterations, max(log.budget.generations, 1)
+        recipe = Recipe(seconds=WINDOW_S, prior_std=np.inf)
+        parts = [p for e in problem.episodes for p in stretches(e, PART_S)]
+        part = dataclasses.replace(problem, episodes=spread(parts, FIRST_S))
+        few, most = FIRST_ITERATIONS, max(log.budget.generations, 1)
         rough = [fit_output_error(part, *start, recipe, iterations=few) for start in starts]
         order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]
         good = [(rough[i].theta, rough[i].latency_s) for i in order]

@@ -8,20 +8,14 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, cut, explained, whitened_residual
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
+from deal_hw.calib.search.no_data import NoSettings
 from deal_hw.calibration import CalibrationResult
 
+TICKS = 10
+"""Window length in control periods."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RandomSettings:
-    """Settings of `random`.
-
-    Attributes:
-        ticks: Window length in control periods.
-        elite: Size of the result's population, best first; at least 2.
-    """
-
-    ticks: int = 10
-    elite: int = 10
+ELITE = 10
+"""Size of the result's population, best first."""
 
 
 class _Random(Stepper):
@@ -29,11 +23,11 @@ class _Random(Stepper):
 
     STATE = ("_unit", "_score")
 
-    settings: RandomSettings
+    settings: NoSettings
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
-        self._windows = cut(log.problem, self.settings.ticks)
+        self._windows = cut(log.problem, TICKS)
         # One metric for all draws, that of the range's midpoint: otherwise scores are not comparable.
         self._middle = self.coordinates.midpoint
         self._unit = np.empty((0, self.coordinates.count))
@@ -52,7 +46,7 @@ class _Random(Stepper):
         score = np.mean(np.abs(residual), axis=1)
         score = np.where(np.isfinite(score), score, np.inf)
         units, scores = np.concatenate([self._unit, unit]), np.concatenate([self._score, score])
-        order = np.argsort(scores, kind="stable")[: max(self.settings.elite, 2)]
+        order = np.argsort(scores, kind="stable")[:ELITE]
         self._unit, self._score = units[order], scores[order]
         values = {"best": float(score.min())}
         self.log.note(f"best {self._score[0]:.3g}", members, values)
@@ -63,7 +57,7 @@ class _Random(Stepper):
         return self.log.result(
             best,
             elite,
-            chi2=explained(self.problem, best, self.settings.ticks),
+            chi2=explained(self.problem, best, TICKS),
             extra={"interval": "spread of the best draws, uncalibrated"},
         )
 
@@ -77,4 +71,4 @@ class RandomSearch(Search):
 
     name = "random"
     stepper = _Random
-    settings: RandomSettings = field(default_factory=RandomSettings)
+    settings: NoSettings = field(default_factory=NoSettings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,7 +21,7 @@ CHANGING = frozenset({"critic"})
 class ScoredStepper(Stepper):
     """A run whose search sees one number per member.
 
-    The settings name the fitness and its own settings; its window is also that of the stated residual.
+    The settings name the fitness; its window is also that of the stated residual.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
@@ -35,7 +35,7 @@ class ScoredStepper(Stepper):
 
     def scoring(self) -> FitnessSettings:
         """Return how the fitness scores."""
-        return cast("FitnessSettings", self.settings.scoring)
+        return FitnessSettings()
 
     @abc.abstractmethod
     def found(self) -> tuple[Members, Members]:
@@ -72,7 +72,7 @@ class ScoredStepper(Stepper):
         return self.log.result(
             centre,
             population,
-            chi2=explained(self.problem, centre, self.settings.scoring.window_ticks),
+            chi2=explained(self.problem, centre, self.scoring().window_ticks),
             alarms=(alarm,) if lost > 0.5 * scored else (),
             extra={"interval": self.INTERVAL, **self.facts()},
         )

@@ -19,20 +19,21 @@ from deal_hw.calib.search.base import SearchLog
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.recordings.sysid_adapter import SysidRecording, check_space, identify, require_sysid
 
+TICKS = 10
+"""Window length in control periods."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SysidSettings:
     """Settings of `mujoco-sysid`.
 
     Attributes:
-        ticks: Window length in control periods.
         window_s: Window length in seconds instead [s].
         latency_s: A latency found by other means, such as our scan [s]; None for the problem's if given, and
             otherwise zero.
         delay: If no latency is given, search it within the problem's range as one more parameter.
     """
 
-    ticks: int = 10
     window_s: float | None = None
     latency_s: float | None = None
     delay: bool = False
@@ -81,7 +82,7 @@ def _check_channels(problem: Problem) -> None:
 
 
 def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: str) -> FittedStart:
-    problem, ticks = log.problem, settings.ticks
+    problem, ticks = log.problem, TICKS
     if settings.window_s is not None:
         ticks = max(round(settings.window_s * problem.robot.description.control_rate_hz), 1)
     recordings = [

@@ -51,15 +51,14 @@ def check_excitation(problem: Problem) -> None:
     used = [e.position[e.usable][:, joints] for e in problem.episodes if e.usable.any()]
     spans = np.max([np.ptp(position, axis=0) for position in used], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
-    settings = problem.settings
     if problem.known_std is None and not problem.noise_free:
         # A joint that friction held shows few values of its encoder, and less noise than its sensor has, even
         # none. That is not enough to calibrate from.
         values = np.array([[len(np.unique(x)) for x in e.position[:, joints].T] for e in problem.episodes])
         sensor = np.asarray(problem.robot.description.sensor.position_std)
-        coarse = np.max(values, axis=0) < settings.least_motion
+        coarse = np.max(values, axis=0) < LEAST_MOTION
         noises = np.where(coarse, np.maximum(noises, sensor), noises)
-    least = settings.least_motion if problem.known_std is None else settings.least_chosen_motion
+    least = LEAST_MOTION if problem.known_std is None else LEAST_CHOSEN_MOTION
     still = [
         f"{name} moved {span:.2g} (noise {noise:.2g})"
         for name, span, noise in zip(names, spans, noises, strict=True)
@@ -69,10 +68,9 @@ def check_excitation(problem: Problem) -> None:
     passive = changes == 0 and problem.robot.description.actuation == "motor"
     if still and not (passive and len(still) < len(names)):
         raise InsufficientDataError(f"the recording hardly moves: {'; '.join(still)}; {advice}")
-    if changes < settings.fewest_changes and not passive:
+    if changes < FEWEST_CHANGES and not passive:
         raise InsufficientDataError(
-            f"the position target changed {changes} times, at least {settings.fewest_changes} are needed; "
-            f"{advice}"
+            f"the position target changed {changes} times, at least {FEWEST_CHANGES} are needed; {advice}"
         )
 
 
@@ -81,32 +79,39 @@ def target_changes(episodes: Sequence[SampledEpisode]) -> int:
     return sum(int(np.count_nonzero(np.any(np.diff(e.target, axis=0) != 0, axis=1))) for e in episodes)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SensitivitySettings:
-    """Settings of :func:`compute_sensitivity` and :func:`jumps`.
+LEAST_MOTION = 20.0
+"""Least motion of a joint [multiples of the sensor's noise]."""
 
-    Attributes:
-        window_s: Length of the windows [s].
-        most_windows: Most windows to predict.
-        nothing: Predictions that differ by fewer standard deviations of the noise are equal [-].
-        faint: A range that changes predictions by fewer standard deviations is hardly visible [-].
-        nudge: Small parameter change that reveals jumps, in the parameter's own scale.
-        push: Larger change that measures the true slope.
-        jump: Ratio of the slopes under nudge and push above which a prediction jumps [-].
-        many: Least share of windows that jump [-]. A contact that begins at another moment makes a few jump.
-    """
+LEAST_CHOSEN_MOTION = 5.0
+"""The same where the residual scale was chosen. That scale includes model error and is far above the
+sensor's noise."""
 
-    window_s: float = 0.5
-    most_windows: int = 12
-    nothing: float = 1e-9
-    faint: float = 1.0
-    nudge: float = 1e-6
-    push: float = 1e-3
-    jump: float = 10.0
-    many: float = 0.2
+FEWEST_CHANGES = 5
+"""Fewest changes of the target."""
 
+WINDOW_S = 0.5
+"""Length of the windows [s]."""
 
-SETTINGS = SensitivitySettings()
+MOST_WINDOWS = 12
+"""Most windows to predict."""
+
+NOTHING = 1e-9
+"""Predictions that differ by fewer standard deviations of the noise are equal [-]."""
+
+FAINT = 1.0
+"""A range that changes predictions by fewer standard deviations is hardly visible [-]."""
+
+NUDGE = 1e-6
+"""Small parameter change that reveals jumps, in the parameter's own scale."""
+
+PUSH = 1e-3
+"""Larger change that measures the true slope."""
+
+JUMP = 10.0
+"""Ratio of the slopes under nudge and push above which a prediction jumps [-]."""
+
+MANY = 0.2
+"""Least share of windows that jump [-]. A contact that begins at another moment makes a few jump."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,14 +129,12 @@ class Sensitivity:
     @property
     def unseen(self) -> tuple[str, ...]:
         """Parameters with no effect."""
-        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < SETTINGS.nothing)
+        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < NOTHING)
 
     @property
     def faint(self) -> tuple[str, ...]:
         """Parameters whose whole range changes no sample by more than the noise."""
-        return tuple(
-            n for n, e in zip(self.names, self.effect, strict=True) if SETTINGS.nothing <= e < SETTINGS.faint
-        )
+        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if NOTHING <= e < FAINT)
 
 
 def compute_sensitivity(problem: Problem) -> Sensitivity:
@@ -169,18 +172,18 @@ def jumps(problem: Problem) -> dict[str, float]:
     # Towards the middle of the range: a value at its end would be clipped.
     inwards = np.where(value > (space.to_scale(space.low) + space.to_scale(space.high)) / 2, -1.0, 1.0)
     values = np.repeat(value[None], 1 + 2 * K, axis=0)
-    values[1 : 1 + K] += SETTINGS.nudge * np.diag(inwards)
-    values[1 + K :] += SETTINGS.push * np.diag(inwards)
+    values[1 : 1 + K] += NUDGE * np.diag(inwards)
+    values[1 + K :] += PUSH * np.diag(inwards)
     changes = []
     for change, data in _changes(problem, space.from_scale(values)):
         largest = np.where(data.reported, change, 0.0).max(axis=(2, 3))
         changes.append(np.nan_to_num(largest, nan=0.0, posinf=0.0))
     nudged, pushed = np.split(np.concatenate(changes, axis=1), 2)
     jumping = nudged > np.maximum(
-        SETTINGS.jump * SETTINGS.nudge / SETTINGS.push * pushed,
-        SETTINGS.nothing * np.min(problem.noise_std[problem.channels]),
+        JUMP * NUDGE / PUSH * pushed,
+        NOTHING * np.min(problem.noise_std[problem.channels]),
     )
-    rough = np.mean(jumping, axis=1) > SETTINGS.many
+    rough = np.mean(jumping, axis=1) > MANY
     return {name: float(nudged[k].max()) for k, name in enumerate(space.names) if rough[k]}
 
 
@@ -204,8 +207,8 @@ def _changes(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArray, 
     There are about ``most_windows`` of them, evenly over all recordings.
     """
     latency, first = np.full(len(theta), problem.fixed_latency_s or 0.0), 0
-    windows = longest_windows(problem, SETTINGS.window_s)
-    every = max(sum(len(data.windows) for data in windows) // SETTINGS.most_windows, 1)
+    windows = longest_windows(problem, WINDOW_S)
+    every = max(sum(len(data.windows) for data in windows) // MOST_WINDOWS, 1)
     for data in windows:
         rows = np.arange((-first) % every, len(data.windows), every)
         first += len(data.windows)

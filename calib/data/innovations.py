@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deal_hw.calib.data.noise import NOISE_FREE_STD
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, measurements
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -36,7 +37,7 @@ class Members:
 def is_noisy(problem: Problem) -> bool:
     """Return whether the measurements carry sensor noise."""
     std = problem.noise_std[problem.channels]
-    return not problem.noise_free and bool(np.any(std >= problem.settings.noise_free_std))
+    return not problem.noise_free and bool(np.any(std >= NOISE_FREE_STD))
 
 
 def samples_per_tick(problem: Problem) -> int:
@@ -54,7 +55,7 @@ def cut(problem: Problem, ticks: int) -> list[WindowData]:
     per_tick = samples_per_tick(problem)
     if not is_noisy(problem):
         return problem.windows(ticks * per_tick)
-    margin = round(0.5 * problem.settings.smoothing_s * problem.robot.description.state_rate_hz)
+    margin = round(0.5 * problem.smoothing_s * problem.robot.description.state_rate_hz)
     return problem.windows(ticks * per_tick, offset=margin)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -23,70 +23,52 @@ MAD_TO_STD = 1.4826022185056018
 """Of a normal distribution: standard deviation over median absolute deviation."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DataSettings:
-    """Assumptions about recordings.
+RESOLUTION = 1e-6
+"""Step of positions on the wire [m or rad]."""
 
-    Attributes:
-        resolution: Step of positions on the wire [m or rad].
-        noise_free_std: Positions with less noise are taken as exact [m or rad].
-        noise_free_residual: Residual scale of noise-free recordings [m or rad]: far above rounding, far below
-            sensors.
-        held_std: Noise of a position that never changes, which shows none [m or rad]: a count of a coarse
-            encoder. Without it such a joint would outweigh all that move.
-        noise_order: Order of the differences that remove smooth motion and leave white noise.
-        speed_bins: Number of bins of equal speed in which noise is estimated.
-        fewest_in_bin: Fewest samples per bin for an estimate of jitter.
-        rounded: Least share of rounding in a channel's noise from which it limits the estimate of jitter [-].
-        counts: Least motion in a sampling period for that estimate then [counts]: slower, rounding is a
-            saw-tooth.
-        saw_tooth: Uncertainty of each variance then, as a share of rounding's [-]. Of 144 motions of one or
-            six sines at 200 Hz, rounded to 12 bits a turn, 3 seem to jitter by 0.1 ms or more, all of them
-            single sines; 18 without these two settings. A jitter of 0.5 ms is found in 38 of 54 motions, in
-            42 without them.
-        certain: Least significance of a timing jitter [standard errors].
-        slowest_jitter_s: Longest sampling period at which jitter of the sample times can be separated from
-            the motion [s].
-        smoothing_s: Width over which start states are smoothed [s].
-        smoothing_order: Order of the smoothing polynomial.
-        fewest_smoothed: Fewest samples of a polynomial.
-        velocity_prior_std: Weak prior on start velocities by the coordinate's unit [m/s and rad/s]; keeps
-            windows of few samples solvable.
-        unseen_std: Prior on an unmeasured place of the base on the floor [m]; no trajectory depends on it.
-        least_motion: Least motion of a joint [multiples of the sensor's noise].
-        least_chosen_motion: The same where the residual scale was chosen. That scale includes model error and
-            is far above the sensor's noise.
-        fewest_changes: Fewest changes of the target.
-    """
+FLOOR_STD = RESOLUTION / math.sqrt(12.0)
+"""Least noise of positions: rounding on the wire [m or rad]."""
 
-    resolution: float = 1e-6
-    noise_free_std: float = 2e-5
-    noise_free_residual: float = 1e-5
-    held_std: float = 1e-3
-    noise_order: int = 6
-    speed_bins: int = 10
-    fewest_in_bin: int = 20
-    rounded: float = 0.5
-    counts: float = 2.0
-    saw_tooth: float = 0.3
-    certain: float = 2.0
-    slowest_jitter_s: float = 0.01
-    smoothing_s: float = 0.1
-    smoothing_order: int = 3
-    fewest_smoothed: int = 7
-    velocity_prior_std: Mapping[str, float] = field(default_factory=lambda: {"m": 3.0, "rad": 30.0})
-    unseen_std: float = 1e-6
-    least_motion: float = 20.0
-    least_chosen_motion: float = 5.0
-    fewest_changes: int = 5
+NOISE_FREE_STD = 2e-5
+"""Positions with less noise are taken as exact [m or rad]."""
 
-    @property
-    def floor(self) -> float:
-        """Least noise of positions: rounding on the wire [m or rad]."""
-        return float(self.resolution / np.sqrt(12.0))
+HELD_STD = 1e-3
+"""Noise of a position that never changes, which shows none [m or rad]: a count of a coarse encoder.
+Without it such a joint would outweigh all that move."""
 
+NOISE_ORDER = 6
+"""Order of the differences that remove smooth motion and leave white noise."""
 
-SETTINGS = DataSettings()
+SPEED_BINS = 10
+"""Number of bins of equal speed in which noise is estimated."""
+
+FEWEST_IN_BIN = 20
+"""Fewest samples per bin for an estimate of jitter."""
+
+ROUNDED = 0.5
+"""Least share of rounding in a channel's noise from which it limits the estimate of jitter [-]."""
+
+LEAST_COUNTS = 2.0
+"""Least motion in a sampling period for that estimate then [counts]: slower, rounding is a saw-tooth."""
+
+SAW_TOOTH = 0.3
+"""Uncertainty of each variance where rounding is a saw-tooth, as a share of rounding's [-]. Of 144 motions
+of one or six sines at 200 Hz, rounded to 12 bits a turn, 3 seem to jitter by 0.1 ms or more, all of them
+single sines; 18 without this and `LEAST_COUNTS`. A jitter of 0.5 ms is found in 38 of 54 motions, in 42
+without them."""
+
+CERTAIN_JITTER = 2.0
+"""Least significance of a timing jitter [standard errors]."""
+
+SMOOTHING_S = 0.1
+"""Width over which start states are smoothed [s]."""
+
+SMOOTHING_ORDER = 3
+"""Order of the smoothing polynomial."""
+
+FEWEST_SMOOTHED = 7
+"""Fewest samples of a polynomial."""
+
 REST = 24
 """Steps of one value above which a joint is at rest [-]. In fewer, a slow motion passes a count of its
 encoder: that is rounding, which counts as noise."""
@@ -112,9 +94,7 @@ class NoiseModel:
         return np.sqrt(self.position_std**2 + (self.timing_std_s * velocity) ** 2)
 
 
-def white_noise_std(
-    parts: Sequence[FloatArray], settings: DataSettings = SETTINGS, reported: Sequence[Mask | None] = ()
-) -> FloatArray:
+def white_noise_std(parts: Sequence[FloatArray], reported: Sequence[Mask | None] = ()) -> FloatArray:
     """Estimate the standard deviation of white noise on top of smooth motion, (J,), from parts (T, J) each.
 
     The sixth difference of a smooth motion nearly vanishes. That of white noise with variance s^2 has
@@ -125,18 +105,16 @@ def white_noise_std(
     value: a joint at rest on a count of its encoder shows no noise.
     """
     masks = reported or [None] * len(parts)
-    differences = _differences(parts, settings.noise_order, masks)
-    rounding = _rounding_std(parts, masks, settings)
-    found = [_spread(d, settings.noise_order) if len(d) else 0.0 for d, _ in differences]
+    differences = _differences(parts, NOISE_ORDER, masks)
+    rounding = _rounding_std(parts, masks)
+    found = [_spread(d, NOISE_ORDER) if len(d) else 0.0 for d, _ in differences]
     first = next((x[0] for x in parts if len(x)), None)
     held = np.all([np.all(x == first, axis=0) for x in parts], axis=0)
-    least = np.where(held, settings.held_std, settings.floor)
+    least = np.where(held, HELD_STD, FLOOR_STD)
     return np.maximum(np.maximum(found, rounding), least)
 
 
-def _rounding_std(
-    parts: Sequence[FloatArray], reported: Sequence[Mask | None], settings: DataSettings
-) -> FloatArray:
+def _rounding_std(parts: Sequence[FloatArray], reported: Sequence[Mask | None]) -> FloatArray:
     """Return the noise of rounding to an encoder's counts, (J,): the least step between values over sqrt(12).
 
     The values of all parts count together: few samples of a fast motion lie many counts apart. Values that
@@ -144,7 +122,7 @@ def _rounding_std(
     """
     values = np.concatenate([x if m is None else x[m] for x, m in zip(parts, reported, strict=True)])
     steps = [np.diff(np.unique(column)) for column in values.T]
-    least = settings.resolution / 2
+    least = RESOLUTION / 2
     return np.array([min(s[s > least], default=0.0) for s in steps]) / math.sqrt(12.0)
 
 
@@ -183,7 +161,6 @@ def _spread(difference: FloatArray, order: int) -> float:
 def noise_model(
     positions: Sequence[FloatArray],
     velocities: Sequence[FloatArray],
-    settings: DataSettings = SETTINGS,
     reported: Sequence[Mask | None] = (),
 ) -> NoiseModel:
     """Estimate noise and timing jitter from positions and smoothed velocities of recordings, (T, J) each.
@@ -193,25 +170,25 @@ def noise_model(
     by all joints, is the jitter's variance. ``reported`` holds a mask for each recording, as in
     :func:`white_noise_std`.
     """
-    order, bins, floor = settings.noise_order, settings.speed_bins, settings.floor
+    order, bins, floor = NOISE_ORDER, SPEED_BINS, FLOOR_STD
     masks = reported or [None] * len(positions)
-    whole = white_noise_std(positions, settings, masks)
+    whole = white_noise_std(positions, masks)
     differences = _differences(positions, order, masks)
-    fewest = bins * settings.fewest_in_bin - order
+    fewest = bins * FEWEST_IN_BIN - order
     if all(len(d) <= fewest for d, _ in differences) or np.all(whole <= 10 * floor):
         return NoiseModel(whole, 0.0)
     middle = order // 2
     speed2 = np.concatenate([v[middle : middle + len(v) - order] ** 2 for v in velocities if len(v) > order])
-    rounding = _rounding_std(positions, masks, settings)
+    rounding = _rounding_std(positions, masks)
     slopes, weights = [], []
     lines: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
     moved = np.concatenate([np.abs(p[order:] - p[:-order]) for p in positions if len(p) > order])
-    least = settings.counts * order * math.sqrt(12.0)
+    least = LEAST_COUNTS * order * math.sqrt(12.0)
     for j, (difference, rows) in enumerate(differences):
         # Slower than some counts a sample, rounding is a saw-tooth: its differences grow with the speed, as
         # those of a jitter do.
-        rounded = rounding[j] > settings.rounded * whole[j]
-        saw_tooth = settings.saw_tooth * rounding[j] ** 2 if rounded else 0.0
+        rounded = rounding[j] > ROUNDED * whole[j]
+        saw_tooth = SAW_TOOTH * rounding[j] ** 2 if rounded else 0.0
         fast = np.flatnonzero(~rounded | (moved[rows, j] > least * rounding[j]))
         if len(fast) <= fewest:
             continue
@@ -231,7 +208,7 @@ def noise_model(
         return NoiseModel(whole, 0.0)
     variance = float(np.average(slopes, weights=weights))
     error = float(1.0 / math.sqrt(sum(weights)))
-    if variance < settings.certain * error:
+    if variance < CERTAIN_JITTER * error:
         return NoiseModel(whole, 0.0)
     rest = whole.copy()
     for j, x, y, s in lines:
@@ -284,7 +261,7 @@ class StartStates:
 
 
 def smooth_states(
-    episode: SampledEpisode, noise_std: FloatArray, rotation: slice, settings: DataSettings
+    episode: SampledEpisode, noise_std: FloatArray, rotation: slice, smoothing_s: float
 ) -> StartStates:
     """Estimate the state at every sample; ``noise_std`` is that of (position, velocity), (2 C,).
 
@@ -300,16 +277,16 @@ def smooth_states(
     channels = episode.channels
     seen = np.zeros(2 * C, dtype=bool)
     seen[channels] = True
-    clean = bool(np.all(noise_std[channels[channels < C]] < settings.noise_free_std))
+    clean = bool(np.all(noise_std[channels[channels < C]] < NOISE_FREE_STD))
     if clean and np.isfinite(episode.velocity).all() and seen[:C].all():
         rounding = np.concatenate([np.maximum(noise_std[:C], 1e-7), np.full(C, 1e-4)])
         return StartStates(episode.position, episode.velocity, np.tile(rounding, (len(episode.sample), 1)))
-    position, velocity, gain, slope_gain = _local_polynomials(episode.position, episode.period_s, settings)
+    position, velocity, gain, slope_gain = _local_polynomials(episode.position, episode.period_s, smoothing_s)
     # Twice the propagated noise: kinks of stick-slip and saturation are not polynomials.
     std = 2 * np.concatenate([np.outer(gain, noise_std[:C]), np.outer(slope_gain, noise_std[:C])], axis=1)
     gyro = [c for c in range(C)[rotation] if seen[C + c]]
     if gyro:
-        smooth, _, gyro_gain, _ = _local_polynomials(episode.velocity[:, gyro], episode.period_s, settings)
+        smooth, _, gyro_gain, _ = _local_polynomials(episode.velocity[:, gyro], episode.period_s, smoothing_s)
         position[:, gyro], velocity[:, gyro] = 0.0, smooth
         std[:, C + np.array(gyro)] = 2 * np.outer(gyro_gain, noise_std[C:][gyro])
     if episode.estimate_std is not None:
@@ -321,21 +298,21 @@ def smooth_states(
     return StartStates(position, velocity, std)
 
 
-def smoothed_samples(period_s: float, settings: DataSettings = SETTINGS) -> int:
+def smoothed_samples(period_s: float, smoothing_s: float = SMOOTHING_S) -> int:
     """Return the number of samples of a smoothing polynomial; no shorter recording can be used."""
-    return max(2 * round(settings.smoothing_s / period_s / 2) + 1, settings.fewest_smoothed)
+    return max(2 * round(smoothing_s / period_s / 2) + 1, FEWEST_SMOOTHED)
 
 
 def _local_polynomials(
-    values: FloatArray, period_s: float, settings: DataSettings
+    values: FloatArray, period_s: float, smoothing_s: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smooth columns (Savitzky-Golay).
 
     Returns:
         Values and slopes, (T, n), and the gain of each on white noise, (T,).
     """
-    T, order = len(values), settings.smoothing_order
-    length = smoothed_samples(period_s, settings)
+    T, order = len(values), SMOOTHING_ORDER
+    length = smoothed_samples(period_s, smoothing_s)
     half = length // 2
     if length > T:
         raise InsufficientDataError(

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.noise import (
-    SETTINGS,
-    DataSettings,
+    FLOOR_STD,
+    SMOOTHING_S,
     Mask,
     NoiseModel,
     StartStates,
@@ -38,6 +38,19 @@ from deal_hw.types import FloatArray, IntArray
 
 Member = tuple[FloatArray, float]
 """Physical parameters, (K,), and latency [s]."""
+
+NOISE_FREE_RESIDUAL = 1e-5
+"""Residual scale of noise-free recordings [m or rad]: far above rounding, far below sensors."""
+
+SLOWEST_JITTER_S = 0.01
+"""Longest sampling period at which jitter of the sample times can be separated from the motion [s]."""
+
+VELOCITY_PRIOR_STD: Mapping[str, float] = {"m": 3.0, "rad": 30.0}
+"""Weak prior on start velocities by the coordinate's unit [m/s and rad/s]; keeps windows of few samples
+solvable."""
+
+UNSEEN_STD = 1e-6
+"""Prior on an unmeasured place of the base on the floor [m]; no trajectory depends on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +179,7 @@ class Problem:
         fixed_latency_s: A given latency [s]; None to search it.
         known_std: Standard deviation of (position, velocity), (2 C,), where known or chosen; None to estimate
             it from the recordings.
-        settings: Assumptions about recordings.
+        smoothing_s: Width over which start states are smoothed [s].
         policy: The policy that produced all commands; None for an unknown one, or no policy.
         command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
             to single commands of these recordings: a problem of others begins without.
@@ -183,7 +196,7 @@ class Problem:
     latency_range_s: tuple[float, float] = LATENCY_RANGE_S
     fixed_latency_s: float | None = None
     known_std: FloatArray | None = None
-    settings: DataSettings = SETTINGS
+    smoothing_s: float = SMOOTHING_S
     policy: PopulationPolicy | None = None
     command_delays: CommandDelays | None = field(init=False, default=None)
     channels: IntArray = field(init=False)
@@ -210,28 +223,27 @@ class Problem:
             raise ConfigurationError("the recordings measure different channels; calibrate them one by one")
         self.noise_std = self._white_noise()
         rotation = self.robot.rotation
-        self.starts = [smooth_states(e, self.noise_std, rotation, self.settings) for e in self.episodes]
+        self.starts = [smooth_states(e, self.noise_std, rotation, self.smoothing_s) for e in self.episodes]
         self.noise = self._noise_model()
 
     def _white_noise(self) -> FloatArray:
-        floor = self.settings.floor
         if self.known_std is not None:
             if self.known_std.shape != (2 * self.coordinates,):
                 raise ConfigurationError(
                     f"known_std has shape {self.known_std.shape}, expected ({2 * self.coordinates},): "
                     "positions, then velocities"
                 )
-            return np.maximum(self.known_std, floor)
+            return np.maximum(self.known_std, FLOOR_STD)
         if self.noise_free:
-            return np.full(2 * self.coordinates, self.settings.noise_free_residual)
-        found = np.full(2 * self.coordinates, floor)
+            return np.full(2 * self.coordinates, NOISE_FREE_RESIDUAL)
+        found = np.full(2 * self.coordinates, FLOOR_STD)
         values = [np.concatenate([e.position, e.velocity], axis=1)[:, self.channels] for e in self.episodes]
         reported = [e.reported for e in self.episodes]
-        found[self.channels] = white_noise_std(values, self.settings, reported)
+        found[self.channels] = white_noise_std(values, reported)
         return self._with_given_noise(found, np.arange(2 * self.coordinates))
 
     def _noise_model(self) -> NoiseModel:
-        slow = self.episodes[0].period_s > self.settings.slowest_jitter_s
+        slow = self.episodes[0].period_s > SLOWEST_JITTER_S
         if self.known_std is not None or self.noise_free or slow:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
@@ -241,7 +253,7 @@ class Problem:
         positions = [e.position[:, columns] for e in self.episodes]
         speeds = [s.velocity[:, columns] for s in self.starts]
         reported = [e.reported for e in self.episodes]
-        moved = noise_model(positions, speeds, self.settings, reported)
+        moved = noise_model(positions, speeds, reported)
         std = self.noise_std[self.channels]
         std[timed] = moved.position_std
         return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
@@ -400,10 +412,10 @@ class Problem:
         """Return the prior of each state: mean and std, (T, 2 C), and which entries count as measurements."""
         episode, C = self.episodes[index], self.coordinates
         T = len(episode.sample)
-        weak = np.array([self.settings.velocity_prior_std[unit] for unit in self.robot.coordinate_units])
+        weak = np.array([VELOCITY_PRIOR_STD[unit] for unit in self.robot.coordinate_units])
         # The weak prior on velocities has mean zero; it only keeps the inverse finite.
         mean = np.concatenate([episode.position, np.zeros((T, C))], axis=1)
-        unseen = np.full((T, C), self.settings.unseen_std)
+        unseen = np.full((T, C), UNSEEN_STD)
         spread = np.concatenate([unseen, np.repeat(weak[None], T, axis=0)], axis=1)
         counts = np.concatenate([np.ones(C, dtype=bool), np.zeros(C, dtype=bool)])
         if episode.estimate_std is not None:

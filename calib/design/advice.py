@@ -23,9 +23,11 @@ from deal_hw.calib.design.experiment_design import (
     Prior,
     information,
 )
-from deal_hw.calib.fit.intervals import SETTINGS as INTERVALS
+from deal_hw.calib.fit.intervals import IDENTIFIABLE_STD, WEAK_SHARE
 from deal_hw.calibration import CalibrationResult, std_words
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.errors import DealHwError
+from deal_hw.motions.excitation.plan import (
     OF_FAMILY,
     ExcitationDesign,
     ExcitationPlan,
@@ -33,42 +35,37 @@ from deal_hw.control.excitation_plan import (
     largest_factor,
     make_plan,
 )
-from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
+WORTH = 0.7
+"""Largest ratio of standard deviations, after to before, at which an excitation is advised."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AdviceSettings:
-    """Which excitations are tried, and when one is advised.
+SECONDS = 4.0
+"""Length of an excitation [s]."""
 
-    Attributes:
-        worth: Largest ratio of standard deviations, after to before, at which an excitation is advised.
-        seconds: Length of an excitation [s].
-        balance_s: Balancing time at the start, at most a quarter of the whole [s].
-        amplitudes: Shares of the joints' ranges.
-        low_effort: A low effort limit, as a share of the usual one: it shows the unit of an effort.
-        high_speed: A high speed limit, as a multiple of the usual one.
-        beyond: Margin on either side of the recorded range of a joint without limits, as a share of it.
-        faster: Trip speed of a joint without limits, as a multiple of the recorded one; requests get half.
-        seed: Seeds the excitations.
-    """
+BALANCE_S = 0.6
+"""Balancing time at the start, at most a quarter of the whole [s]."""
 
-    worth: float = 0.7
-    seconds: float = 4.0
-    balance_s: float = 0.6
-    amplitudes: tuple[float, ...] = (1.0, 0.4)
-    low_effort: float = 0.15
-    high_speed: float = 2.5
-    beyond: float = 0.25
-    faster: float = 5.0
-    seed: int = 1
+AMPLITUDES = (1.0, 0.4)
+"""Shares of the joints' ranges."""
 
+LOW_EFFORT = 0.15
+"""A low effort limit, as a share of the usual one: it shows the unit of an effort."""
 
-SETTINGS = AdviceSettings()
+HIGH_SPEED = 2.5
+"""A high speed limit, as a multiple of the usual one."""
+
+BEYOND = 0.25
+"""Margin on either side of the recorded range of a joint without limits, as a share of it."""
+
+FASTER = 5.0
+"""Trip speed of a joint without limits, as a multiple of the recorded one; requests get half."""
+
+SEED = 1
+"""Seeds the excitations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,26 +101,26 @@ class Advice:
 
 
 def menu_designs(
-    description: RobotDescription, balances: bool = False, settings: AdviceSettings = SETTINGS
+    description: RobotDescription, balances: bool = False, seconds: float = SECONDS
 ) -> dict[str, ExcitationDesign]:
     """Return the excitations of the menu by their description; ``balances``: a policy balances first."""
-    balance_s = min(settings.balance_s, 0.25 * settings.seconds) if balances else 0.0
+    balance_s = min(BALANCE_S, 0.25 * seconds) if balances else 0.0
     top = min(5.0, description.control_rate_hz / 6)
     designs = [
         ExcitationDesign(
             family=family,
-            seconds=settings.seconds,
+            seconds=seconds,
             balance_s=balance_s,
             amplitude=amplitude,
             high_hz=top,
             split=1.0,
             effort=effort,
             speed=speed,
-            seed=settings.seed,
+            seed=SEED,
         )
         for family in ("multisine", "chirp", "steps")
-        for amplitude in settings.amplitudes
-        for effort, speed in _variants(description, settings)
+        for amplitude in AMPLITUDES
+        for effort, speed in _variants(description)
     ]
     return {describe_design(design): design for design in designs}
 
@@ -140,16 +137,16 @@ def options(design: ExcitationDesign) -> str:
 
 
 def _variants(
-    description: RobotDescription, settings: AdviceSettings
+    description: RobotDescription,
 ) -> list[tuple[tuple[float, float], tuple[float, float]]]:
     """Return factors on effort and speed limit to try: both unchanged, low effort, high speed."""
     one = (1.0, 1.0)
     found = [(one, one)]
     fast = 1.0
     if np.isfinite(description.speed_limit).all():
-        fast = min(settings.high_speed, largest_factor(description.speed_limit, description.limits.speed))
+        fast = min(HIGH_SPEED, largest_factor(description.speed_limit, description.limits.speed))
     if description.actuation == "position" and np.isfinite(description.effort_limit).all():
-        found.append(((settings.low_effort, 1.0), (fast, 1.0)))
+        found.append(((LOW_EFFORT, 1.0), (fast, 1.0)))
     if fast > 1.0:
         found.append((one, (fast, 1.0)))
     return found
@@ -161,14 +158,14 @@ def advise(
     seen: FloatArray,
     *,
     balance: MakeBehaviour | None = None,
-    settings: AdviceSettings = SETTINGS,
+    seconds: float = SECONDS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
     """Return advice for each weak or unidentified parameter of a result.
 
     The robot's base is fixed. ``seen`` is the information of the recordings, (K + 1, K + 1), from
     :func:`~deal_hw.calib.design.experiment_design.information`. ``balance`` makes the balancing policy; None
-    for robots that stand by themselves.
+    for robots that stand by themselves. Excitations last ``seconds``.
     """
     space, K = result.space, len(result.space)
     known = result.distribution()
@@ -179,7 +176,7 @@ def advise(
     open_ = [k for k, verdict in enumerate(result.verdicts) if verdict != "identifiable"]
     if not open_:
         return ()
-    designs = menu_designs(robot.description, balance is not None, settings)
+    designs = menu_designs(robot.description, balance is not None, seconds)
     menu = {name: make_plan(robot.description, design) for name, design in designs.items()}
     # The ranges bound what the recordings leave open.
     prior = Prior(seen + Prior.of(dataclasses.replace(known, covariance=None)).information)
@@ -187,7 +184,7 @@ def advise(
     wider = before / np.sqrt(np.diag(np.linalg.inv(prior.information))[:K])
     found = []
     for k in open_:
-        one = _advice(space, k, float(before[k]), predictions, float(wider[k]), settings.worth)
+        one = _advice(space, k, float(before[k]), predictions, float(wider[k]), WORTH)
         command = options(designs[one.excitation]) if one.excitation else ""
         found.append(dataclasses.replace(one, command=command))
     return tuple(found)
@@ -233,7 +230,7 @@ def _advice(
     if after > worth * before:
         how = (
             "measure it by other means (scale, ruler, stall torque), or give what it is bound to as known"
-            if before > INTERVALS.weak_share * prior
+            if before > WEAK_SHARE * prior
             else "record for longer, or measure it by other means"
         )
         sentence = (
@@ -242,7 +239,7 @@ def _advice(
         )
         return Advice(name, before, after, "", sentence)
     unit = 1.0 if space.log_scale[k] else float(space.width[k])
-    rest = "" if after <= INTERVALS.identifiable_std * unit else _STILL_WEAK
+    rest = "" if after <= IDENTIFIABLE_STD * unit else _STILL_WEAK
     sentence = f"{_record(best)}{name} goes from {now} to {std_words(space.free[k], after)}{rest}"
     return Advice(name, before, after, best, sentence)
 
@@ -301,7 +298,7 @@ def _described(
     positions = np.concatenate([e.position[e.usable] for e in episodes])
     low, high = np.nanmin(targets, axis=0), np.nanmax(targets, axis=0)
     least, most = np.nanmin(positions, axis=0), np.nanmax(positions, axis=0)
-    spare = SETTINGS.beyond * (most - least)
+    spare = BEYOND * (most - least)
     fastest = np.max([np.abs(s.velocity).max(axis=0) for s in problem.starts], axis=0)
     home = 0.5 * (least + most)
     if description.actuation == "position":
@@ -310,7 +307,7 @@ def _described(
         description.limits,
         target=_pairs(low, high),
         trip_position=_pairs(least - spare, most + spare),
-        trip_velocity=tuple(map(float, SETTINGS.faster * fastest)),
+        trip_velocity=tuple(map(float, FASTER * fastest)),
     )
     return dataclasses.replace(description, limits=limits, default_position=tuple(map(float, home)))
 

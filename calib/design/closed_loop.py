@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.safety_filter import SafetyFilter
+from deal_hw.control.safety.filter import SafetyFilter
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import Behaviour
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop

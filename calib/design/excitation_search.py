@@ -11,7 +11,9 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, MakeBehaviour
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription
+from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.motions.excitation.plan import (
     FAMILIES,
     ExcitationDesign,
     ExcitationPlan,
@@ -19,10 +21,21 @@ from deal_hw.control.excitation_plan import (
     largest_factor,
     make_plan,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import CalibrationError, ConfigurationError
 
 Criterion = Literal["determinant", "mean"]
+
+
+CONFIRMED = 6
+"""Number of designs to repeat on the members of the confirmation, if there is one."""
+
+LOWEST_EFFORT = 0.08
+"""Lowest factor on the effort limit: below it joints hardly move against their friction."""
+
+TOP_HZ = 8.0
+"""Highest frequency [Hz]."""
+
+TICKS_A_CYCLE = 6.0
+"""Fewest commands per cycle of the highest frequency."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,19 +48,11 @@ class SearchSettings:
     """Number of designs to keep; a design is abandoned once it is certain to be worse than all of these."""
     rounds: int = 24
     """Number of single-coordinate changes of the best design."""
-    confirmed: int = 6
-    """Number of designs to repeat on the members of the confirmation, if there is one."""
     criterion: Criterion = "determinant"
     """determinant: most information in total (D-optimal); mean: least mean standard deviation (A-optimal)."""
-    lowest_effort: float = 0.08
-    """Lowest factor on the effort limit: below it joints hardly move against their friction."""
-    top_hz: float = 8.0
-    """Highest frequency [Hz]."""
-    ticks_a_cycle: float = 6.0
-    """Fewest commands per cycle of the highest frequency."""
 
     def __post_init__(self) -> None:
-        if self.candidates < 1 or self.finalists < 1 or self.rounds < 0 or self.confirmed < 1:
+        if self.candidates < 1 or self.finalists < 1 or self.rounds < 0:
             raise ConfigurationError(f"not a usable search for an excitation: {self}")
 
 
@@ -102,9 +107,9 @@ def search_excitation(
     """
     description = experiment.robot.description
     tried, tripped = 0, Counter[str]()
-    designer = _Designer(description, experiment.seconds, balance is not None, settings)
+    designer = _Designer(description, experiment.seconds, balance is not None)
     designs = designer.usual() + [designer.draw(rng) for _ in range(settings.candidates)]
-    total = len(designs) + settings.rounds + (settings.confirmed if confirmation is not None else 0)
+    total = len(designs) + settings.rounds + (CONFIRMED if confirmation is not None else 0)
 
     def predict(
         design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment
@@ -144,9 +149,9 @@ def search_excitation(
         trace.append(score(best, settings))
     if confirmation is not None:
         # Half of them from the history of the best design, half other finalists.
-        chosen = steps[::-1][: (settings.confirmed + 1) // 2]
+        chosen = steps[::-1][: (CONFIRMED + 1) // 2]
         there = [d for _, d in chosen]
-        chosen += [pair for pair in finals if pair[1] not in there][: settings.confirmed - len(chosen)]
+        chosen += [pair for pair in finals if pair[1] not in there][: CONFIRMED - len(chosen)]
         again = [(predict(d, on=confirmation), d) for _, d in chosen]
         best, design = max(again, key=lambda pair: score(pair[0], settings))
         if not best.usable:
@@ -179,13 +184,11 @@ def score(prediction: ExpectedInformation, settings: SearchSettings) -> float:
 class _Designer:
     """Makes candidates inside a robot's limits."""
 
-    def __init__(
-        self, description: RobotDescription, seconds: float, balances: bool, settings: SearchSettings
-    ) -> None:
+    def __init__(self, description: RobotDescription, seconds: float, balances: bool) -> None:
         self._seconds, self._balances = seconds, balances
-        self._top_hz = min(settings.top_hz, description.control_rate_hz / settings.ticks_a_cycle)
+        self._top_hz = min(TOP_HZ, description.control_rate_hz / TICKS_A_CYCLE)
         # Factors on effort and speed limits; 1 to 1 where there is no such limit.
-        self._effort, self._speed = (settings.lowest_effort, 1.0), (1.0, 1.0)
+        self._effort, self._speed = (LOWEST_EFFORT, 1.0), (1.0, 1.0)
         if description.actuation != "position" or not np.isfinite(description.effort_limit).all():
             self._effort = (1.0, 1.0)
         if np.isfinite(description.speed_limit).all():

@@ -16,10 +16,10 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, longest_windows
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.fit.residual import Shooting, States
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationPlan
 from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.excitation.plan import ExcitationBehaviour, ExcitationPlan
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -29,25 +29,18 @@ MakeBehaviour = Callable[[], Behaviour]
 """Makes one behaviour; every member has its own."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExperimentSettings:
-    """Settings of :class:`Experiment`.
+WINDOW_S = 0.8
+"""Window length of the information: the longest that the refinement uses [s]."""
 
-    Attributes:
-        window_s: Window length of the information: the longest that the refinement uses [s].
-        start_std: Spread of start positions [standard deviations of the sensor].
-        inner: Part of each range from which members are drawn before a calibration: corners of the ranges are
-            no real robots.
-        draws_per_member: Number of draws per member that can be run.
-    """
+START_STD = 5.0
+"""Spread of start positions [standard deviations of the sensor]."""
 
-    window_s: float = 0.8
-    start_std: float = 5.0
-    inner: tuple[float, float] = (0.1, 0.9)
-    draws_per_member: int = 8
+INNER = (0.1, 0.9)
+"""Part of each range from which members are drawn before a calibration: corners of the ranges are no real
+robots."""
 
-
-SETTINGS = ExperimentSettings()
+DRAWS_PER_MEMBER = 8
+"""Number of draws per member that can be run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +112,7 @@ def information(
     episodes: Sequence[SampledEpisode],
     theta: FloatArray,
     latency_s: float,
-    window_s: float = SETTINGS.window_s,
+    window_s: float = WINDOW_S,
     threads: int | None = None,
     states: States | None = None,
 ) -> FloatArray:
@@ -157,10 +150,9 @@ class Experiment:
         rng: np.random.Generator,
         rest: MakeBehaviour | None = None,
         threads: int | None = None,
-        settings: ExperimentSettings = SETTINGS,
         prior: Prior | None = None,
     ) -> None:
-        self.robot, self.space, self.known, self.settings = robot, known.space, known, settings
+        self.robot, self.space, self.known = robot, known.space, known
         self.seconds, self.threads = seconds, threads
         self.prior = prior or Prior.of(known)
         self.refused = 0
@@ -168,7 +160,7 @@ class Experiment:
         self._runner: TrialRunner | None = None
         self._order = list(range(draws))
         self._rest = rest
-        drawn = _draw(robot.description, known, rng, draws, settings)
+        drawn = _draw(robot.description, known, rng, draws)
         self.scenario = drawn.part(range(draws)) if rest is None else self._runnable(drawn, draws, rest)
 
     def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour) -> Scenario:
@@ -188,9 +180,8 @@ class Experiment:
 
     def afresh(self, draws: int, rng: np.random.Generator) -> Experiment:
         """Return the same experiment on other members, for an independent evaluation."""
-        rest, threads, settings = self._rest, self.threads, self.settings
         return Experiment(
-            self.robot, self.known, self.seconds, draws, rng, rest, threads, settings, self.prior
+            self.robot, self.known, self.seconds, draws, rng, self._rest, self.threads, self.prior
         )
 
     def playing(self, plan: ExcitationPlan, balance: MakeBehaviour | None) -> MakeBehaviour:
@@ -230,7 +221,7 @@ class Experiment:
                     [episode],
                     theta,
                     latency_s,
-                    self.settings.window_s,
+                    WINDOW_S,
                     self.threads,
                     [(episode.position, episode.velocity)],
                 )
@@ -255,9 +246,8 @@ def _draw(
     known: ParameterDistribution,
     rng: np.random.Generator,
     draws: int,
-    settings: ExperimentSettings,
 ) -> Scenario:
-    cubes_of_draws, (least, most) = settings.draws_per_member, settings.inner
+    cubes_of_draws, (least, most) = DRAWS_PER_MEMBER, INNER
     count = draws * cubes_of_draws
     if known.covariance is None:
         # Latin hypercubes: each parameter is at its low and at its high end on some member, because effects
@@ -272,5 +262,5 @@ def _draw(
     # Half of the searched range: few robots have a delay at its end.
     latency = rng.uniform(low, 0.5 * (low + high) if known.covariance is None else high, count)
     default = np.array(description.default_position)
-    spread = settings.start_std * description.sensor.position_std
+    spread = START_STD * description.sensor.position_std
     return Scenario(theta, latency, default + rng.standard_normal((count, len(default))) * spread)

@@ -12,37 +12,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from deal_hw.calib.data.noise import Mask
+from deal_hw.calib.data.noise import FLOOR_STD, Mask
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.refinement import EXPLAINED, STAGES_S, Refined, refine
 from deal_hw.calib.fit.solver import channel_scale
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
+FINEST_MODEL = 0.002
+"""A smaller residual, as a share of the channel's motion within a window (root mean square), is taken for
+the model's limit: no search finds better parameters [-]. The noise of usual encoders is above it: 0.3 mm
+on a cart that moves 20 mm in a window is 1.5 %."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WeightSettings:
-    """Settings of :func:`weight_channels`.
+LEAST_NOISE = 10.0
+"""With all noise below this multiple of the wire's rounding, the recording is from a simulator, whose
+model may be exact [-]."""
 
-    Attributes:
-        finest_model: A smaller residual, as a share of the channel's motion within a window (root mean
-            square), is taken for the model's limit: no search finds better parameters [-]. The noise of usual
-            encoders is above it: 0.3 mm on a cart that moves 20 mm in a window is 1.5 %.
-        least_noise: With all noise below this multiple of the wire's rounding, the recording is from a
-            simulator, whose model may be exact [-].
-        rounds: Fits with new weights for each window length.
-        adds_up: A longer window is kept while no channel's residual grows by more than this factor [-]. An
-            error of the model adds up over time; that of a wrong start state grows faster.
-    """
+ROUNDS = 2
+"""Fits with new weights for each window length."""
 
-    finest_model: float = 0.002
-    least_noise: float = 10.0
-    rounds: int = 2
-    adds_up: float = 2.0
-
-
-SETTINGS = WeightSettings()
+ADDS_UP = 2.0
+"""A longer window is kept while no channel's residual grows by more than this factor [-]. An error of the
+model adds up over time; that of a wrong start state grows faster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,15 +63,15 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
         problem: The problem.
         fit: A fit whose residual is above the noise.
     """
-    noisy = np.any(problem.noise.position_std > SETTINGS.least_noise * problem.settings.floor)
+    noisy = np.any(problem.noise.position_std > LEAST_NOISE * FLOOR_STD)
     if problem.known_std is not None or problem.robot.base is not None or not noisy:
         return None
     left = _rms(fit)
     fine = _followed(fit, left)
-    if fine.all() or not np.any(left[fine] ** 2 > REFINEMENT.explained):
+    if fine.all() or not np.any(left[fine] ** 2 > EXPLAINED):
         return None
     scale, weighted = np.where(fine, np.maximum(left, 1.0), 1.0), None
-    for seconds in REFINEMENT.stages_s:
+    for seconds in STAGES_S:
         if samples_in(problem, seconds) < fit.shooting.length:
             continue
         try:
@@ -88,9 +79,9 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
         except InsufficientDataError:
             break
         # The other channels keep the weight of their noise. The fit has to explain them to that level.
-        if np.any(_rms(longer.fit)[~fine] ** 2 > REFINEMENT.explained):
+        if np.any(_rms(longer.fit)[~fine] ** 2 > EXPLAINED):
             break
-        if weighted is not None and np.any(longer.scale > SETTINGS.adds_up * weighted.scale):
+        if weighted is not None and np.any(longer.scale > ADDS_UP * weighted.scale):
             break
         shorter = None if weighted is None else weighted.fit
         weighted = replace(longer, fit=replace(longer.fit, shorter=shorter))
@@ -100,7 +91,7 @@ def weight_channels(problem: Problem, fit: Refined) -> WeightedFit | None:
 
 def _fitted(problem: Problem, fit: Refined, scale: FloatArray, fine: Mask, seconds: float) -> WeightedFit:
     """Return the fit in windows of one length; weights and parameters are fitted in turn."""
-    for _ in range(SETTINGS.rounds):
+    for _ in range(ROUNDS):
         weighted = problem.with_noise(scale)
         states = fit.shooting.states(fit.point)
         fit = refine(weighted, fit.theta, fit.latency_s, (seconds,), states=states)
@@ -120,4 +111,4 @@ def _followed(fit: Refined, left: FloatArray) -> Mask:
     data = fit.shooting.data
     moved = np.concatenate([(d.measured - d.measured[:, :1]).reshape(-1, len(left)) for d in data])
     noise = fit.shooting.problem.noise.position_std
-    return np.asarray(left * noise < SETTINGS.finest_model * np.sqrt(np.mean(moved**2, axis=0)))
+    return np.asarray(left * noise < FINEST_MODEL * np.sqrt(np.mean(moved**2, axis=0)))

@@ -11,6 +11,13 @@ projection on parameters and start states. The ratio is taken to the sum of thos
 number of blocks. This is the bias reduction of Bell and McCaffrey (2002), applied to the sum instead of to
 each block, which stays finite where one block alone determines a parameter. The effective number of blocks is
 returned as well.
+
+Symbols: J, derivatives of the whitened residuals by the P coordinates with start states that follow; B, their
+covariance for independent residuals of unit variance, H^-1 with the priors in H, (P, P) (``bread``);
+g_b = J_b^T r_b, score of block b, (P,); H_b = J_b^T J_b; F_b = J_b^T P_start J_b, the start states' part of
+the projection. The estimate shifts by B g_b. Under independent residuals of unit variance this has the
+covariance B (H_b - F_b - H_b B H_b) B. Sources: White (1980), Liang and Zeger (1986), Bell and McCaffrey
+(2002).
 """
 
 from __future__ import annotations
@@ -24,25 +31,17 @@ import numpy.typing as npt
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.types import FloatArray
 
+FEWEST_BLOCKS = 8
+"""Fewest blocks that show how residuals are correlated."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClusterSettings:
-    """Settings of :func:`clustered`.
+ENOUGH_BLOCKS = 24
+"""Blocks are as long as this number of them allows."""
 
-    Attributes:
-        fewest_blocks: Fewest blocks that show how residuals are correlated.
-        enough_blocks: Blocks are as long as this number of them allows.
-        parts: Parts into which a window is cut first.
-        shortest: Fewest samples of a part.
-    """
+PARTS = (8, 4, 2)
+"""Parts into which a window is cut first."""
 
-    fewest_blocks: int = 8
-    enough_blocks: int = 24
-    parts: tuple[int, ...] = (8, 4, 2)
-    shortest: int = 4
-
-
-SETTINGS = ClusterSettings()
+SHORTEST_PART = 4
+"""Fewest samples of a part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +68,14 @@ class Clustered:
     @property
     def ratio(self) -> FloatArray:
         """Variance over that of independent residuals of unit variance, (P,)."""
+        # sum_b (B g_b)_p^2 over its mean under independent residuals.
         power, expected = np.sum(self.shift**2, axis=0), np.sum(self.expected, axis=0)
         return np.asarray(np.divide(power, expected, out=np.ones_like(power), where=expected > 0))
 
     @property
     def degrees(self) -> FloatArray:
         """Effective number of blocks that determine each coordinate, (P,)."""
+        # (sum_b v_b)^2 / sum_b v_b^2, Satterthwaite's degrees of freedom of a sum of squares with means v_b.
         square, spread = np.sum(self.expected, axis=0) ** 2, np.sum(self.expected**2, axis=0)
         return np.asarray(np.divide(square, spread, out=np.ones_like(square), where=spread > 0))
 
@@ -83,6 +84,7 @@ class Clustered:
         """Whether neighbouring blocks are correlated."""
         power = np.sum(self.shift**2, axis=0)
         product = np.sum((self.shift[1:] * self.shift[:-1])[self.follows], axis=0)
+        # White scores correlate by 0 with a standard error of 1 / sqrt(blocks).
         correlation = float(np.mean(product / np.maximum(power, 1e-300)))
         return bool(correlation > 2.0 / np.sqrt(self.blocks))
 
@@ -101,11 +103,11 @@ def clustered(
     found: Clustered | None = None
     for parts, group in _levels(rows, samples):
         length = group * samples // parts
-        if length < max(SETTINGS.shortest, 2 * correlation_samples) and parts > 1:
+        if length < max(SHORTEST_PART, 2 * correlation_samples) and parts > 1:
             continue
         level = _level(rows, bread, samples, parts, group)
         settled = found is not None and not found.autocorrelated
-        if level.blocks < (SETTINGS.enough_blocks if settled else SETTINGS.fewest_blocks):
+        if level.blocks < (ENOUGH_BLOCKS if settled else FEWEST_BLOCKS):
             break
         found = level
     return found
@@ -114,7 +116,7 @@ def clustered(
 def _levels(rows: Sequence[WindowRows], samples: int) -> list[tuple[int, int]]:
     """Return (parts of a window, windows in a group) from the shortest block to the longest."""
     longest = max((len(r.residual) for r in rows), default=0)
-    levels = [(parts, 1) for parts in (*SETTINGS.parts, 1) if samples // parts >= 1]
+    levels = [(parts, 1) for parts in (*PARTS, 1) if samples // parts >= 1]
     group = 2
     while group <= longest:
         levels.append((1, group))

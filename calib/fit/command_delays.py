@@ -5,7 +5,12 @@ unknown, not many. Least squares that takes them as noise of the sensors follows
 too narrow. Here each delay is an unknown with a normal prior. Around the likeliest delays predictions are
 straight in them, so they are eliminated: the residuals of a window have the covariance
 1 + sum_k s^2 d_k d_k^T, where d_k is the change of the whitened predictions by a delay of command k and s the
-delays' standard deviation. Residuals are whitened by its symmetric root (generalised least squares).
+delays' standard deviation. Residuals are whitened by its symmetric root (generalised least squares, Aitken
+1936).
+
+Symbols: C, the columns d_k of a window, (H M, P) [1/s]; s [s]; V = 1 + s^2 C C^T, (H M, H M). With the
+singular vectors U of C and g = s^2 (singular values)^2: V^-1 = 1 - U diag(g / (1 + g)) U^T and
+V^(-1/2) = 1 - U diag(1 - (1 + g)^(-1/2)) U^T.
 """
 
 from __future__ import annotations
@@ -27,23 +32,14 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.residual import WindowRows
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CommandDelaySettings:
-    """Settings of this module.
+EARLIER_COMMANDS = 8
+"""Commands before a window whose delays still count [-]: a slewing set-point is behind until it arrives."""
 
-    Attributes:
-        earlier: Commands before a window whose delays still count [-]: a slewing set-point is behind until it
-            arrives.
-        most: Most commands in a window; with more, delays of single commands cannot be told from noise.
-        std_s: Least and largest standard deviation of delays that is looked for [s].
-    """
+MOST_COMMANDS = 120
+"""Most commands in a window; with more, delays of single commands cannot be told from noise."""
 
-    earlier: int = 8
-    most: int = 120
-    std_s: tuple[float, float] = (1e-5, 0.1)
-
-
-SETTINGS = CommandDelaySettings()
+DELAY_STD_S = (1e-5, 0.1)
+"""Least and largest standard deviation of delays that is looked for [s]."""
 
 
 def with_command_delays(problem: Problem, windows: Sequence[WindowData]) -> list[WindowData]:
@@ -63,7 +59,7 @@ def with_command_delays(problem: Problem, windows: Sequence[WindowData]) -> list
             continue
         moved = (columns @ shifts(problem, data, columns.shape[2])[..., None])[..., 0]
         std = np.where(data.reported, data.std, 0.0)
-        # Thin: a window has fewer commands than measurements.
+        # V^(-1/2) = 1 - late late^T. Thin: a window has fewer commands than measurements.
         root, size, _ = np.linalg.svd(known.std_s * columns, full_matrices=False)
         late = root * np.sqrt(1.0 - 1.0 / np.sqrt(1.0 + size**2))[:, None]
         measured = data.measured + std * moved.reshape(data.measured.shape)
@@ -82,8 +78,8 @@ def delay_columns(
     episode = problem.episodes[data.episode]
     begins = command_begins(episode)
     count = _in_window(episode.sample[data.windows.start], data.windows.length * data.windows.stride, begins)
-    P = min(count + SETTINGS.earlier, len(begins))
-    if not count or P > SETTINGS.most:
+    P = min(count + EARLIER_COMMANDS, len(begins))
+    if not count or P > MOST_COMMANDS:
         return None
     targets = np.repeat(episode.target[None], 1 + P, axis=0)
     for k in range(P):
@@ -165,6 +161,10 @@ def likely_std(
     size2, by = np.concatenate(sizes) ** 2, np.concatenate(along)
 
     def deviance(log_std: float) -> float:
+        # Residuals r = J x + C d + e, (n,), with e of an unknown variance and K fitted values x. Minus twice
+        # the restricted log-likelihood without constants, that variance profiled out:
+        # (n - K) ln(q / (n - K)) + ln|V| + ln|H|, with H = J^T V^-1 J + prior, g = J^T V^-1 r and
+        # q = r^T V^-1 r - g^T H^-1 g.
         gain = np.exp(2 * log_std) * size2
         shrunk = by * (gain / (1 + gain))[:, None]
         H = information - by[:, :K].T @ shrunk[:, :K]
@@ -172,7 +172,7 @@ def likely_std(
         left = power - float(by[:, K] @ shrunk[:, K]) - float(g @ np.linalg.solve(H, g))
         return float(count * np.log(left / count) + np.sum(np.log1p(gain)) + np.linalg.slogdet(H)[1])
 
-    least, most = np.log(SETTINGS.std_s)
+    least, most = np.log(DELAY_STD_S)
     best = minimize_scalar(deviance, bounds=(least, most), method="bounded")
     return float(np.exp(best.x)), deviance(-np.inf) - float(best.fun)
 
@@ -219,6 +219,7 @@ def moved_commands(
         before = shifts(problem, data, P)
         normal = np.einsum("wdp,wdq->wpq", row.columns, row.columns) + np.eye(P) / std_s**2
         pull = np.einsum("wdp,wd->wp", row.columns, row.residual) + before / std_s**2
+        # The likeliest delays minimise |r + C (d - d_before)|^2 + |d|^2 / s^2.
         wanted = before - np.linalg.solve(normal, pull[..., None])[..., 0]
         begins, numbers = command_begins(episode), _numbers(problem, data, P)
         # A command is judged by the window that shows it best.

@@ -19,47 +19,41 @@ from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.types import FloatArray
 
+START_DAMPINGS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
+"""Levenberg damping of start states, in units of the smoothed states' standard deviations; each window
+takes the best."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ContactSettings:
-    """Settings of :func:`solve_contacts`.
+FOLLOW = (0.0, 0.5, 1.0)
+"""Shares of the linear start-state update after a parameter step. Because of kinks the full update is too
+long as often as right."""
 
-    Attributes:
-        start_dampings: Levenberg damping of start states, in units of the smoothed states' standard
-            deviations; each window takes the best.
-        follow: Shares of the linear start-state update after a parameter step. Because of kinks the full
-            update is too long as often as right.
-        stretches: Secant lengths, used in turn: forward, backward, far and near ones miss different kinks.
-        gain: A smaller decrease of the cost is noise from kinks.
-        patience: Most consecutive runs of the solver without gain.
-        start_iterations: Most steps of start states alone.
-    """
+STRETCHES = (1.0, -1.0, 2.5, -0.4)
+"""Secant lengths, used in turn: forward, backward, far and near ones miss different kinks."""
 
-    start_dampings: tuple[float, ...] = (1e-2, 1e-1, 1.0, 10.0, 100.0)
-    follow: tuple[float, ...] = (0.0, 0.5, 1.0)
-    stretches: tuple[float, ...] = (1.0, -1.0, 2.5, -0.4)
-    gain: float = 1.0
-    patience: int = 3
-    start_iterations: int = 4
+LEAST_GAIN = 1.0
+"""A smaller decrease of the cost is noise from kinks."""
 
+PATIENCE = 3
+"""Most consecutive runs of the solver without gain."""
 
-CONTACTS = ContactSettings()
+START_ITERATIONS = 4
+"""Most steps of start states alone."""
 
 
 def solve_contacts(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states; return the best point, its normal equations, and derivatives."""
-    best, best_cost = settle(shooting, point, CONTACTS.start_iterations)
+    best, best_cost = settle(shooting, point, START_ITERATIONS)
     bounds, waited, used = value_bounds(shooting.problem), 0, 0
-    while used < iterations and waited <= CONTACTS.patience:
-        fit = Sticking(shooting, best, CONTACTS.stretches[waited % len(CONTACTS.stretches)])
+    while used < iterations and waited <= PATIENCE:
+        fit = Sticking(shooting, best, STRETCHES[waited % len(STRETCHES)])
         settings = SolverSettings(iterations=iterations - used)
         _, more = minimise(fit, best.value, bounds, settings, fixed_latency=shooting.fixed_latency)
         used += max(more, 1)
         fell = best_cost - fit.best_cost
         if fell > 0:
             best, best_cost = fit.best, fit.best_cost
-        waited = 0 if fell > CONTACTS.gain else waited + 1
-    best, _ = settle(shooting, best, CONTACTS.start_iterations // 2)
+        waited = 0 if fell > LEAST_GAIN else waited + 1
+    best, _ = settle(shooting, best, START_ITERATIONS // 2)
     return best, shooting.normal(best), used
 
 
@@ -89,9 +83,7 @@ class Sticking:
         """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
         if not np.array_equal(self._last.point.value, value):
             here, step = self._here.point, value - self._here.point.value
-            ways = [
-                np.stack([-share * (gain @ step) for share in CONTACTS.follow]) for gain in self._here.gains
-            ]
+            ways = [np.stack([-share * (gain @ step) for share in FOLLOW]) for gain in self._here.gains]
             self._last = self._followed(self._shooting.moved(here, value, ways))
         return self._last.residual
 
@@ -116,10 +108,10 @@ def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, fl
     """Fit start states alone; parameters stay, and no window's cost grows. Return the point and its cost."""
     cost = shooting.cost(point)
     for number in range(iterations):
-        normal = shooting.normal(point, keep=True, stretch=CONTACTS.stretches[number % 2])
+        normal = shooting.normal(point, keep=True, stretch=STRETCHES[number % 2])
         point, _ = _settled(shooting, point, normal)
         before, cost = cost, shooting.cost(point)
-        if before - cost < CONTACTS.gain:
+        if before - cost < LEAST_GAIN:
             break
     return point, cost
 
@@ -136,7 +128,7 @@ def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, l
         square = np.einsum("wri,wrj->wij", js, js)
         own = np.einsum("wri,wr->wi", js, rows.residual)[..., None]
         unit = np.eye(len(scale))
-        steps = [np.linalg.solve(square + d * unit, own)[..., 0] * scale for d in CONTACTS.start_dampings]
+        steps = [np.linalg.solve(square + d * unit, own)[..., 0] * scale for d in START_DAMPINGS]
         ways.append(-np.stack([np.zeros_like(steps[0]), *steps]))
         cross = np.einsum("wri,wrj->wij", js, rows.parameter)
         gains.append(np.linalg.solve(square, cross) * scale[:, None])

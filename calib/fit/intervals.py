@@ -1,4 +1,19 @@
-"""Uncertainty of a fit: intervals, identifiability, null directions in words, signs of a wrong model."""
+"""Uncertainty of a fit: intervals, identifiability, null directions in words, signs of a wrong model.
+
+Symbols, for K parameters in their own scale (ln of positive ones) and the latency [s]:
+    H, g: half the Hessian, (K + 1, K + 1), and half the gradient, (K + 1,), of the cost at the estimate,
+        start states eliminated; from :class:`~deal_hw.calib.fit.residual.Normal`.
+    P: information of the parameters' priors, (K + 1,).
+    F: information of the range, 12 / width^2 as of a uniform law, (K + 1,).
+    a: inflation of the noise's variance, kinks^2 max(1, chi2) tau [-]; tau is the residuals' integrated
+        autocorrelation time [samples].
+    V = ((H - P) / a + P + F)^-1: covariance of least squares with the noise's variance times a.
+Then each standard deviation is multiplied by a factor for clusters (:func:`_factor`). Intervals are 90 %:
+estimate +- z V_kk^(1/2), z = 1.645.
+
+Sources: tau, Madras and Sokal (1988); chi2 as the variance of the residuals, Seber and Wild, Nonlinear
+Regression (1989), chapter 2; clusters, :mod:`deal_hw.calib.fit.cluster_robust`.
+"""
 
 from __future__ import annotations
 
@@ -29,69 +44,62 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.output_error import OutputErrorFit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MismatchSettings:
-    """Limits for residuals that noise explains.
+MISMATCH_CHI2 = EXPLAINED_CHI2
+"""Mean squared residual over the noise variance above which the model is wrong [-]."""
 
-    Attributes:
-        chi2: Mean squared residual over the noise variance above which the model is wrong [-].
-        correlation_samples: Autocorrelation time above which it is wrong [samples].
-        false_alarms: Probability of the alarm where every channel's time is at that limit [-].
-        negligible_chi2: Residuals this far below the noise need no explanation, autocorrelated or not [-].
-        white_samples: Longest autocorrelation time of a local fit that needs no search [samples]: beyond it
-            the fit may be in another minimum. Cart-poles with sensors, 15 tuning seeds of ratio 5 and 20: the
-            11 local fits that agreed with a fit from the truth were at 1.00. One in another minimum, with a
-            chi2 of 1.16, was at 1.39.
-        least_jitter_s: Least jitter of the sample times that is an alarm [s]. Fast motion without noise looks
-            like jitter of some hundredths of a millisecond.
-        evidence: Least gain in deviance of a cause, a correction or another minimum [-]: 20 is odds of 22,000
-            to 1.
-    """
+CORRELATION_SAMPLES = 2.0
+"""Autocorrelation time above which it is wrong [samples]."""
 
-    chi2: float = EXPLAINED_CHI2
-    correlation_samples: float = 2.0
-    false_alarms: float = 0.05
-    negligible_chi2: float = 0.5
-    white_samples: float = 1.2
-    least_jitter_s: float = 1e-4
-    evidence: float = 20.0
+FALSE_ALARMS = 0.05
+"""Probability of the alarm where every channel's time is at that limit [-]."""
+
+NEGLIGIBLE_CHI2 = 0.5
+"""Residuals this far below the noise need no explanation, autocorrelated or not [-]."""
+
+WHITE_SAMPLES = 1.2
+"""Longest autocorrelation time of a local fit that needs no search [samples]: beyond it the fit may be in
+another minimum. Cart-poles with sensors, 15 tuning seeds of ratio 5 and 20: the 11 local fits that agreed
+with a fit from the truth were at 1.00. One in another minimum, with a chi2 of 1.16, was at 1.39."""
+
+LEAST_JITTER_S = 1e-4
+"""Least jitter of the sample times that is an alarm [s]. Fast motion without noise looks like jitter of
+some hundredths of a millisecond."""
+
+EVIDENCE = 20.0
+"""Least gain in deviance of a cause, a correction or another minimum [-]: 20 is odds of 22,000 to 1."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IntervalSettings:
-    """Settings of :func:`uncertainty`.
+KINKS = 1.2
+"""Factor on standard deviations for nonlinearity [-]: stick-slip and saturation bend the likelihood. On
+tuning seeds, 90 % intervals without it contained 86-89 % of the truths."""
 
-    Attributes:
-        kinks: Factor on standard deviations for nonlinearity [-]: stick-slip and saturation bend the
-            likelihood. On tuning seeds, 90 % intervals without it contained 86-89 % of the truths.
-        contact_kinks: The same with feet on the floor [-]. On five Go2 tuning seeds with sensor noise, errors
-            were 0.9 to 1.7 times the linear estimate (root mean square), about 1.5 over all. As it differs so
-            much between robots, it includes Student's quantile with four degrees of freedom, 1.3 times the
-            normal one.
-        identifiable_std: Largest standard deviation of an identified parameter, in ln units or parts of a
-            linear range [-].
-        weak_share: Largest standard deviation of a weakly identified parameter, as share of the prior's [-].
-        blind_share: Share of the prior's standard deviation above which the data have no information [-].
-        at_bound: Distance to an end of the range, as share of the range, that counts as at the bound [-].
-        prior_blocks: Number of blocks that the overall inflation counts for in a parameter's own inflation,
-            because a few blocks are poor evidence.
-        lags: Longest lag of the autocorrelation time [samples].
-        near: Share of the refinement's parameter step for central differences [-]. Over a whole step, kinks
-            of dry friction can look like information that a noise-free recording does not have.
-    """
+CONTACT_KINKS = 2.0
+"""The same with feet on the floor [-]. On five Go2 tuning seeds with sensor noise, errors were 0.9 to 1.7
+times the linear estimate (root mean square), about 1.5 over all. As it differs so much between robots, it
+includes Student's quantile with four degrees of freedom, 1.3 times the normal one."""
 
-    kinks: float = 1.2
-    contact_kinks: float = 2.0
-    identifiable_std: float = 0.15
-    weak_share: float = 0.5
-    blind_share: float = 0.9
-    at_bound: float = 1e-6
-    prior_blocks: float = 4.0
-    lags: int = 12
-    near: float = 0.1
+IDENTIFIABLE_STD = 0.15
+"""Largest standard deviation of an identified parameter, in ln units or parts of a linear range [-]."""
 
+WEAK_SHARE = 0.5
+"""Largest standard deviation of a weakly identified parameter, as share of the prior's [-]."""
 
-MISMATCH, SETTINGS = MismatchSettings(), IntervalSettings()
+BLIND_SHARE = 0.9
+"""Share of the prior's standard deviation above which the data have no information [-]."""
+
+AT_BOUND = 1e-6
+"""Distance to an end of the range, as share of the range, that counts as at the bound [-]."""
+
+PRIOR_BLOCKS = 4.0
+"""Number of blocks that the overall inflation counts for in a parameter's own inflation, because a few
+blocks are poor evidence."""
+
+LAGS = 12
+"""Longest lag of the autocorrelation time [samples]."""
+
+NEAR_STRETCH = 0.1
+"""Share of the refinement's parameter step for central differences [-]. Over a whole step, kinks of dry
+friction can look like information that a noise-free recording does not have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +146,11 @@ class Uncertainty:
         for k, std in enumerate(np.sqrt(np.diag(self.covariance))):
             if self.blind[k]:
                 found.append("not identifiable")
-            elif std <= SETTINGS.identifiable_std * unit[k]:
+            elif std <= IDENTIFIABLE_STD * unit[k]:
                 # What compensates for a known effect is a property of the fit, not of the robot.
                 found.append("weak" if self.space.names[k] in self.biased else "identifiable")
             else:
-                found.append("weak" if std <= SETTINGS.weak_share * prior_std[k] else "not identifiable")
+                found.append("weak" if std <= WEAK_SHARE * prior_std[k] else "not identifiable")
         return tuple(found)
 
     def with_alarms(self, *first: Finding, last: Sequence[Finding] = ()) -> Uncertainty:
@@ -194,12 +202,13 @@ def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = N
     below = 0.0 if chance is None else float(norm.ppf(1 - chance / len(channels)))
     for channel in channels:
         total, used = 1.0, 0
-        for rho, pairs in autocorrelations(channel, SETTINGS.lags):
+        for rho, pairs in autocorrelations(channel, LAGS):
             if rho <= 2.0 / np.sqrt(pairs):
                 break
             total, used = total + 2 * rho, used + 1
         count = max(sum(map(np.count_nonzero, channel)), 1)
-        # Standard error of a time summed up to a lag: Madras and Sokal (1988).
+        # tau = 1 + 2 sum_k rho_k, up to the first rho that white residuals would have. Its relative variance
+        # with n samples and m lags is 2 (2 m + 1) / n: Madras and Sokal (1988). Bonferroni over the channels.
         worst = max(worst, total * (1 - below * np.sqrt(2 * (2 * used + 1) / count)))
     return worst
 
@@ -225,7 +234,7 @@ def uncertainty(
     """
     K = len(space)
     tau = correlation_time(normal.residual)
-    least_tau = correlation_time(normal.residual, MISMATCH.false_alarms)
+    least_tau = correlation_time(normal.residual, FALSE_ALARMS)
     inflation = kinks**2 * max(1.0, chi2) * tau
     slope, known = normal.gradient, normal.prior
     data = normal.hessian - np.diag(known)
@@ -234,9 +243,10 @@ def uncertainty(
     belief = known + 1.0 / flat
     # Null directions scale by the range themselves, so only what was measured counts here.
     unseen = null_space(space, data[:K, :K] / inflation + np.diag(known[:K]))
-    blind = unseen.std > SETTINGS.identifiable_std * _unit(space)
+    blind = unseen.std > IDENTIFIABLE_STD * _unit(space)
     bound = _at_bound(space, theta, slope[:K]) * ~blind
     free = np.append(bound == 0, not fixed_latency)
+    # V of the module's text, with the entries at bounds and a given latency held.
     precision = data / inflation + np.diag(belief)
     covariance = _covariance(precision, free)
     cluster = clustered(normal.rows, covariance / inflation, normal.residual[0].shape[1], tau)
@@ -252,7 +262,7 @@ def uncertainty(
     latency = (max(latency_s - reach, first), min(latency_s + reach, last))
     if fixed_latency:
         latency = (latency_s, latency_s)
-    blind |= std[:K] > SETTINGS.blind_share * np.sqrt(flat[:K])
+    blind |= std[:K] > BLIND_SHARE * np.sqrt(flat[:K])
     return Uncertainty(
         space=space,
         theta=theta,
@@ -295,6 +305,8 @@ def _bound_std(
     Its likelihood is cut off at the bound. Inside, it falls with the slope and with the curvature that is
     left when the others follow.
     """
+    # At a distance x from the bound the cost grows by 2 |s| x + c x^2: a normal law of mean -|s| / c and
+    # variance 1 / c, cut off outside [0, width]. c is the information left when the others follow.
     others = free.copy()
     others[k] = True
     curvature = 1.0 / _covariance(precision, others)[k, k]
@@ -314,10 +326,12 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
     """
     if cluster is None:
         return np.ones(1)
+    # With rho the clustered variance over the uniform one and n0 = PRIOR_BLOCKS: factor^2 =
+    # (n0 + nu rho) / (n0 + nu) (t_95(n0 + nu) / z_95)^2 where rho > chi2_95(nu) / nu, otherwise 1.
     degrees = cluster.degrees
     ratio = cluster.ratio * inflation / uniform
-    drawn = (SETTINGS.prior_blocks * inflation + degrees * ratio) / (SETTINGS.prior_blocks + degrees)
-    quantile = t_law.ppf(0.95, SETTINGS.prior_blocks + degrees) / Z90
+    drawn = (PRIOR_BLOCKS * inflation + degrees * ratio) / (PRIOR_BLOCKS + degrees)
+    quantile = t_law.ppf(0.95, PRIOR_BLOCKS + degrees) / Z90
     used = cluster.ratio / uniform > chi2_law.ppf(0.95, degrees) / degrees
     factor = np.where(used, np.sqrt(drawn / inflation) * quantile, 1.0)
     return np.asarray(np.maximum(factor, 1.0))
@@ -339,7 +353,7 @@ def intervals(
     low = np.maximum(space.from_scale(center - Z90 * std), space.low)
     high = np.minimum(space.from_scale(center + Z90 * std), space.high)
     # Without information the estimate is arbitrary: the interval is the range's own 90 %.
-    whole = ((std > SETTINGS.blind_share * space.width / np.sqrt(12.0)) | blind) & (bound == 0)
+    whole = ((std > BLIND_SHARE * space.width / np.sqrt(12.0)) | blind) & (bound == 0)
     # Nothing was searched beyond a bound; the interval lies on one side.
     low = np.where(bound < 0, space.low, np.where(whole, space.unnormalize(np.full(K, 0.05)), low))
     high = np.where(bound > 0, space.high, np.where(whole, space.unnormalize(np.full(K, 0.95)), high))
@@ -356,7 +370,7 @@ def _alarms(
     pressed: npt.NDArray[np.bool_],
 ) -> tuple[Finding, ...]:
     alarms = []
-    if timing_std_s >= MISMATCH.least_jitter_s:
+    if timing_std_s >= LEAST_JITTER_S:
         alarms.append(
             Finding.alarm(
                 f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
@@ -364,9 +378,9 @@ def _alarms(
                 "Record over a connection with less jitter, or with the device's own time stamps.",
             )
         )
-    if chi2 > MISMATCH.chi2:
+    if chi2 > MISMATCH_CHI2:
         alarms.append(mismatch(chi2))
-    if chi2 > MISMATCH.negligible_chi2 and least_tau > MISMATCH.correlation_samples:
+    if chi2 > NEGLIGIBLE_CHI2 and least_tau > CORRELATION_SAMPLES:
         alarms.append(
             Finding.alarm(
                 f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
@@ -415,7 +429,7 @@ def mismatch(chi2: float, window: str = "") -> Finding:
 def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which parameters lie at an end of their range, pressed against it or not, (K,)."""
     unit = space.normalize(theta)
-    return np.asarray((unit < SETTINGS.at_bound) | (unit > 1 - SETTINGS.at_bound))
+    return np.asarray((unit < AT_BOUND) | (unit > 1 - AT_BOUND))
 
 
 def names_at_bound(space: ParameterSpace, theta: FloatArray) -> list[str]:
@@ -432,7 +446,7 @@ def with_rows(refined: Refined) -> Refined:
         return refined
     shooting = refined.shooting
     if shooting.problem.robot.base is None:
-        normal = shooting.normal(refined.point, keep=True, stretch=SETTINGS.near, central=True)
+        normal = shooting.normal(refined.point, keep=True, stretch=NEAR_STRETCH, central=True)
     else:
         normal = shooting.normal(refined.point, keep=True)
     return dataclasses.replace(refined, normal=normal)
@@ -464,6 +478,6 @@ def uncertainty_at(
 
 
 def kinks_of(problem: Problem) -> float:
-    """Return the factor on standard deviations for nonlinearity, see `kinks` and `contact_kinks`."""
+    """Return the factor on standard deviations for nonlinearity, see `KINKS`."""
     smooth = problem.robot.base is None or problem.noise_free
-    return SETTINGS.kinks if smooth else SETTINGS.contact_kinks
+    return KINKS if smooth else CONTACT_KINKS

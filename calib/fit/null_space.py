@@ -20,31 +20,25 @@ from deal_hw.types import FloatArray
 LATENCY = "latency"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NullSpaceSettings:
-    """Settings of :func:`null_space` and :func:`confounded`.
+LEAST_INFORMATION = 1.0
+"""Information below this, relative to that of the range itself, counts as none [-]."""
 
-    Attributes:
-        seen: Information below this, relative to that of the range itself, counts as none [-].
-        rounding: The same relative to the direction with most information [-]: differences are no more exact.
-        part: Smallest part in a direction, relative to the largest, of a parameter that is named [-].
-        wide: Standard deviation of a weak prior that keeps matrices invertible, in search ranges. With the
-            range itself as prior, a kind that the data leave open would look known, and its partner would not
-            be named.
-        narrower: Kinds are named where fixing one makes the other's interval narrower by this factor [-]: a
-            third of its variance comes from the other.
-        mostly: From this factor on, three quarters of the variance, they are confounded; below it partly [-].
-    """
+ROUNDING = 1e-13
+"""The same relative to the direction with most information [-]: differences are no more exact."""
 
-    seen: float = 1.0
-    rounding: float = 1e-13
-    part: float = 0.1
-    wide: float = 10.0
-    narrower: float = 1.25
-    mostly: float = 2.0
+NAMED_PART = 0.1
+"""Smallest part in a direction, relative to the largest, of a parameter that is named [-]."""
 
+WEAK_PRIOR = 10.0
+"""Standard deviation of a weak prior that keeps matrices invertible, in search ranges. With the range
+itself as prior, a kind that the data leave open would look known, and its partner would not be named."""
 
-SETTINGS = NullSpaceSettings()
+NARROWER = 1.25
+"""Kinds are named where fixing one makes the other's interval narrower by this factor [-]: a third of its
+variance comes from the other."""
+
+MOSTLY = 2.0
+"""From this factor on, three quarters of the variance, they are confounded; below it partly [-]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +56,11 @@ class NullSpace:
 
 def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
     """Return the directions in which the data have less information, (K, K), than the range."""
+    # In units of the range's own standard deviation, w / sqrt(12), the range has information 1 in each
+    # direction: an eigenvalue below 1 is a direction that the data determine less than the range does.
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
-    blind = values < max(SETTINGS.seen, SETTINGS.rounding * float(values[-1]))
+    blind = values < max(LEAST_INFORMATION, ROUNDING * float(values[-1]))
     # Posterior variance along each of them, the range's own variance being the prior's.
     spread = vectors[:, blind] ** 2 @ (1.0 / (1.0 + np.maximum(values[blind], 0.0)))
     directions = sparse_basis(vectors[:, blind].T) * root
@@ -82,7 +78,8 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
     D, K = vectors.shape
     if D < 2:
         return vectors
-    # Unknowns: D weights, then K bounds of |entries|.
+    # min |v|_1 for v = u^T vectors with v_k = 1 (basis pursuit: Chen, Donoho and Saunders 1998).
+    # Unknowns: D weights u, then K bounds b of |entries|, -b <= v <= b.
     cost = np.concatenate([np.zeros(D), np.ones(K)])
     below = np.block([[vectors.T, -np.eye(K)], [-vectors.T, -np.eye(K)]])
     found: list[tuple[float, FloatArray]] = []
@@ -119,7 +116,7 @@ def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]
     one description.
     """
     named = [
-        [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > SETTINGS.part]
+        [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > NAMED_PART]
         for direction in unseen.directions
     ]
     combined = zip(named, unseen.directions, strict=True)
@@ -166,7 +163,7 @@ class Confounded:
     @property
     def words(self) -> str:
         """The pair in a sentence."""
-        degree = "" if self.factor >= SETTINGS.mostly else "partly "
+        degree = "" if self.factor >= MOSTLY else "partly "
         return (
             f"{self.first} and {self.second} are {degree}confounded: with {self.second} known the interval "
             f"of {self.first} would be {self.factor:.1f} times narrower"
@@ -181,7 +178,7 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
     """
     space = problem.space
     low, high = problem.latency_range_s
-    weak = 12.0 / (SETTINGS.wide * np.append(space.width, high - low)) ** 2
+    weak = 12.0 / (WEAK_PRIOR * np.append(space.width, high - low)) ** 2
     precision = information + np.diag(weak)
     kinds = {
         kind: [k for k, p in enumerate(space) if p.kind == kind]
@@ -197,12 +194,13 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
         without = [i for name, members in kinds.items() if name != b for i in members]
         alone = _free_std(precision, without)
         factor = float(np.median([whole[i] / alone[i] for i in kinds[a]]))
-        if factor >= SETTINGS.narrower:
+        if factor >= NARROWER:
             found.append(Confounded(a, b, factor))
     return tuple(sorted(found, key=lambda pair: -pair.factor))
 
 
 def _free_std(precision: FloatArray, free: list[int]) -> dict[int, float]:
     """Return standard deviations of the free entries, the others fixed."""
+    # Entries that are left out are known: their rows and columns go before the inverse, not after.
     variance = np.diag(np.linalg.inv(precision[np.ix_(free, free)]))
     return {i: float(np.sqrt(v)) for i, v in zip(free, variance, strict=True)}

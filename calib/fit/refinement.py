@@ -14,59 +14,62 @@ from functools import partial
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
+from deal_hw.calib.fit.contacts import START_ITERATIONS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, restarted, solve
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
+STAGES_S = (0.2, 0.4, 0.8)
+"""Window lengths, short first [s]: short windows have a wide basin, long ones the information."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefinementSettings:
-    """Settings of :func:`refine`.
+CONTACT_STAGES_S = (0.2, 0.4)
+"""The same for feet on the floor: longer windows add more kinks than information."""
 
-    Attributes:
-        stages_s: Window lengths, short first [s]: short windows have a wide basin, long ones the information.
-        contact_stages_s: The same for feet on the floor: longer windows add more kinks than information.
-        given_stages_s: The same for exact start states. Over one sample, predictions are nearly linear in the
-            motors' gains and contacts hardly change, so the basin is about as wide as the range. Starting
-            with windows of 0.1 s ended in other minima (0.18 % off).
-        worse: Largest growth of chi2 with the window length. Beyond it, start states are in another basin or
-            model errors add up, and the longer window is not kept.
-        explained: Chi2 below which no other start states are drawn.
-        shakes: Spreads of the drawn start states where contacts stop the solver, in standard deviations.
-        shake_count: Draws of each.
-        shaken: Share of the cost above which a draw is the last one: then the model is wrong.
-        rounds: Most rounds of weights for exact start states.
-        round_iterations: Most steps of each.
-        given_chi2: Chi2 at the truth for exact start states, in most windows. A kink magnifies rounding in a
-            few.
-        given_still: Largest parameter change in a round of weights that ends the rounds, in its own scale.
-        given_right: Chi2 of most of the shortest windows below which the latency is the right whole step.
-        most_windows: Share of the windows that counts as most [-].
-        local_s: Length of data on which the local fit starts [s].
-        local_hopeless: Chi2 of the shortest windows above which the local fit does not continue.
-    """
+GIVEN_STAGES_S = (0.02, 0.04, 0.1)
+"""The same for exact start states. Over one sample, predictions are nearly linear in the motors' gains and
+contacts hardly change, so the basin is about as wide as the range. Starting with windows of 0.1 s ended in
+other minima (0.18 % off)."""
 
-    stages_s: tuple[float, ...] = (0.2, 0.4, 0.8)
-    contact_stages_s: tuple[float, ...] = (0.2, 0.4)
-    given_stages_s: tuple[float, ...] = (0.02, 0.04, 0.1)
-    worse: float = 1.2
-    explained: float = 1.25
-    shakes: tuple[float, ...] = (0.5, 0.25, 0.12)
-    shake_count: int = 60
-    shaken: float = 0.95
-    rounds: int = 4
-    round_iterations: int = 4
-    given_chi2: float = 1e-9
-    given_still: float = 1e-7
-    given_right: float = 1.0
-    most_windows: float = 0.75
-    local_s: float = 8.0
-    local_hopeless: float = 4.0
+WORSE = 1.2
+"""Largest growth of chi2 with the window length. Beyond it, start states are in another basin or model
+errors add up, and the longer window is not kept."""
 
+EXPLAINED = 1.25
+"""Chi2 below which no other start states are drawn."""
 
-SETTINGS = RefinementSettings()
+PERTURBATIONS = (0.5, 0.25, 0.12)
+"""Spreads of the drawn start states where contacts stop the solver, in standard deviations."""
+
+PERTURBED_STARTS = 60
+"""Draws of each."""
+
+LAST_PERTURBATION = 0.95
+"""Share of the cost above which a draw is the last one: then the model is wrong."""
+
+WEIGHT_ROUNDS = 4
+"""Most rounds of weights for exact start states."""
+
+ROUND_ITERATIONS = 4
+"""Most steps of each."""
+
+GIVEN_CHI2 = 1e-9
+"""Chi2 at the truth for exact start states, in most windows. A kink magnifies rounding in a few."""
+
+GIVEN_STILL = 1e-7
+"""Largest parameter change in a round of weights that ends the rounds, in its own scale."""
+
+GIVEN_RIGHT = 1.0
+"""Chi2 of most of the shortest windows below which the latency is the right whole step."""
+
+MOST_WINDOWS = 0.75
+"""Share of the windows that counts as most [-]."""
+
+LOCAL_S = 8.0
+"""Length of data on which the local fit starts [s]."""
+
+LOCAL_HOPELESS = 4.0
+"""Chi2 of the shortest windows above which the local fit does not continue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +115,7 @@ def refine(
         problem: The problem.
         theta: Start, (K,).
         latency_s: Start latency [s].
-        stages_s: Window lengths, in order [s]; the settings' by default.
+        stages_s: Window lengths, in order [s]; those of :func:`window_stages` by default.
         iterations: Most iterations of each run of the solver.
         notify: Called with the fit after each window length that is kept.
         states: Start states of the first stage's windows; the smoothed states by default.
@@ -124,7 +127,7 @@ def refine(
     Raises:
         InsufficientDataError: Not even the shortest window fits.
     """
-    space, settings = problem.space, SETTINGS
+    space = problem.space
     theta = np.clip(theta, space.low, space.high)
     stages_s = stages_s or window_stages(problem)
     if problem.noise_free and shake and problem.fixed_latency_s is None:
@@ -147,7 +150,7 @@ def refine(
             point, normal, used = _with_contacts(shooting, point, iterations, shake, rng)
         elif shooting.given:
             point, normal, used = _from_known_states(
-                shooting, point, iterations, settings.rounds if shake else 0
+                shooting, point, iterations, WEIGHT_ROUNDS if shake else 0
             )
         else:
             told = None
@@ -156,7 +159,7 @@ def refine(
             point, normal, used = _solved(shooting, point, iterations, hopeless, told)
         done += used
         found = _refined(shooting, point, normal, done)
-        if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
+        if result is not None and not shooting.given and found.chi2 > WORSE * max(result.chi2, 1.0):
             break
         result = dataclasses.replace(found, shorter=result)
         theta, latency_s = found.theta, found.latency_s
@@ -174,8 +177,8 @@ def refine(
 def window_stages(problem: Problem) -> tuple[float, ...]:
     """Return the lengths of the refinement's windows, short first [s]."""
     if problem.noise_free:
-        return SETTINGS.given_stages_s
-    return SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
+        return GIVEN_STAGES_S
+    return CONTACT_STAGES_S if problem.robot.base is not None else STAGES_S
 
 
 def refine_windows(shooting: Shooting, point: Point, iterations: int) -> Refined:
@@ -245,10 +248,10 @@ def at_parameters(
     shooting = Shooting(problem, length)
     point = shooting.start(theta, latency_s, states)
     if shooting.contacts:
-        point = settle(shooting, point, CONTACTS.start_iterations)[0]
+        point = settle(shooting, point, START_ITERATIONS)[0]
         normal = shooting.normal(point)
     else:
-        point, normal = converged(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
+        point, normal = converged(shooting, point, shooting.normal(point), START_ITERATIONS)
         point, normal = restarted(shooting, point, normal)
     return dataclasses.replace(_refined(shooting, point, normal, 0), theta=theta, latency_s=latency_s)
 
@@ -271,7 +274,7 @@ def _whole_step(
         point, normal, _ = _from_known_states(shooting, start, SolverSettings().iterations, 1)
         if _most(normal.residual) < least:
             best, least = (shooting.theta(point), tick * step_s), _most(normal.residual)
-        if least < SETTINGS.given_right:
+        if least < GIVEN_RIGHT:
             break
     return best
 
@@ -279,7 +282,7 @@ def _whole_step(
 def _most(residuals: Sequence[FloatArray]) -> float:
     """Return the quantile of the windows' chi2 at ``most_windows``; residuals are (W, H, M) each."""
     each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in residuals])
-    return float(np.quantile(each, SETTINGS.most_windows))
+    return float(np.quantile(each, MOST_WINDOWS))
 
 
 def _from_known_states(
@@ -291,19 +294,18 @@ def _from_known_states(
     bend the parameters to it. So after a first, plain round a window weighs less the more it exceeds the
     median (Cauchy's weights). The solution then rests on windows that can be explained.
     """
-    settings = SETTINGS
     point, last, used = solve(plain, point, SolverSettings(iterations=iterations))
     normal: Normal | None = last
     left: Sequence[FloatArray] = last.residual
     for _ in range(rounds):
-        if _most(left) < settings.given_chi2:
+        if _most(left) < GIVEN_CHI2:
             break
         weighed, before = plain.on(cauchy_windows(plain.data, left)), point.value
-        point, _, more = solve(weighed, point, SolverSettings(iterations=settings.round_iterations))
+        point, _, more = solve(weighed, point, SolverSettings(iterations=ROUND_ITERATIONS))
         used += more
         # Weights need residuals alone. Derivatives cost as many simulations as there are parameters.
         normal, left = None, plain.residuals(point)
-        if np.max(np.abs(point.value - before)) < settings.given_still:
+        if np.max(np.abs(point.value - before)) < GIVEN_STILL:
             break
     return point, normal or plain.normal(point), used
 
@@ -312,16 +314,15 @@ def _with_contacts(
     shooting: Shooting, point: Point, iterations: int, shake: bool, rng: np.random.Generator
 ) -> tuple[Point, Normal, int]:
     """Solve; while the residual is unexplained, draw other start states and solve again."""
-    settings = SETTINGS
     point, normal, used = _solved(shooting, point, iterations)
-    for spread in settings.shakes if shake else ():
-        if normal.cost / _degrees(shooting, normal) < settings.explained:
+    for spread in PERTURBATIONS if shake else ():
+        if normal.cost / _degrees(shooting, normal) < EXPLAINED:
             break
         before = normal.cost
-        point = shooting.shaken(point, spread, settings.shake_count, rng)
+        point = shooting.shaken(point, spread, PERTURBED_STARTS, rng)
         point, normal, more = _solved(shooting, point, iterations)
         used += more
-        if normal.cost > settings.shaken * before:
+        if normal.cost > LAST_PERTURBATION * before:
             break
     return point, normal, used
 
@@ -334,7 +335,7 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     gets the fit after the first step of each window length, each that halves chi2, and the last: on a damped
     robot an early one is often nearly the result, in a third of the time.
     """
-    hopeless = np.inf if problem.noise_free else SETTINGS.local_hopeless
+    hopeless = np.inf if problem.noise_free else LOCAL_HOPELESS
     fit = partial(
         refine,
         notify=notify,
@@ -342,7 +343,7 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
         hopeless=hopeless,
         notify_step=_clear_gains(notify) if notify is not None else None,
     )
-    part = part_of(problem, SETTINGS.local_s)
+    part = part_of(problem, LOCAL_S)
     theta, latency_s = problem.space.nominal, problem.first_latency_s
     if part is problem or problem.noise_free:
         found = fit(problem, theta, latency_s)

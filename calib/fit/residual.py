@@ -2,6 +2,19 @@
 
 Each window's start state is eliminated (Schur complement). The remaining small system in the parameters and
 the latency has their covariance as inverse, with the start states' uncertainty included.
+
+Symbols, with S = 2 C unknowns of a start state (0 where start states are given):
+    p: parameters in their own scale (ln of positive ones), then the latency [s], (K + 1,).
+    s_w: start state of window w, positions then velocities, (S,); m_w, L_w: its prior mean and information.
+    r_w: whitened residuals of window w, (predicted - measured) / std, (R,) [-].
+    J_p, J_s: their derivatives by p, (R, K + 1), and by s_w, (R, S).
+    q, P: mean and information of the parameters' prior, (K + 1,) each; P is diagonal.
+    cost: f(p, s) = (p - q)^T P (p - q) + sum_w [r_w^T r_w + (s_w - m_w)^T L_w (s_w - m_w)].
+Gradients and Hessians here are half of those of f; f is twice a negative log-likelihood.
+
+Sources: Gauss-Newton, Bjorck, Numerical Methods for Least Squares Problems (1996), chapter 9; multiple
+shooting, Bock (1983); start states that follow are variable projection (Golub and Pereyra 1973) with the
+simplified derivative of Kaufman (1975).
 """
 
 from __future__ import annotations
@@ -16,32 +29,27 @@ from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.calib.fit.command_delays import with_command_delays
 from deal_hw.types import FloatArray
 
+PARAMETER_STEP = 1e-4
+"""Step of the differences that linearise predictions: of a parameter, in its own scale."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DifferenceSettings:
-    """Steps of the differences that linearise predictions.
+CONTACT_PARAMETER_STEP = 2e-2
+"""The same with feet on the floor. Sticking and slipping make kinks on every scale, and a secant describes
+them better than a derivative."""
 
-    Attributes:
-        parameter: Of a parameter, in its own scale.
-        contact_parameter: The same with feet on the floor. Sticking and slipping make kinks on every scale,
-            and a secant describes them better than a derivative.
-        noise_free_parameter: The same for noise-free states, where no noise hides a secant's error.
-        latency_s: Of the latency [s].
-        position: Of a start position [rad or m].
-        velocity: Of a start velocity [rad/s or m/s].
-        contact_state: Of start states with feet on the floor, in standard deviations of the smoothed ones.
-    """
+NOISE_FREE_PARAMETER_STEP = 1e-5
+"""The same for noise-free states, where no noise hides a secant's error."""
 
-    parameter: float = 1e-4
-    contact_parameter: float = 2e-2
-    noise_free_parameter: float = 1e-5
-    latency_s: float = 2e-4
-    position: float = 1e-6
-    velocity: float = 1e-4
-    contact_state: float = 0.5
+LATENCY_STEP_S = 2e-4
+"""The same of the latency [s]."""
 
+POSITION_STEP = 1e-6
+"""The same of a start position [rad or m]."""
 
-DIFFERENCES = DifferenceSettings()
+VELOCITY_STEP = 1e-4
+"""The same of a start velocity [rad/s or m/s]."""
+
+CONTACT_STATE_STEP = 0.5
+"""The same of start states with feet on the floor, in standard deviations of the smoothed ones."""
 
 States = list[tuple[FloatArray, FloatArray]]
 """Positions and velocities at every sample of each episode, (T, C) each."""
@@ -83,6 +91,7 @@ class WindowRows:
 
     def without_starts(self, columns: FloatArray) -> FloatArray:
         """Return columns, (W, R, n), without their projection on the start states."""
+        # (1 - J_s (J_s^T J_s)^-1 J_s^T) columns: the projection beside the span of J_s.
         moved = np.linalg.solve(self.start_normal, np.einsum("wrs,wri->wsi", self.start, columns))
         return np.asarray(columns - np.einsum("wrs,wsi->wri", self.start, moved))
 
@@ -157,19 +166,16 @@ class Shooting:
         own, around = 1 / std**2, 1 / (prior_share * space.width) ** 2
         # The latency has no prior.
         self.prior_information = np.append(own + around, 0.0)
+        # Product of two normal laws: informations add, and the mean is weighted with them.
         centre = own * space.to_scale(mean) + around * space.to_scale(space.nominal)
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
         self.start_information = [1 / d.prior_std**2 for d in self.data]
-        self._parameter_step = (
-            DIFFERENCES.noise_free_parameter if problem.noise_free else DIFFERENCES.parameter
-        )
-        self._state_step = np.concatenate(
-            [np.full(C, DIFFERENCES.position), np.full(C, DIFFERENCES.velocity)]
-        )
+        self._parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
+        self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
         if self.contacts:
-            self._parameter_step = DIFFERENCES.contact_parameter
-            self._state_step = np.maximum(DIFFERENCES.contact_state * self.state_std, self._state_step)
+            self._parameter_step = CONTACT_PARAMETER_STEP
+            self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
 
     @property
     def device_periods(self) -> int:
@@ -245,7 +251,7 @@ class Shooting:
         moved = 0 if self.given else C
         members = K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
-        steps = np.concatenate([np.full(K, self._parameter_step), [DIFFERENCES.latency_s], self._state_step])
+        steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
         steps = stretch * steps[:members]
         # A negative latency or friction is no model: there, differences are taken inwards.
         low, high = value_bounds(self.problem)
@@ -254,6 +260,7 @@ class Shooting:
         before = point.value - steps[: K + 1]
         one_sided = np.concatenate([outside | (before < low) | (before > high), np.zeros(2 * moved, bool)])
         values[: K + 1] += np.diag(steps[: K + 1])
+        # The prior's part: H = P, g = P (p - q).
         expected = point.value - self.prior_mean
         hessian, gradient = np.diag(self.prior_information), self.prior_information * expected
         cost, count = float(np.sum(self.prior_information * expected**2)), 0
@@ -267,6 +274,8 @@ class Shooting:
             for c in range(moved):
                 x[K + 1 + c, :, c] += steps[K + 1 + c]
                 v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
+            # Row n of `values`, `x` and `v` has entry n of (p, s_w) changed by its step, in all windows at
+            # once: windows do not share start states.
             predicted = self._predict(values, data, x, v).observed
             r = data.whitened(base[e] - data.measured)
             difference = predicted - base[e]
@@ -274,6 +283,7 @@ class Shooting:
                 here_x, here_v = point.position[e], point.velocity[e]
                 other = self._predict(2 * point.value - values, data, 2 * here_x - x, 2 * here_v - v).observed
                 two = ~one_sided
+                # (y(p + h) - y(p - h)) / 2; divided by h below, as y(p + h) - y(p) is.
                 difference[two] = (predicted - other)[two] / 2
             jac = np.moveaxis(data.whitened(difference), 0, -1) / steps
             if np.isfinite(r).all():
@@ -283,6 +293,7 @@ class Shooting:
             r_flat, jac = r.reshape(W, -1), jac.reshape(W, -1, len(steps))
             jp, js = jac[..., : K + 1], jac[..., K + 1 :]
             residuals.append(r)
+            # H += J_p^T J_p, g += J_p^T r: Gauss-Newton, without the residuals' second derivatives.
             hessian += np.einsum("wri,wrj->ij", jp, jp)
             gradient += np.einsum("wri,wr->i", jp, r_flat)
             cost += float(np.sum(r_flat**2))
@@ -296,6 +307,9 @@ class Shooting:
             information = self.start_information[e]
             if keep:
                 rows.append(_rows(r_flat, jp, js, np.sqrt(information), start))
+            # The blocks of window w: H_ss = J_s^T J_s + L, g_s = J_s^T r + L (s - m), H_sp = J_s^T J_p.
+            # Their elimination leaves the Schur complement H -= H_sp^T H_ss^-1 H_sp, g -= H_sp^T H_ss^-1 g_s.
+            # A step dp takes the start state along by ds = -H_ss^-1 (g_s + H_sp dp); `back` has both parts.
             mss = np.einsum("wri,wrj->wij", js, js) + information[:, :, None] * np.eye(2 * C)
             gs = np.einsum("wri,wr->wi", js, r_flat) + information * start
             msp = np.einsum("wri,wrj->wij", js, jp)
@@ -362,6 +376,7 @@ class Shooting:
         """
         found = []
         for rows, (gain, _) in zip(normal.rows, normal.back, strict=True):
+            # J_p - J_s H_ss^-1 H_sp. The change of H_ss^-1 with p is left out (Kaufman 1975).
             by = rows.parameter
             if not self.given:
                 by = by - np.einsum("wrs,wsp->wrp", rows.start, gain)

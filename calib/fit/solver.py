@@ -5,7 +5,16 @@ Each step is the exact minimum of the linear model in a box: the bounds cut by t
 Of 92 parameters one always does at once: 9 such steps left 1.7 % of the cost, 9 exact ones 2e-11.
 
 Unknown start states of windows follow the parameters (variable projection, Golub and Pereyra 1973), so the
-solver sees the parameters alone. A robust loss is a weight per residual, computed from the previous fit.
+solver sees the parameters alone. A robust loss is a weight per residual, computed from the previous fit
+(iteratively reweighted least squares, Holland and Welsch 1977).
+
+Symbols of :func:`minimise`, for n free unknowns:
+    x: step from the start in units of the first trust region, (n,) [-].
+    r(x), J: whitened residuals, (M + n,), with those of the hold last, and their derivatives, (M + n, n).
+    D: half side of the trust region around the present x, a box [-] (``radius``).
+    f(x) = |r(x)|^2, and its model m(d) = |r + J d|^2 for a step d.
+The rule for D is algorithm 4.1 of Nocedal and Wright, Numerical Optimization (2006), with a box instead of a
+ball; the bounded linear problem is solved by BVLS (Stark and Parker 1995).
 """
 
 from __future__ import annotations
@@ -25,6 +34,36 @@ from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 
+FIRST_RADIUS = 0.7
+"""Radius of the first trust region in the parameters' own scale; 0.7 is about a factor two."""
+
+LATENCY_UNIT_S = 0.007
+"""Latency change that counts like a factor e of a parameter [s]."""
+
+SMALLEST_STEP = 1e-5
+"""Relative step length below which a step is the last."""
+
+GOOD = 0.75
+"""Share of the predicted decrease above which the trust region may grow; it doubles."""
+
+POOR = 0.25
+"""Share of the predicted decrease below which the trust region shrinks."""
+
+SHRUNK = 0.25
+"""The shrunk radius as a share of the step."""
+
+RESTART_GAIN = 3e-3
+"""Relative decrease of the cost below which the solver is not started again."""
+
+STATES_CONVERGED = 1e-4
+"""Relative decrease of the cost below which a step of start states alone is the last."""
+
+FALSE_RESTARTS = 1e-3
+"""Chance that noise alone puts any window out of line [-]."""
+
+RESTART_ITERATIONS = 6
+"""Most steps of a start state from each other start."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverSettings:
@@ -32,39 +71,16 @@ class SolverSettings:
 
     Attributes:
         iterations: Most steps.
-        first_step: Radius of the first trust region in the parameters' own scale; 0.7 is about a factor two.
-        latency_unit_s: Latency change that counts like a factor e of a parameter [s].
         converged: Relative decrease of the cost below which a step is the last.
-        smallest_step: Relative step length below which a step is the last.
-        good: Share of the predicted decrease above which the trust region may grow; it doubles.
-        poor: Share below which it shrinks.
-        shrunk: The shrunk radius as a share of the step.
         reach: Width of a prior around the start, in the parameters' own scale, which holds insensitive
             parameters. It is as wide as a range of ratio 5, and moves with each new start.
-        gain: Relative decrease of the cost below which the solver is not started again.
-        hopeless: Mean squared residual above which it is not started again either.
-        settled: Relative decrease of the cost below which a step of start states alone is the last.
-        false_restarts: Chance that noise alone puts any window out of line [-].
-        restart_iterations: Most steps of a start state from each other start.
+        hopeless: Mean squared residual above which the solver is not started again.
     """
 
     iterations: int = 12
-    first_step: float = 0.7
-    latency_unit_s: float = 0.007
     converged: float = 1e-4
-    smallest_step: float = 1e-5
-    good: float = 0.75
-    poor: float = 0.25
-    shrunk: float = 0.25
     reach: float = 1.0
-    gain: float = 3e-3
     hopeless: float = np.inf
-    settled: float = 1e-4
-    false_restarts: float = 1e-3
-    restart_iterations: int = 6
-
-
-SOLVER = SolverSettings()
 
 
 class LeastSquares(Protocol):
@@ -99,9 +115,11 @@ def minimise(
         start = np.where(free & (np.abs(start - bound) < 1e-9 * (high - low)), bound, start)
     if settings.iterations < 1 or not free.any():
         return start, 0
-    unit = np.full(len(value), settings.first_step)
-    unit[-1] *= settings.latency_unit_s
-    hold = settings.first_step / settings.reach
+    # The hold: x has a normal prior around 0 whose standard deviation is ``reach`` in the parameters' own
+    # scale, reach / FIRST_RADIUS in x. So x adds the residuals FIRST_RADIUS / reach * x.
+    unit = np.full(len(value), FIRST_RADIUS)
+    unit[-1] *= LATENCY_UNIT_S
+    hold = FIRST_RADIUS / settings.reach
     lower, upper = (low - start)[free] / unit[free], (high - start)[free] / unit[free]
 
     def at(step: FloatArray) -> FloatArray:
@@ -126,23 +144,26 @@ def minimise(
     for _ in range(settings.iterations):
         if triangle is None:
             used += 1
+            # [J, -r] = Q R: |r + J d|^2 = |R_J d - R_r|^2, with n + 1 rows instead of M + n.
             triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian(here), -left]), mode="r"))
         rows, wanted = triangle[:, :-1], triangle[:, -1]
         box = np.maximum(lower - here, -radius), np.minimum(upper - here, radius)
         step = lsq_linear(rows, wanted, box, method="bvls", max_iter=10 * len(here)).x
+        # The decrease that the model predicts, f(x) - m(d), against the one that comes, f(x) - f(x + d).
         expected = cost - float(np.sum((rows @ step - wanted) ** 2))
         if not expected > 0:
             break
         new, moved = residual(here + step), float(np.abs(step).max())
         gained = cost - float(new @ new) if np.isfinite(new).all() else -np.inf
-        if gained < settings.poor * expected:
-            radius = settings.shrunk * moved
-        elif gained > settings.good * expected and moved > 0.95 * radius:
+        # A step that uses nearly all of the box may be cut by it: the box grows only then.
+        if gained < POOR * expected:
+            radius = SHRUNK * moved
+        elif gained > GOOD * expected and moved > 0.95 * radius:
             radius *= 2.0
-        small = settings.smallest_step * (settings.smallest_step + float(np.linalg.norm(here)))
+        small = SMALLEST_STEP * (SMALLEST_STEP + float(np.linalg.norm(here)))
         ends = float(np.linalg.norm(step)) < small
         if gained > 0:
-            ends |= settings.poor * expected < gained < settings.converged * cost
+            ends |= POOR * expected < gained < settings.converged * cost
             here, left, cost, triangle = here + step, new, cost - gained, None
         if ends:
             break
@@ -170,7 +191,7 @@ def solve(
         point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
         point, normal = restarted(shooting, point, normal)
         used += max(more, 1)
-        gained = normal.cost < before * (1 - settings.gain)
+        gained = normal.cost < before * (1 - RESTART_GAIN)
         if used >= settings.iterations or not gained or normal.cost > settings.hopeless * normal.count:
             break
         before = normal.cost
@@ -185,7 +206,7 @@ def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int)
     """
     for _ in range(0 if shooting.given else iterations):
         moved = shooting.followed(point, normal, np.zeros_like(point.value))
-        if not shooting.cost(moved) < normal.cost * (1 - SOLVER.settled):
+        if not shooting.cost(moved) < normal.cost * (1 - STATES_CONVERGED):
             break
         point, normal = moved, shooting.normal(moved, keep=bool(normal.rows))
     return point, normal
@@ -207,16 +228,16 @@ def restarted(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, 
     position, velocity = list(point.position), list(point.velocity)
     for states in (shooting.smoothed(), shooting.states(point, handed_on=True)):
         start = part.start(shooting.theta(point), float(point.value[-1]), states)
-        tried, _ = converged(part, start, part.normal(start), SOLVER.restart_iterations)
+        tried, _ = converged(part, start, part.normal(start), RESTART_ITERATIONS)
         here = Point(point.value, *(tuple(s[e][w] for e, w in place) for s in (position, velocity)))
         costs = zip(part.window_costs(tried), part.window_costs(here), strict=True)
         for k, ((e, windows), (new, old)) in enumerate(zip(place, costs, strict=True)):
-            lower = new < old * (1 - SOLVER.settled)
+            lower = new < old * (1 - STATES_CONVERGED)
             for states_of, found in ((position, tried.position), (velocity, tried.velocity)):
                 states_of[e] = states_of[e].copy()
                 states_of[e][windows[lower]] = found[k][lower]
     moved = Point(point.value, tuple(position), tuple(velocity))
-    if not shooting.cost(moved) < normal.cost * (1 - SOLVER.settled):
+    if not shooting.cost(moved) < normal.cost * (1 - STATES_CONVERGED):
         return point, normal
     return converged(shooting, moved, shooting.normal(moved, keep=bool(normal.rows)), 1)
 
@@ -226,7 +247,8 @@ def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
     costs = shooting.window_costs(point)
     freedom = [np.maximum(d.freedom, 1) for d in shooting.data]
     size = max(float(np.median(np.concatenate([c / f for c, f in zip(costs, freedom, strict=True)]))), 1.0)
-    chance = SOLVER.false_restarts / sum(map(len, costs))
+    # A window's cost over its size is chi-square with its degrees of freedom; Bonferroni over the windows.
+    chance = FALSE_RESTARTS / sum(map(len, costs))
     return [c > size * chi2_law.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
 
 
@@ -275,22 +297,12 @@ class _Following:
         return self._normal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobustSettings:
-    """Settings of the weights.
+HUBER = 1.345
+"""Residuals beyond this many standard deviations weigh less; 95 % as efficient as least squares on noise
+(Huber 1964)."""
 
-    Attributes:
-        huber: Residuals beyond this many standard deviations weigh less; 95 % as efficient as least squares
-            on noise (Huber 1964).
-        least_scale: Smallest residual scale; smaller residuals of noise-free recordings are rounding [rad or
-            m].
-    """
-
-    huber: float = 1.345
-    least_scale: float = 1e-9
-
-
-ROBUST = RobustSettings()
+LEAST_SCALE = 1e-9
+"""Smallest residual scale; smaller residuals of noise-free recordings are rounding [rad or m]."""
 
 
 def huber_weights(residual: FloatArray) -> FloatArray:
@@ -299,14 +311,16 @@ def huber_weights(residual: FloatArray) -> FloatArray:
     Their spread is the scaled median, and at least that of the noise: small noise in a model that explains
     nothing is no outlier.
     """
+    # w = min(1, k s / |r|), s = 1.4826 median |r| (Huber 1964).
     size = np.abs(residual)
     spread = max(MAD_TO_STD * float(np.median(size)), 1.0)
-    return np.asarray(np.minimum(1.0, ROBUST.huber * spread / np.maximum(size, 1e-300)))
+    return np.asarray(np.minimum(1.0, HUBER * spread / np.maximum(size, 1e-300)))
 
 
 def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) -> list[WindowData]:
     """Return windows with less weight the more their residual, (W, H, M), exceeds the median's (Cauchy)."""
     costs = [np.sum(r**2, axis=(1, 2)) for r in residuals]
+    # Cauchy's weight of a window with cost c is 1 / (1 + c / median); a standard deviation has its root.
     median = max(float(np.median(np.concatenate(costs))), 1e-12)
     return [
         dataclasses.replace(d, std=d.std * np.sqrt(1.0 + c / median)[:, None, None])
@@ -335,7 +349,7 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
     if robust:
         size = np.concatenate([np.abs(r).reshape(-1, r.shape[-1]) for r in errors])
         scale = np.minimum(scale, MAD_TO_STD * np.median(size, axis=0))
-    return np.asarray(np.maximum(scale, ROBUST.least_scale))
+    return np.asarray(np.maximum(scale, LEAST_SCALE))
 
 
 def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:

@@ -26,7 +26,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import (
-    MISMATCH,
+    MISMATCH_CHI2,
     Uncertainty,
     mismatch,
     names_at_bound,
@@ -42,8 +42,7 @@ from deal_hw.calib.fit.output_error import (
     prediction_rmse,
     standing_rmse,
 )
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import at_parameters
+from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.no_data import nominal
@@ -72,6 +71,13 @@ from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
+SEARCH_S = 12.0
+"""Length of data for the search, spread evenly over the recordings [s]. The search only has to find the
+neighbourhood."""
+
+FOLDS = 3
+"""Number of folds over the motions; a single motion is split in time."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputErrorSettings:
@@ -82,10 +88,7 @@ class OutputErrorSettings:
             each window length differently.
         search_always: Search whatever the fits explain; otherwise only where their predictions over
             ``compared_s`` are no better than a robot whose state stays as it is.
-        search_s: Length of data for the search, spread evenly over the recordings [s]. The search only has to
-            find the neighbourhood.
         stretch_s: Recordings are divided into stretches of this length for the search [s].
-        folds: Number of folds over the motions; a single motion is split in time.
         compared_s: Window in which start points are compared [s]; short, so that poor ones do not diverge.
         half_iterations: Most steps of the fit of each half.
         mismatch_s: Windows with fitted start states in which the residual is compared with the sensors' noise
@@ -102,9 +105,7 @@ class OutputErrorSettings:
 
     windows_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
     search_always: bool = True
-    search_s: float = 12.0
     stretch_s: float = 2.5
-    folds: int = 3
     compared_s: float = 0.4
     half_iterations: int = 5
     mismatch_s: float = 0.4
@@ -193,7 +194,7 @@ class OutputErrorFits(Fits):
         with run.check(AFTER_FIT):
             if local is not None and left is not None:
                 # A local fit that diverged has seen only a part of the recordings.
-                lost = local.chi2 >= REFINEMENT.local_hopeless
+                lost = local.chi2 >= LOCAL_HOPELESS
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
                 if judged[1] is not None and unexplained(judged[1]):
                     causes = diagnose(judged[0], judged[1], run.play, run.allows)
@@ -222,7 +223,7 @@ class OutputErrorFits(Fits):
             "split_half": split.to_json(),
             "confounded": [dataclasses.asdict(pair) for pair in found],
         }
-        if chi2 > MISMATCH.chi2:
+        if chi2 > MISMATCH_CHI2:
             seconds = settings.mismatch_s or settings.long_s
             kind = "fitted" if settings.mismatch_s else "smoothed"
             window = f" over {seconds:g} s from {kind} start states"
@@ -252,7 +253,7 @@ class OutputErrorFits(Fits):
     def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
         """Return the search's problem: part of the recordings, and the first fit's residuals as scale."""
         std = first.expected_std if problem.known_std is None else problem.known_std
-        return problem.on(self._spread(problem, self.settings.search_s), std)
+        return problem.on(self._spread(problem, SEARCH_S), std)
 
     def _spread(self, problem: Problem, seconds: float) -> list[SampledEpisode]:
         """Return stretches of the recordings, spread evenly over them, of this total length [s]."""
@@ -276,11 +277,7 @@ class OutputErrorFits(Fits):
         """
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
-        masks = (
-            time_masks(problem, settings.folds)
-            if motions == 1
-            else fold_masks(problem, min(motions, settings.folds))
-        )
+        masks = time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
 
         def fits(train: Problem, fold: int) -> dict[str, Member]:
             question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"

@@ -24,13 +24,17 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.intervals import (
-    MISMATCH,
+    CORRELATION_SAMPLES,
+    EVIDENCE,
+    MISMATCH_CHI2,
+    WHITE_SAMPLES,
     mismatch,
     uncertainty_at,
     with_rows,
 )
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import (
+    LOCAL_HOPELESS,
+    LOCAL_S,
     Refined,
     local_fit,
     part_of,
@@ -49,7 +53,7 @@ from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, une
 from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
-from deal_hw.calib.validation.time_steps import STEP, averaged, check_step, halved, scan_latency
+from deal_hw.calib.validation.time_steps import HALVINGS, averaged, check_step, halved, scan_latency
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     EXPLAINED_CHI2,
@@ -63,6 +67,9 @@ from deal_hw.calibration import (
 )
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
+
+CONTACT_DRAWN = 0
+"""Refinements from drawn points with feet on the floor, where each takes as long as a search."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,19 +86,17 @@ class RestartSettings:
             population, half drawn in the ranges. On cart-poles whose nominal values lead to another minimum,
             about one in four of the latter leads to the truth. Where none of 8 did (1 to 4 s of balancing,
             noise-free), one of the first three members did.
-        contact_drawn: The same with feet on the floor, where a refinement takes as long as a search.
     """
 
     restarts: int = 2
     same: float = 0.2
     fewest_generations: int = 15
-    explained: float = MISMATCH.chi2
+    explained: float = MISMATCH_CHI2
     drawn: int = 8
-    contact_drawn: int = 0
 
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
-        return self.drawn if problem.robot.base is None else self.contact_drawn
+        return self.drawn if problem.robot.base is None else CONTACT_DRAWN
 
 
 RESTARTS = RestartSettings()
@@ -169,7 +174,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
         # Another minimum can leave a residual as small as noise, but with a pattern.
-        white = local is not None and conclusive(problem, local, MISMATCH.white_samples)
+        white = local is not None and conclusive(problem, local, WHITE_SAMPLES)
         if local is not None and not white and conclusive(problem, local):
             local = lower_minimum(run, local, RESTARTS) or local
             white = conclusive(problem, local)
@@ -282,7 +287,7 @@ def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
 
 def clearly_lower(a: Refined, b: Refined) -> bool:
     """Return whether ``a`` has less residual than ``b``, by more than noise makes, on the same windows."""
-    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > MISMATCH.evidence)
+    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > EVIDENCE)
 
 
 def lower_minimum(
@@ -296,7 +301,7 @@ def lower_minimum(
     """
     if not settings.draws(run.problem):
         return None
-    part, shortest = part_of(run.problem, REFINEMENT.local_s), window_stages(run.problem)[:1]
+    part, shortest = part_of(run.problem, LOCAL_S), window_stages(run.problem)[:1]
     run_part = dataclasses.replace(run, problem=part)
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
     rng = np.random.default_rng(0)
@@ -309,7 +314,7 @@ def lower_minimum(
         near = rng.permutation(searched.population)[: len(starts) // 2]
         starts = [(theta, searched.latency_s) for theta in near] + starts[: len(starts) - len(near)]
     for theta, latency_s in starts:
-        if (again or best is not same) and conclusive(part, best, MISMATCH.white_samples):
+        if (again or best is not same) and conclusive(part, best, WHITE_SAMPLES):
             break
         tried = refined_from(run_part, theta, latency_s, shortest)
         if clearly_lower(tried, best):
@@ -327,12 +332,12 @@ def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun
     step explains a part of the residual, fits with it come before a search.
     """
     problem, fit = run.problem, local
-    if problem.noise_free or not local.chi2 < REFINEMENT.local_hopeless:
+    if problem.noise_free or not local.chi2 < LOCAL_HOPELESS:
         return None
-    for _ in range(STEP.halvings):
+    for _ in range(HALVINGS):
         step = check_step(problem, with_rows(fit))
         # Residuals grow with the step, so half of it removes three quarters of what it adds to chi2.
-        if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH.chi2:
+        if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH_CHI2:
             break
         problem = halved(problem)
         window_s = fit.shooting.length * problem.episodes[0].period_s
@@ -364,9 +369,9 @@ def conclude_fit(
     """
     late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
-    if unexplained(refined, MISMATCH.white_samples):
+    if unexplained(refined, WHITE_SAMPLES):
         # Not before: in another minimum delays seem to explain what no parameters there do.
-        late = fit_delays(run.problem, refined, MISMATCH.evidence)
+        late = fit_delays(run.problem, refined, EVIDENCE)
         refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
@@ -477,7 +482,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     """
     problem, local = run.problem, run.local
     asked = run.settings.diagnosis and run.settings.local_first
-    if not asked or (local is not None and not unexplained(local, MISMATCH.white_samples)):
+    if not asked or (local is not None and not unexplained(local, WHITE_SAMPLES)):
         return fits.best(run)
     # The search that follows is a part of the fits.
     most = math.inf if run.settings.thorough else run.check_steps_left + run.search_steps
@@ -516,7 +521,7 @@ def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCa
         progress(Progress(BEFORE_SEARCH, 1, 1, f"the data do not determine: {'; '.join(words)}"))
 
 
-def conclusive(problem: Problem, fit: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
+def conclusive(problem: Problem, fit: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
     """Return whether noise explains the residual of a fit, so that no other check is needed.
 
     A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,44 +15,41 @@ from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 from deal_hw.viz.robot_drawing import Outline, RobotDrawing
 
+MOST_CHANNELS = 8
+"""Channels whose residuals are drawn: those with the largest."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChartSettings:
-    """Limits of what charts show.
+MOST_PANELS = 24
+"""Channels whose motion is drawn: the first ones."""
 
-    Attributes:
-        channels: Channels whose residuals are drawn: those with the largest.
-        panels: Channels whose motion is drawn: the first ones.
-        points: Points of all motion on the page; long series are reduced to their lows and highs.
-        lags: Longest lag of autocorrelations [samples].
-        bins: Of histograms.
-        log_ratio: Ratio of highest to lowest value above which positive series get a log scale.
-        strong: Least size of listed correlations.
-        listed: Most listed correlations.
-        picture: Width of the robot's drawing [pixels].
-    """
+MOST_POINTS = 90_000
+"""Points of all motion on the page; long series are reduced to their lows and highs."""
 
-    channels: int = 8
-    panels: int = 24
-    points: int = 90_000
-    lags: int = 20
-    bins: int = 30
-    log_ratio: float = 20.0
-    strong: float = 0.8
-    listed: int = 12
-    picture: int = 480
+LAGS = 20
+"""Longest lag of autocorrelations [samples]."""
 
+BINS = 30
+"""Bins of histograms."""
 
-SETTINGS = ChartSettings()
+LOG_RATIO = 20.0
+"""Ratio of highest to lowest value above which positive series get a log scale."""
+
+STRONG = 0.8
+"""Least size of listed correlations."""
+
+MOST_LISTED = 12
+"""Most listed correlations."""
+
+PICTURE_PX = 480
+"""Width of the robot's drawing [pixels]."""
 
 
-def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
+def overlay(shown: OverlayPanel, panels: int = MOST_PANELS) -> Markup:
     """Draw real, nominal and calibrated motion, one panel per channel.
 
     All overlays of the page share the limit of points over ``panels``, the number of their panels.
     """
-    M = min(len(shown.names), SETTINGS.panels)
-    buckets = int(np.clip(SETTINGS.points / (6 * panels), 80, 1000))
+    M = min(len(shown.names), MOST_PANELS)
+    buckets = int(np.clip(MOST_POINTS / (6 * panels), 80, 1000))
     found = []
     for m in range(M):
         series = [
@@ -108,12 +104,8 @@ def residuals(shown: Residuals) -> tuple[Markup, str]:
     """Draw whitened residuals over time, as histogram and as autocorrelation; name the selection, if any."""
     M = shown.whitened.shape[2]
     size = np.array([_root_mean_square(shown.whitened[..., m]) for m in range(M)])
-    order = np.argsort(-np.nan_to_num(size))[: SETTINGS.channels]
-    words = (
-        ""
-        if M <= SETTINGS.channels
-        else f"the {SETTINGS.channels} channels with the largest residuals of {M}"
-    )
+    order = np.argsort(-np.nan_to_num(size))[:MOST_CHANNELS]
+    words = "" if M <= MOST_CHANNELS else f"the {MOST_CHANNELS} channels with the largest residuals of {M}"
     rows = [group(_residual_row(shown, int(m), float(size[m])), "residual") for m in sorted(order)]
     return Markup("").join(rows), words
 
@@ -145,9 +137,7 @@ def _residual_row(shown: Residuals, m: int, size: float) -> Iterator[Panel]:
     if len(finite) == 0:
         return
     limit = max(3.5, min(reach, 4 * size))
-    density, edges = np.histogram(
-        np.clip(finite, -limit, limit), SETTINGS.bins, (-limit, limit), density=True
-    )
+    density, edges = np.histogram(np.clip(finite, -limit, limit), BINS, (-limit, limit), density=True)
     x = np.linspace(-limit, limit, 101)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     yield Panel(
@@ -187,7 +177,7 @@ def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
 
     The band holds 95 %. A missing sample is NaN and does not count.
     """
-    rho = [found for found, _ in autocorrelations([np.nan_to_num(values)], SETTINGS.lags)]
+    rho = [found for found, _ in autocorrelations([np.nan_to_num(values)], LAGS)]
     return np.array(rho), 2.0 / float(np.sqrt(max(np.isfinite(values).sum(), 1)))
 
 
@@ -205,7 +195,7 @@ def _positive(title: str, x_title: str, series: Series, style: str = "", *, whol
     """Return a panel of one series, on a log scale if its range is wide."""
     finite = series.y[np.isfinite(series.y)]
     low, high = float(finite.min()), float(finite.max())
-    log_y = low > 0 and high > SETTINGS.log_ratio * low
+    log_y = low > 0 and high > LOG_RATIO * low
     margin = max(0.08 * (high - low), 1e-6 * abs(high), 1e-12)
     y = (low / 1.3, 1.3 * high) if log_y else (low - margin, high + margin)
     left, right = _wide(series.x)
@@ -288,14 +278,14 @@ def strongest(matrix: FloatArray, names: Sequence[str]) -> list[tuple[str, str, 
     """Return the pairs of parameters with the strongest correlations, strongest first."""
     i, j = np.triu_indices(len(matrix), 1)
     size = np.nan_to_num(np.abs(matrix[i, j]))
-    order = [n for n in np.argsort(-size) if size[n] >= SETTINGS.strong][: SETTINGS.listed]
+    order = [n for n in np.argsort(-size) if size[n] >= STRONG][:MOST_LISTED]
     return [(names[i[n]], names[j[n]], float(matrix[i[n], j[n]])) for n in order]
 
 
 def robot(drawing: RobotDrawing) -> Markup:
     """Draw the robot as each predictor places it, with a scale bar."""
     left, bottom, width, height = drawing.box
-    scale = SETTINGS.picture / max(width, height)
+    scale = PICTURE_PX / max(width, height)
     size = np.array([width, height]) * scale
 
     def path(outline: Outline, style: str) -> str:

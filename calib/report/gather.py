@@ -19,23 +19,14 @@ from deal_hw.sim.recordings.parts import joined
 from deal_hw.types import FloatArray
 from deal_hw.viz.robot_drawing import RobotDrawing, draw_robot
 
+MOST_PANELS = 24
+"""Most panels for each sort of recordings, one per channel."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GatherSettings:
-    """Settings of :func:`gather`.
+WHITENED_SIZE = 600
+"""Most samples times channels of a whitened window: the size of its covariance."""
 
-    Attributes:
-        panels: Most panels for each sort of recordings, one per channel.
-        whitened_size: Most samples times channels of a whitened window: the size of its covariance.
-        window_s: Longest whitened window [s].
-    """
-
-    panels: int = 24
-    whitened_size: int = 600
-    window_s: float = 0.2
-
-
-SETTINGS = GatherSettings()
+WHITENED_S = 0.2
+"""Longest whitened window [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +109,7 @@ def gather(
     holdout: Sequence[SampledEpisode] = (),
     *,
     telemetry: Sequence[str] = (),
-    window_s: float = SETTINGS.window_s,
+    window_s: float = WHITENED_S,
     threads: int | None = None,
 ) -> ReportInputs:
     """Simulate the predictions of the report on the fitted recordings and on held-out ones.
@@ -140,7 +131,7 @@ def gather(
         word = "held-out" if heldout else "fitted"
         if not group:
             continue
-        shown = group[: max(min(SETTINGS.panels // len(group[0].channels), len(group)), 1)]
+        shown = group[: max(min(MOST_PANELS // len(group[0].channels), len(group)), 1)]
         if len(group) > len(shown):
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
         problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
@@ -232,7 +223,7 @@ def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
 def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str]) -> list[Residuals]:
     centre = Members(result.estimate[None], np.array([result.latency_s]))
     M = len(problem.channels)
-    length = max(min(samples_in(problem, SETTINGS.window_s), SETTINGS.whitened_size // M), 2)
+    length = max(min(samples_in(problem, WHITENED_S), WHITENED_SIZE // M), 2)
     found = []
     try:
         windows = problem.windows(length)

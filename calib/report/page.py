@@ -84,7 +84,7 @@ def render(inputs: ReportInputs) -> str:
     result = inputs.result
     rows = parameter_rows(result)
     provenance = dict(result.provenance)
-    panels = sum(min(len(shown.names), charts.SETTINGS.panels) for shown in inputs.overlays)
+    panels = sum(min(len(shown.names), charts.MOST_PANELS) for shown in inputs.overlays)
     heldout = _mapping(provenance.get("heldout_rmse"))
     names, joints = heldout_rows(heldout)
     matrix = charts.correlation_matrix(result)
@@ -114,7 +114,7 @@ def render(inputs: ReportInputs) -> str:
         ],
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
         windows=list(dict.fromkeys(short(shown.window_s) for shown in inputs.overlays)),
-        panels_each=charts.SETTINGS.panels,
+        panels_each=charts.MOST_PANELS,
         heldout_window_s=float(heldout.get("window_s") or provenance.get("heldout_window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
@@ -124,7 +124,7 @@ def render(inputs: ReportInputs) -> str:
         scan=charts.latency_scan(_mapping(provenance.get("latency_scan")), inputs.tick_s),
         correlations=None if matrix is None else charts.correlations(matrix),
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
-        strong=charts.SETTINGS.strong,
+        strong=charts.STRONG,
         trace=charts.trace(result.trace),
         population=[]
         if result.population is None

@@ -35,11 +35,26 @@ from deal_hw.calib.data.innovations import (
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic, Samples
-from deal_hw.calib.search.eki import KalmanStepper, spread_of
+from deal_hw.calib.search.eki import NEAR_SPREAD, KalmanStepper, spread_of
 from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
+
+MOST_GENERATIONS = 50
+"""Search steps; never more than the budget's."""
+
+LEAST_SPREAD = 1e-4
+"""Spread below which members cannot be separated and the search ends, in logits."""
+
+KEPT_RESIDUAL = 0.25
+"""Share of the residual that one step leaves (noise-free recordings, without innovations)."""
+
+ALARM_CHI2 = 3.0
+"""Chi2 of a noisy recording above which the result carries an alarm."""
+
+SMOOTH_DRAWS = 4
+"""Number of noise draws in a member's mean statistics."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,34 +63,20 @@ class DealSettings:
 
     Attributes:
         critic: Size and training.
-        generations: Search steps; never more than the budget's.
         clean_ticks: Window lengths of the stages for positions without noise [control periods].
         noisy_ticks: The same for noisy positions; a long window of a distant simulator has no information.
         widen: Least spread of a coordinate at the start of each further stage, in logits.
-        least_spread: Spread below which members cannot be separated and the search ends, in logits.
-        near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
-        keep: Share of the residual that one step leaves (noise-free recordings, without innovations).
-        step_clip: Largest step of a coordinate, in logits.
-        alarm_chi2: Chi2 of a noisy recording above which the result carries an alarm.
         noise_draws: Draws of the noise that estimate its effect on the statistics (noisy recordings).
-        smooth_draws: Number of these draws in a member's mean statistics.
         innovations: Whether the update regresses on the innovations, too, as that of `eki`.
         features: Whether it regresses on the critic's statistics; off is a search without a critic.
         trained: Whether the critic is trained; off leaves the features of its random first weights.
     """
 
     critic: CriticSettings = field(default_factory=lambda: FEATURE_CRITIC)
-    generations: int = 50
     clean_ticks: tuple[int, ...] = (10,)
     noisy_ticks: tuple[int, ...] = (5, 20)
     widen: float = 0.5
-    least_spread: float = 1e-4
-    near_spread: float = 0.8
-    keep: float = 0.25
-    step_clip: float = 2.0
-    alarm_chi2: float = 3.0
     noise_draws: int = 100
-    smooth_draws: int = 4
     innovations: bool = True
     features: bool = True
     trained: bool = True
@@ -99,9 +100,8 @@ class _Deal(KalmanStepper):
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
-        settings = self.settings
-        self._least_spread = settings.near_spread if self._brief else settings.least_spread
-        self._most = min(settings.generations, log.budget.generations)
+        self._least_spread = NEAR_SPREAD if self._brief else LEAST_SPREAD
+        self._most = min(MOST_GENERATIONS, log.budget.generations)
         self._view: _View
         self._diverged = 0
         self._enter_stage(0)
@@ -120,7 +120,7 @@ class _Deal(KalmanStepper):
         # Innovations and statistics of noisy recordings are whitened by their noise, so the tempering ends
         # there. Noise-free statistics alone have no such end: each step leaves a share of the residual.
         ends = self._noisy or self.settings.innovations
-        step = self.kalman.tell(residual, keep=None if ends else self.settings.keep)
+        step = self.kalman.tell(residual, keep=None if ends else KEPT_RESIDUAL)
         self._spread = step.spread
         values = {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation}
         words = f"misfit {step.misfit:.3g}, spread {step.spread:.3g}"
@@ -140,7 +140,7 @@ class _Deal(KalmanStepper):
         diverged = self._diverged + self._view.diverged
         alarms = self.log.critic_diverged(diverged)
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
-        if self._noisy and not chi2 <= self.settings.alarm_chi2:
+        if self._noisy and not chi2 <= ALARM_CHI2:
             alarms.append(self.log.unexplained(chi2))
         return self.log.result(
             centre,
@@ -362,9 +362,7 @@ class _NoisyView(_View):
         data, imitation = self._join(real, scale), self._join(fake + noise, scale)
         gap = self._train(data, imitation[good])
         target = self._critic.statistics(data[None])[0]
-        repeats = [
-            self._critic.statistics(self._join(fake + d, scale)) for d in draws[: settings.smooth_draws]
-        ]
+        repeats = [self._critic.statistics(self._join(fake + d, scale)) for d in draws[:SMOOTH_DRAWS]]
         found = np.mean(repeats, axis=0)
         covariance = np.cov(self._critic.statistics(self._join(draws, scale)), rowvar=False)
         variance = np.diag(covariance)

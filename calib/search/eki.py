@@ -24,6 +24,12 @@ from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
+STEP_CLIP = 2.0
+"""Largest step of a coordinate, in logits."""
+
+NEAR_SPREAD = 0.8
+"""Spread at which a brief search ends, in logits: the refinement's basin is that wide."""
+
 
 @dataclass(frozen=True, slots=True)
 class KalmanStep:
@@ -155,7 +161,7 @@ def spread_of(statistics: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray
 
 
 class LogitStepper(Stepper):
-    """A run of ensemble Kalman inversion in logits; it needs the setting ``step_clip`` [logits]."""
+    """A run of ensemble Kalman inversion in logits."""
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
@@ -164,7 +170,7 @@ class LogitStepper(Stepper):
     def new_ensemble(self) -> EnsembleKalman:
         """Return an ensemble drawn over the whole range."""
         unit = self.coordinates.sample(self.rng, self.log.budget.population)
-        return EnsembleKalman(logit(unit), self.rng, step_clip=self.settings.step_clip)
+        return EnsembleKalman(logit(unit), self.rng, step_clip=STEP_CLIP)
 
     def population(self, z: FloatArray) -> tuple[Members, Members]:
         """Return the members at logits z, (N, C), and the member at their mean."""
@@ -214,20 +220,16 @@ class EkiSettings:
     Attributes:
         noisy_ticks: Window lengths of the stages for noisy positions [control periods].
         clean_ticks: The same for positions without noise.
-        step_clip: Largest step of a coordinate, in logits.
         widen: Least spread of a coordinate at the start of each further stage, in logits.
         restart_chi2: Chi2 above which the search starts again from the whole range.
         stage_generations: Most generations of one stage.
-        near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
     """
 
     noisy_ticks: tuple[int, ...] = (5, 20, 20)
     clean_ticks: tuple[int, ...] = (5, 10)
-    step_clip: float = 2.0
     widen: float = 0.5
     restart_chi2: float = 3.0
     stage_generations: int = 20
-    near_spread: float = 0.8
 
 
 class _Eki(KalmanStepper):
@@ -258,7 +260,7 @@ class _Eki(KalmanStepper):
         residual = whitened_residual(self.problem, members, centre, self._windows, self._offsets)
         step = self.kalman.tell(residual)
         self._generation += 1
-        self._near = self._brief and step.spread < self.settings.near_spread
+        self._near = self._brief and step.spread < NEAR_SPREAD
         ticks = self._lengths[self._stage]
         self.log.note(
             f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",

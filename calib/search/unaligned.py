@@ -34,6 +34,18 @@ from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
+FEATURES = 256
+"""Number of random Fourier features; each is a cosine and a sine."""
+
+MOST_GENERATIONS = 25
+"""Search steps; never more than the budget's."""
+
+KEPT_RESIDUAL = 0.3
+"""Share of the residual that one step leaves."""
+
+LEAST_SPREAD = 1e-3
+"""Spread below which members cannot be separated and the search ends, in logits."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnalignedSettings:
@@ -42,22 +54,10 @@ class UnalignedSettings:
     Attributes:
         statistics: What of a member's transitions is compared.
         critic: Size and training of the critic.
-        features: Number of random Fourier features; each is a cosine and a sine.
-        innovations: Compare s' minus its regression on (s, a) over the population, not s' itself.
-        generations: Search steps; never more than the budget's.
-        keep: Share of the residual that one step leaves.
-        step_clip: Largest step of a coordinate, in logits.
-        least_spread: Spread below which members cannot be separated and the search ends, in logits.
     """
 
     statistics: Literal["critic", "kernel", "moments"] = "critic"
     critic: CriticSettings = field(default_factory=lambda: FEATURE_CRITIC)
-    features: int = 256
-    innovations: bool = True
-    generations: int = 25
-    keep: float = 0.3
-    step_clip: float = 2.0
-    least_spread: float = 1e-3
 
 
 class _Statistics(Stateful, abc.ABC):
@@ -107,7 +107,7 @@ class _KernelMeans(_Statistics):
     STATE = ("_frequency",)
 
     def _prepare(self, width: int, rng: np.random.Generator) -> None:
-        scale = np.repeat([0.3, 1.0, 3.0], -(-self.settings.features // 3))[: self.settings.features]
+        scale = np.repeat([0.3, 1.0, 3.0], -(-FEATURES // 3))[:FEATURES]
         # Standardised inputs: two samples are about sqrt(2 width) apart.
         self._frequency = rng.standard_normal((width, len(scale))) / (scale * np.sqrt(2 * width))
 
@@ -165,13 +165,13 @@ class _Unaligned(LogitStepper):
         settings = self.settings
         width, outputs = self._view.real.shape[1], self._view.outputs
         self._statistics = _KINDS[settings.statistics](width, outputs, settings, rng)
-        self._most = min(settings.generations, log.budget.generations)
+        self._most = min(MOST_GENERATIONS, log.budget.generations)
         self._spread = float("inf")
 
     @property
     def finished(self) -> bool:
         """Whether the budget is used up, or members cannot be separated any more."""
-        return len(self.log.trace) >= self._most or not self._spread > self.settings.least_spread
+        return len(self.log.trace) >= self._most or not self._spread > LEAST_SPREAD
 
     def step(self) -> None:
         """One round of rollouts and one Kalman step."""
@@ -183,7 +183,7 @@ class _Unaligned(LogitStepper):
             alive, std = spread_of(found)
             residual = np.full((len(fake), len(std)), np.nan)
             residual[usable] = (target - found)[:, alive] / std
-        step = self.kalman.tell(residual, keep=self.settings.keep)
+        step = self.kalman.tell(residual, keep=KEPT_RESIDUAL)
         self._spread = step.spread
         words = f"misfit {step.misfit:.3g}, spread {step.spread:.3g}"
         if not np.isfinite(self._statistics.values.get("wasserstein", 0.0)):
@@ -203,8 +203,6 @@ class _Unaligned(LogitStepper):
         """Return the recording's and the members' transitions as the statistics see them."""
         fake = self._view.as_sensed(fake, self.rng)
         real = self._view.real
-        if not self.settings.innovations:
-            return real, fake
         D = self._view.outputs
         pooled = fake.reshape(-1, fake.shape[-1]).astype(np.float64)
         mean = _ridge(pooled[:, :-D], pooled[:, -D:])

@@ -18,7 +18,9 @@ from scipy.stats import norm
 
 from deal_hw.calib.data.problem import Member, Problem, taken
 from deal_hw.calib.fit.intervals import (
-    MISMATCH,
+    CORRELATION_SAMPLES,
+    MISMATCH_CHI2,
+    NEGLIGIBLE_CHI2,
     Uncertainty,
     correlation_time,
     names_at_bound,
@@ -37,28 +39,22 @@ from deal_hw.findings import Finding
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.types import FloatArray
 
+AT_END = 0.01
+"""Distance to an end of the latency range, as a share of it, that counts as at the end [-]."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckSettings:
-    """Settings of the checks.
+MOST_CAUSES = 2
+"""Most causes of a residual that become alarms; all are in the provenance."""
 
-    Attributes:
-        at_end: Distance to an end of the latency range, as a share of it, that counts as at the end [-].
-        causes: Most causes of a residual that become alarms; all are in the provenance.
-        half_iterations: Most iterations of each half's fit.
-        fewest_windows: Fewest windows that are halved.
-        false_alarms: Probability that the split-half check flags any parameter of a right model [-]: among
-            many parameters, intervals of some halves always miss each other.
-    """
+HALF_ITERATIONS = 6
+"""Most iterations of each half's fit."""
 
-    at_end: float = 0.01
-    causes: int = 2
-    half_iterations: int = 6
-    fewest_windows: int = 4
-    false_alarms: float = 0.05
+FEWEST_WINDOWS = 4
+"""Fewest windows that are halved."""
 
+SPLIT_FALSE_ALARMS = 0.05
+"""Probability that the split-half check flags any parameter of a right model [-]: among many parameters,
+intervals of some halves always miss each other."""
 
-SETTINGS = CheckSettings()
 
 HALVES = "two halves of the data"
 """Name of the split-half check."""
@@ -95,7 +91,7 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Finding, ...]:
     if problem.fixed_latency_s is not None:
         return ()
     low, high = problem.latency_range_s
-    near = max(SETTINGS.at_end * (high - low), 0.5 * problem.episodes[0].step_s)
+    near = max(AT_END * (high - low), 0.5 * problem.episodes[0].step_s)
     if latency_s > high - near:
         side, wider = "later", (low, min(2 * high, LONGEST_LATENCY_S))
     elif low > 0 and latency_s < low + near:
@@ -112,11 +108,11 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Finding, ...]:
     )
 
 
-def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
+def unexplained(refined: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
     """Return whether the residual exceeds noise, or is autocorrelated over more than ``longest`` samples."""
-    if refined.chi2 <= MISMATCH.negligible_chi2:
+    if refined.chi2 <= NEGLIGIBLE_CHI2:
         return False
-    if refined.chi2 > MISMATCH.chi2:
+    if refined.chi2 > MISMATCH_CHI2:
         return True
     return correlation_time(refined.normal.residual) > longest
 
@@ -221,8 +217,8 @@ def with_causes(
 
     Where there is none, the alarm says so, and where the residual lies.
     """
-    alarms: list[Finding] = list(found[: SETTINGS.causes])
-    if not found and refined.chi2 > MISMATCH.chi2:
+    alarms: list[Finding] = list(found[:MOST_CAUSES])
+    if not found and refined.chi2 > MISMATCH_CHI2:
         alarms = [unexplained_alarm(problem, refined)]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
 
@@ -343,7 +339,7 @@ def check_split_half(
     """
     shooting = refined.shooting
     windows = sum(len(d.windows) for d in shooting.data)
-    if windows < SETTINGS.fewest_windows:
+    if windows < FEWEST_WINDOWS:
         return SplitHalf(note=f"{windows} windows are too few to halve: record longer")
     cost = _steps(problem, shooting)
     if not allows(HALVES, cost):
@@ -352,12 +348,12 @@ def check_split_half(
     block = 1
     if known.clustered is not None:
         # Blocks as long as residuals are correlated, but at least two blocks in each half.
-        longest = windows // SETTINGS.fewest_windows
+        longest = windows // FEWEST_WINDOWS
         block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
     latency_s = None if shooting.fixed_latency else refined.latency_s
     fits, halves = [], []
     for half in range(2):
-        found = refine_windows(*half_of(shooting, refined.point, half, block), SETTINGS.half_iterations)
+        found = refine_windows(*half_of(shooting, refined.point, half, block), HALF_ITERATIONS)
         own = uncertainty_at(problem, with_rows(found), fixed_latency=latency_s is None)
         # A half holds few blocks: the clustering of all blocks holds for it, too.
         std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
@@ -399,12 +395,12 @@ def agreement(
         reach_s = [h.latency_reach_s(late) for late, h in zip(each, halves, strict=True)]
         expected = np.append(expected, np.linalg.norm(reach_s) / Z90)
         reach[-1] = max(abs(late - latency_s) for late in each)
-    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
+    least = norm.ppf(1 - SPLIT_FALSE_ALARMS / (2 * max(int(identified.sum()), 1)))
     z = np.abs(scaled[0] - scaled[1]) / np.maximum(expected, 1e-300)
     flagged = tuple(r.name for k, r in enumerate(rows) if z[k] > least and identified[k] and r.agree is False)
     compared = z[identified & [r.agree is not None for r in rows]]
     power, count = float(np.sum(compared**2)), len(compared)
-    by_chance = not count or power <= chi2_law.ppf(1 - SETTINGS.false_alarms, count)
+    by_chance = not count or power <= chi2_law.ppf(1 - SPLIT_FALSE_ALARMS, count)
     scale = 1.0 if by_chance else float(np.sqrt(power / count))
     return SplitHalf(tuple(rows), flagged, reach, scale, steps)
 
@@ -451,4 +447,4 @@ def _steps(problem: Problem, shooting: Shooting) -> float:
     substeps = problem.episodes[0].step_s / problem.robot.step_s
     # One normal matrix and one line of damped steps per iteration.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
-    return float(SETTINGS.half_iterations * members * shooting.device_periods * substeps)
+    return float(HALF_ITERATIONS * members * shooting.device_periods * substeps)

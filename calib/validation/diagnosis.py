@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import MISMATCH, ended_at_bound
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
@@ -37,57 +37,65 @@ from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
+FOLDS = 4
+"""Number of folds over the windows."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DiagnosisSettings:
-    """Settings of :func:`diagnose`.
+ROUNDS = 2
+"""Stretches of consecutive windows that each fold leaves out."""
 
-    Attributes:
-        folds: Number of folds over the windows.
-        rounds: Stretches of consecutive windows that each fold leaves out.
-        noticed: Least share of the held-out squared residual that a signature explains [-].
-        most: Most named causes.
-        alike: Least explained share of a named body's mass, relative to the best one's [-].
-        decisive: Share explained by play from which other causes are searched only after its repair [-].
-        poor: Chi2 that a cause may leave without explaining the share ``decisive`` [-]. Effects are computed
-            around the fit. Where most of a residual of three times the noise stays unexplained, the fit is
-            not the robot, and what remains can look like any cause.
-        reversals: Share that play must explain in a poor fit [-],
-        alone: and its deviance over that of each other signature [-].
-        most_play: Widest play, as a share of the commands' span [-].
-        least_play: Least play of a named joint, as a share of the widest one [-].
-        sure: Least value of a named parameter that is 0 in the model, in its standard deviations [-].
-        parameter_prior: Spread of parameters in the regression, as a share of their range [-].
-        latency_prior_s: The same of the latency [s].
-        burst_part: Bursts occupy at most this part of the time [-],
-        burst_share: hold at least this share of the squared residual [-],
-        burst_kurtosis: and have at least this kurtosis (noise: 3).
-        burst_size: Least squared residual of a burst over the median [-].
-        burst_left: Chi2 that bursts may leave: twice the noise [-].
-    """
+NOTICED = 0.03
+"""Least share of the held-out squared residual that a signature explains [-]."""
 
-    folds: int = 4
-    rounds: int = 2
-    noticed: float = 0.03
-    most: int = 3
-    alike: float = 0.8
-    decisive: float = 0.5
-    poor: float = 9.0
-    reversals: float = 0.2
-    alone: float = 2.0
-    most_play: float = 0.5
-    least_play: float = 0.2
-    sure: float = 5.0
-    parameter_prior: float = 0.5
-    latency_prior_s: float = 0.02
-    burst_part: float = 0.05
-    burst_share: float = 0.4
-    burst_kurtosis: float = 8.0
-    burst_size: float = 40.0
-    burst_left: float = 4.0
+MOST_CAUSES = 3
+"""Most named causes."""
 
+ALIKE = 0.8
+"""Least explained share of a named body's mass, relative to the best one's [-]."""
 
-SETTINGS = DiagnosisSettings()
+DECISIVE = 0.5
+"""Share explained by play from which other causes are searched only after its repair [-]."""
+
+POOR = 9.0
+"""Chi2 that a cause may leave without explaining the share ``decisive`` [-]. Effects are computed around
+the fit. Where most of a residual of three times the noise stays unexplained, the fit is not the robot, and
+what remains can look like any cause."""
+
+REVERSALS = 0.2
+"""Share that play must explain in a poor fit [-]."""
+
+ALONE = 2.0
+"""Least ratio of play's deviance to that of each other signature in a poor fit [-]."""
+
+MOST_PLAY = 0.5
+"""Widest play, as a share of the commands' span [-]."""
+
+LEAST_PLAY = 0.2
+"""Least play of a named joint, as a share of the widest one [-]."""
+
+SURE = 5.0
+"""Least value of a named parameter that is 0 in the model, in its standard deviations [-]."""
+
+PARAMETER_PRIOR = 0.5
+"""Spread of parameters in the regression, as a share of their range [-]."""
+
+LATENCY_PRIOR_S = 0.02
+"""Spread of the latency in the regression [s]."""
+
+BURST_PART = 0.05
+"""Bursts occupy at most this part of the time [-]."""
+
+BURST_SHARE = 0.4
+"""Bursts hold at least this share of the squared residual [-]."""
+
+BURST_KURTOSIS = 8.0
+"""Least kurtosis of a residual with bursts; noise has 3 [-]."""
+
+BURST_SIZE = 40.0
+"""Least squared residual of a burst over the median [-]."""
+
+BURST_LEFT = 4.0
+"""Chi2 that bursts may leave: twice the noise [-]."""
+
 
 Allows = Callable[[str, float], bool]
 """Whether a check, by name, may run that takes at most so many physics steps."""
@@ -132,7 +140,7 @@ class Play:
     @property
     def explains(self) -> bool:
         """Whether it leaves only noise of motion that was not fitted, and less than half of the residual."""
-        return self.chi2 < MISMATCH.chi2 and self.diagnosis.share >= SETTINGS.decisive
+        return self.chi2 < MISMATCH_CHI2 and self.diagnosis.share >= DECISIVE
 
 
 @dataclass(frozen=True)
@@ -228,9 +236,9 @@ class Evidence:
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
         matrix, vector, squares, prior = self._normal(taken)
-        fold = fold_numbers(len(squares), SETTINGS.folds, SETTINGS.rounds)
+        fold = fold_numbers(len(squares), FOLDS, ROUNDS)
         cost = 0.0
-        for k in range(SETTINGS.folds):
+        for k in range(FOLDS):
             mine, others = fold == k, fold != k
             found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
             each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
@@ -262,11 +270,11 @@ def diagnose(
     ):
         found_play = find_play(problem, refined, fitted)
         wider += [] if found_play is None else [found_play.diagnosis]
-    if not any(one.share >= SETTINGS.decisive for one in wider):
+    if not any(one.share >= DECISIVE for one in wider):
         more = [] if problem.noise_free else zero_parameters(problem)
         if more and allows(ZEROS, wider_cost(problem, True)):
             wider += find_zero(problem, refined, more)
-    decisive = [one for one in wider if one.share >= SETTINGS.decisive]
+    decisive = [one for one in wider if one.share >= DECISIVE]
     if decisive:
         return tuple(decisive)
     wider = [one for one in wider if supported(one.share, refined.chi2)]
@@ -276,13 +284,13 @@ def diagnose(
 
 def supported(share: float, chi2: float) -> bool:
     """Return whether a cause that explains a share of a residual is more than an accident of a poor fit."""
-    return share >= SETTINGS.decisive or chi2 * (1 - share) <= SETTINGS.poor
+    return share >= DECISIVE or chi2 * (1 - share) <= POOR
 
 
 def evidence(problem: Problem, refined: Refined) -> Evidence:
     """Return the evidence for :func:`diagnose`."""
     space, data = problem.space, refined.shooting.data
-    width = np.append(SETTINGS.parameter_prior * space.width, SETTINGS.latency_prior_s)
+    width = np.append(PARAMETER_PRIOR * space.width, LATENCY_PRIOR_S)
     # A parameter at the end of its range cannot explain more.
     free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
     episodes = [problem.episodes[d.episode] for d in data]
@@ -324,7 +332,7 @@ def fit_play(problem: Problem) -> WiderFit | None:
             unit=units[joint],
             nominal=0.0,
             low=0.0,
-            high=SETTINGS.most_play * float(most),
+            high=MOST_PLAY * float(most),
             scale="linear",
         )
         for name, joint, most in zip(names, description.actuated, span, strict=True)
@@ -346,7 +354,7 @@ def find_play(problem: Problem, refined: Refined, fitted: WiderFit | None = None
     if gained is None:
         return None
     plays, fit, found = wide.more, wide.fit, wide.found
-    order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
+    order = [k for k in np.argsort(-found) if found[k] >= LEAST_PLAY * found.max() > 0]
     named = [plays[k] for k in order]
     joints = [play.elements[0] for play in named]
     sizes = listed([f"{found[k]:.2g} {plays[k].unit} at {plays[k].elements[0]}" for k in order])
@@ -371,7 +379,7 @@ def find_zero(problem: Problem, refined: Refined, more: Sequence[Parameter]) -> 
     if wide is None or gained is None:
         return []
     sure = wide.significance()
-    order = [k for k in np.argsort(-sure) if sure[k] > SETTINGS.sure]
+    order = [k for k in np.argsort(-sure) if sure[k] > SURE]
     if not order:
         return []
     named = [more[k] for k in order]
@@ -399,14 +407,14 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     found: list[Diagnosis] = []
     taken: list[Signature] = []
     groups = _groups(known.found)
-    while groups and len(found) < SETTINGS.most:
+    while groups and len(found) < MOST_CAUSES:
         groups = [group for group in groups if _possible(known, taken, group)]
         gains = [known.gain(taken, group) for group in groups]
-        if not gains or max(gains) <= MISMATCH.evidence:
+        if not gains or max(gains) <= EVIDENCE:
             break
         group = groups[int(np.argmax(gains))]
         share = 1 - float(np.exp(-max(gains) / known.count))
-        if share <= SETTINGS.noticed:
+        if share <= NOTICED:
             break
         found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
@@ -421,7 +429,7 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     if varying is not None and supported(varying.share, left):
         found.append(varying)
     # Bursts predict nothing, and are chosen for their size. So only what they leave can support them.
-    if bursts is not None and left * (1 - bursts.share) <= SETTINGS.burst_left:
+    if bursts is not None and left * (1 - bursts.share) <= BURST_LEFT:
         found.append(bursts)
     return sorted(found, key=lambda f: -f.deviance)
 
@@ -437,7 +445,7 @@ def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
     for group in (group for group in groups if group[0].cause == "backlash"):
         gain = known.gain([], group)
         share = 1 - float(np.exp(-gain / known.count))
-        if share >= SETTINGS.reversals and gain >= SETTINGS.alone * max(rivals, default=0.0):
+        if share >= REVERSALS and gain >= ALONE * max(rivals, default=0.0):
             return _cause_diagnosis(known, [], group, share, gain)
     return None
 
@@ -496,7 +504,7 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
 
     def alike(cause: Cause) -> list[Signature]:
         gains = [(known.gain(taken, [s]), s) for s in known.found if s.cause == cause]
-        enough = [(gain, s) for gain, s in gains if gain >= SETTINGS.alike * deviance]
+        enough = [(gain, s) for gain, s in gains if gain >= ALIKE * deviance]
         return [s for _, s in sorted(enough, key=lambda pair: -pair[0])]
 
     bodies = [s for s in alike("mass") if _possible(known, taken, [s])]
@@ -522,7 +530,7 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
 def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
     """Return whether commands seem to have delays of their own beside other causes; see `.random_delay`."""
     found = random_delay(known.without(taken), known.answers, known.period_s)
-    if found is None or not (found.gain > MISMATCH.evidence and found.share > SETTINGS.noticed):
+    if found is None or not (found.gain > EVIDENCE and found.share > NOTICED):
         return None
     seen = (
         f"{percent(found.share)} of the squared residual comes where commands change fast, as if each "
@@ -547,10 +555,10 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     # Samples that filled a gap have a residual of 0.
     seen = each > 0
     each, time, source = each[seen], time[seen], source[seen]
-    most = np.argsort(-each)[: max(round(SETTINGS.burst_part * len(each)), 1)]
-    most = most[each[most] > SETTINGS.burst_size * np.median(each)]
+    most = np.argsort(-each)[: max(round(BURST_PART * len(each)), 1)]
+    most = most[each[most] > BURST_SIZE * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))
-    if kurtosis(values) < SETTINGS.burst_kurtosis or share < SETTINGS.burst_share:
+    if kurtosis(values) < BURST_KURTOSIS or share < BURST_SHARE:
         return None
     unit_s = 10 * known.period_s
     stretches = [

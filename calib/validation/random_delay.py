@@ -25,42 +25,36 @@ from deal_hw.calib.fit.command_delays import (
     moved_commands,
 )
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.validation.signatures import SignatureResponse, answers
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
+FEWEST_WINDOWS = 4
+"""Fewest windows."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RandomDelaySettings:
-    """Settings of :func:`random_delay`.
+MOST_WINDOWS = 20
+"""Most windows, spread over the recordings."""
 
-    Attributes:
-        fewest: Fewest windows.
-        windows: Most windows, spread over the recordings.
-        rows: Residuals of each window, from its start.
-        slow_s: Correlation time of the slow force [s].
-        ratio: Least and largest ratio of the mean variances of a process and the noise [-].
-        spaced: Largest standard deviation of delays, in times between commands, with which these arrive in
-            order [-].
-        rounds: Most fits of one window length, each around the delays of the one before.
-        iterations: Most iterations of each.
-    """
+ROWS = 320
+"""Residuals of each window, from its start."""
 
-    fewest: int = 4
-    windows: int = 20
-    rows: int = 320
-    slow_s: float = 0.1
-    ratio: tuple[float, float] = (1e-5, 1e5)
-    spaced: float = 0.3
-    rounds: int = 3
-    iterations: int = 6
+SLOW_S = 0.1
+"""Correlation time of the slow force [s]."""
 
+VARIANCE_RATIO = (1e-5, 1e5)
+"""Least and largest ratio of the mean variances of a process and the noise [-]."""
 
-SETTINGS = RandomDelaySettings()
+MOST_SPACED = 0.3
+"""Largest standard deviation of delays, in times between commands, with which these arrive in order [-]."""
+
+ROUNDS = 3
+"""Most fits of one window length, each around the delays of the one before."""
+
+ITERATIONS = 6
+"""Most iterations of each fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,18 +132,16 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
         return None
     std_s, gain = _likely(part, refined, rows, columns)
     # Commands that wait for those before them have no delay of their own.
-    if not gain > least or std_s > SETTINGS.spaced * command_spacing_s(problem):
+    if not gain > least or std_s > MOST_SPACED * command_spacing_s(problem):
         return None
     delayed = _with(problem.with_command_delays(none), refined, std_s)
     best: Refined | None = None
     fit = refined
-    for seconds in REFINEMENT.stages_s:
+    for seconds in STAGES_S:
         states = None if best is None else best.shooting.states(best.point)
-        for _ in range(SETTINGS.rounds):
+        for _ in range(ROUNDS):
             try:
-                fit = refine(
-                    delayed, fit.theta, fit.latency_s, (seconds,), SETTINGS.iterations, states=states
-                )
+                fit = refine(delayed, fit.theta, fit.latency_s, (seconds,), ITERATIONS, states=states)
             except InsufficientDataError:
                 break
             if (seen := _seen(delayed, fit)) is None:
@@ -160,7 +152,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
                 break
             delayed = _with(delayed, fit, std_s, shift, moved)
             states = fit.shooting.states(fit.point)
-        if best is not None and fit.chi2 > REFINEMENT.worse * max(best.chi2, 1.0):
+        if best is not None and fit.chi2 > WORSE * max(best.chi2, 1.0):
             break
         best = fit
     if best is None or best.shooting.problem.command_delays is None:
@@ -219,8 +211,8 @@ def random_delay(
     :func:`delay_columns`, if they are known. Without them each sample's change of a set-point has a delay.
     """
     every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
-    chosen = every[:: max(-(-len(every) // SETTINGS.windows), 1)]
-    if len(chosen) < SETTINGS.fewest or not any(np.any(a.change) for a in answers):
+    chosen = every[:: max(-(-len(every) // MOST_WINDOWS), 1)]
+    if len(chosen) < FEWEST_WINDOWS or not any(np.any(a.change) for a in answers):
         return None
     late = [None] * len(rows) if columns is None else columns
     windows = [_Window.of(rows[e], answers[e], late[e], w) for e, w in chosen]
@@ -263,7 +255,7 @@ class _Window:
     @classmethod
     def of(cls, rows: WindowRows, answer: SignatureResponse, late: FloatArray | None, w: int) -> _Window:
         R, S, M = rows.residual.shape[1], rows.start.shape[2], answer.response.shape[3]
-        H = min(answer.response.shape[2], max(SETTINGS.rows // M, 4))
+        H = min(answer.response.shape[2], max(ROWS // M, 4))
         # The start state's prior comes last.
         kept = np.concatenate([np.arange(H * M), np.arange(R - S, R)])
         basis = np.linalg.qr(rows.start[w][kept], mode="complete")[0][:, S:] if S else np.eye(len(kept))
@@ -299,7 +291,7 @@ def _process(
             moved = rms[:, None, None, None] * later
         if name == "slow":
             apart = np.abs(np.subtract.outer(np.arange(H), np.arange(H))) * period_s
-            root = np.linalg.cholesky(np.exp(-apart / SETTINGS.slow_s) + 1e-9 * np.eye(H))
+            root = np.linalg.cholesky(np.exp(-apart / SLOW_S) + 1e-9 * np.eye(H))
             moved = np.einsum("lk,alhm->akhm", root, moved)
         columns = moved.reshape(-1, H * M) @ window.basis
         covariance.append(columns.T @ columns)
@@ -348,7 +340,7 @@ def _fitted(
 
     found = np.zeros(len(covariances))
     if covariances:
-        least, most = np.log(SETTINGS.ratio)
+        least, most = np.log(VARIANCE_RATIO)
         found = minimize(cost, found, jac=True, bounds=Bounds(least, most)).x
     deviance, _, level = likelihood(found)
     return deviance, np.exp(found), level

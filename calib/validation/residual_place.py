@@ -16,26 +16,18 @@ from deal_hw.calibration import percent
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
+BINS = 16
+"""Parts of a joint's travel [-]."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlaceSettings:
-    """Settings of :func:`residual_place`.
+LEAST_SHARE = 0.5
+"""Share of the squared residual that a stretch of the travel must hold [-]."""
 
-    Attributes:
-        bins: Parts of a joint's travel [-].
-        most: Share of the squared residual that a stretch of the travel must hold [-].
-        denser: Least ratio of that share to the share of the samples there [-]. A model error that is spread
-            over the motion has about 1.
-        channel: Least share of the squared residual in one channel that is named without a stretch [-].
-    """
+DENSER = 2.5
+"""Least ratio of that share to the share of the samples there [-]. A model error that is spread over the
+motion has about 1."""
 
-    bins: int = 16
-    most: float = 0.5
-    denser: float = 2.5
-    channel: float = 0.8
-
-
-SETTINGS = PlaceSettings()
+CHANNEL_SHARE = 0.8
+"""Least share of the squared residual in one channel that is named without a stretch [-]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +85,7 @@ def residual_place(problem: Problem, refined: Refined) -> str:
             found.append((stretch, c))
     if not found:
         return (
-            f"{most}."
-            if of_channel[worst] >= SETTINGS.channel
-            else "It is spread over channels and positions."
+            f"{most}." if of_channel[worst] >= CHANNEL_SHARE else "It is spread over channels and positions."
         )
     stretch, c = max(found, key=lambda pair: pair[0].share / pair[0].samples)
     return (
@@ -114,25 +104,25 @@ def densest_stretch(power: FloatArray, position: FloatArray) -> Stretch | None:
     total = float(power.sum())
     if not (high > low and total > 0):
         return None
-    edges = np.linspace(low, high, SETTINGS.bins + 1)
+    edges = np.linspace(low, high, BINS + 1)
     share = np.histogram(position, edges, weights=power)[0] / total
     samples = np.histogram(position, edges)[0] / len(position)
-    dense = share >= SETTINGS.denser * samples
+    dense = share >= DENSER * samples
 
     def stretch(first: int, end: int) -> Stretch:
         held, there = float(share[first:end].sum()), float(samples[first:end].sum())
         return Stretch(float(edges[first]), float(edges[end]), held, there)
 
-    for width in range(1, SETTINGS.bins):
-        every = [stretch(first, first + width) for first in range(SETTINGS.bins - width + 1)]
-        enough = [s.share >= max(SETTINGS.most, SETTINGS.denser * s.samples) for s in every]
+    for width in range(1, BINS):
+        every = [stretch(first, first + width) for first in range(BINS - width + 1)]
+        enough = [s.share >= max(LEAST_SHARE, DENSER * s.samples) for s in every]
         if any(enough):
             first = int(np.argmax([s.share * good for s, good in zip(every, enough, strict=True)]))
             end = first + width
             # Its neighbours belong to it where the residual is as dense.
             while first > 0 and dense[first - 1]:
                 first -= 1
-            while end < SETTINGS.bins and dense[end]:
+            while end < BINS and dense[end]:
                 end += 1
             return stretch(first, end)
     return None

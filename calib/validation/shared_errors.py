@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, measurements, samples_in
-from deal_hw.calib.fit.intervals import MISMATCH
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
@@ -35,38 +35,37 @@ UNITS = {"rad": (1 / DEGREES, "degrees", "deg"), "m": (1e-3, "millimetres", "mm"
 """Factor of a value that was written in the named unit, and that unit in a column map."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SharedErrorSettings:
-    """Settings of :func:`find_shared_error`.
+FACTOR = 2.0
+"""Clocks and positions are tried this factor faster or larger, and slower or smaller [-]."""
 
-    Attributes:
-        factor: Clocks and positions are tried this factor faster or larger, and slower or smaller [-].
-        stretch_s: Recordings are divided into stretches of this length; every other one is predicted [s].
-        part_s: Length of data that is fitted, and that is predicted, evenly spread [s].
-        window_s: Windows of the fits [s]; windows of other clocks have as many samples.
-        tried: Number of candidates that are fitted: those that the nominal values predict best.
-        iterations: Most steps of each fit.
-        first: Step after which a fit ends that is far behind the recordings as they are. On 16 recordings
-            with a known error its correction had at most 0.74 times their residual after two steps.
-        behind: Ratio of its mean squared residual to theirs above which it is far behind [-].
-        noticed: Least share of the held-out squared residual that it explains, where only noise remains [-].
-        alike: Largest ratio of the held-out squared residual to the best one's for candidates that are named
-            together [-].
-    """
+STRETCH_S = 1.0
+"""Recordings are divided into stretches of this length; every other one is predicted [s]."""
 
-    factor: float = 2.0
-    stretch_s: float = 1.0
-    part_s: float = 4.0
-    window_s: float = 0.2
-    tried: int = 5
-    iterations: int = 8
-    first: int = 3
-    behind: float = 3.0
-    noticed: float = 0.2
-    alike: float = 1.1
+PART_S = 4.0
+"""Length of data that is fitted, and that is predicted, evenly spread [s]."""
 
+WINDOW_S = 0.2
+"""Windows of the fits [s]; windows of other clocks have as many samples."""
 
-SETTINGS = SharedErrorSettings()
+TRIED = 5
+"""Number of candidates that are fitted: those that the nominal values predict best."""
+
+ITERATIONS = 8
+"""Most steps of each fit."""
+
+FIRST_STEPS = 3
+"""Step after which a fit ends that is far behind the recordings as they are. On 16 recordings with a known
+error its correction had at most 0.74 times their residual after two steps."""
+
+BEHIND = 3.0
+"""Ratio of its mean squared residual to theirs above which it is far behind [-]."""
+
+NOTICED = 0.2
+"""Least share of the held-out squared residual that it explains, where only noise remains [-]."""
+
+ALIKE = 1.1
+"""Largest ratio of the held-out squared residual to the best one's for candidates that are named together
+[-]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,7 +226,7 @@ def shared_errors(problem: Problem) -> Iterator[SharedError]:
                 f"{names[i]} and {names[j]} were swapped",
                 f"Change the columns of {names[i]} and {names[j]} in the column map.",
             )
-    f = SETTINGS.factor
+    f = FACTOR
     for clock, words in (
         (1 / f, f"the clock were {f:g} times too fast"),
         (f, f"the clock were {f:g} times too slow"),
@@ -302,17 +301,16 @@ def find_shared_error(
     if problem.robot.base is not None or problem.noise_free:
         return SharedErrorCheck()
     before = problem.steps
-    settings = SETTINGS
-    parts = [s for e in problem.episodes for s in stretches(e, settings.stretch_s) if s.usable.any()]
-    seen, unseen = (spread(parts[k::2], settings.part_s) for k in (0, 1))
-    length = samples_in(problem, settings.window_s)
+    parts = [s for e in problem.episodes for s in stretches(e, STRETCH_S) if s.usable.any()]
+    seen, unseen = (spread(parts[k::2], PART_S) for k in (0, 1))
+    length = samples_in(problem, WINDOW_S)
     same = ChannelChange.none(len(problem.robot.description.joint_names))
     if not unseen:
         return SharedErrorCheck()
     if most_steps <= 0:
-        return SharedErrorCheck(of=settings.tried)
+        return SharedErrorCheck(of=TRIED)
     tell = tell or (lambda done, total: None)
-    tell(0, 1 + settings.tried)
+    tell(0, 1 + TRIED)
     try:
         test = same.on(problem, unseen)
         count = _samples(test, length)
@@ -323,17 +321,17 @@ def find_shared_error(
         return SharedErrorCheck()
     ranked = sorted(shared_errors(problem), key=lambda e: _screened(problem, e.undo, seen, length))
     found: dict[SharedError, float] = {}
-    for error in ranked[: settings.tried]:
+    for error in ranked[:TRIED]:
         if problem.steps - before >= most_steps:
             break
-        tell(1 + len(found), 1 + settings.tried)
-        hopeless = settings.behind * trained
+        tell(1 + len(found), 1 + TRIED)
+        hopeless = BEHIND * trained
         found[error] = _fitted(problem, error.undo, seen, unseen, length, hopeless)[1]
-    check = SharedErrorCheck(tried=len(found), of=min(len(ranked), settings.tried))
+    check = SharedErrorCheck(tried=len(found), of=min(len(ranked), TRIED))
     best = min(found, key=lambda e: found[e], default=None)
     if best is None or not _decides(as_recorded, found[best], count):
         return check
-    alike = sorted((e for e in found if found[e] <= settings.alike * found[best]), key=lambda e: found[e])
+    alike = sorted((e for e in found if found[e] <= ALIKE * found[best]), key=lambda e: found[e])
     deviance = count * math.log(as_recorded / found[best])
     error_found = FoundError(tuple(alike), found[best], as_recorded, deviance, test, length)
     return dataclasses.replace(check, found=error_found)
@@ -345,11 +343,11 @@ def _decides(before: float, after: float, count: int) -> bool:
     Only noise may remain: from a fit that explains neither, no cause can be named. Residuals far below the
     noise need no explanation.
     """
-    if before <= MISMATCH.negligible_chi2 or not after <= MISMATCH.chi2:
+    if before <= NEGLIGIBLE_CHI2 or not after <= MISMATCH_CHI2:
         return False
-    if not after < (1 - SETTINGS.noticed) * before:
+    if not after < (1 - NOTICED) * before:
         return False
-    return not np.isfinite(before) or count * math.log(before / after) > MISMATCH.evidence
+    return not np.isfinite(before) or count * math.log(before / after) > EVIDENCE
 
 
 def _samples(test: Problem, length: int) -> int:
@@ -387,7 +385,7 @@ def _fitted(
     steps = itertools.count(1)
 
     def check(fit: Refined) -> None:
-        if next(steps) == SETTINGS.first and fit.chi2 > hopeless:
+        if next(steps) == FIRST_STEPS and fit.chi2 > hopeless:
             raise CalibrationError("the correction explains the recordings worse than they are")
 
     try:
@@ -398,7 +396,7 @@ def _fitted(
             problem.space.nominal,
             problem.first_latency_s,
             (window_s,),
-            iterations=SETTINGS.iterations,
+            iterations=ITERATIONS,
             notify_step=check,
         )
         held_out = change.on(problem, unseen)

@@ -24,29 +24,23 @@ from deal_hw.types import FloatArray
 Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "lag", "load", "mass", "contact"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SignatureSettings:
-    """Settings of :func:`signatures`.
+PUSH = 0.2
+"""Size of a disturbance, as a share of the torque that the joint's own inertia needed [-]."""
 
-    Attributes:
-        push: Size of a disturbance, as a share of the torque that the joint's own inertia needed [-].
-        heavier: Relative change of a mass [-].
-        low_speeds: Speeds at which friction's excess at low speed falls to 1/e, as parts of a joint's rms
-            speed [-].
-        still: Part of the rms speed below which a velocity has no direction [-].
-        plays: Plays whose crossing is simulated [rad or m]: the time of a crossing grows with the play.
-        nudge: Change of a set-point for one sample that shows a joint's response [rad or m].
-    """
+HEAVIER = 0.02
+"""Relative change of a mass [-]."""
 
-    push: float = 0.2
-    heavier: float = 0.02
-    low_speeds: tuple[float, ...] = (0.1, 0.4)
-    still: float = 1e-3
-    plays: tuple[float, ...] = (0.005, 0.02, 0.06)
-    nudge: float = 1e-3
+LOW_SPEEDS = (0.1, 0.4)
+"""Speeds at which friction's excess at low speed falls to 1/e, as parts of a joint's rms speed [-]."""
 
+STILL = 1e-3
+"""Part of the rms speed below which a velocity has no direction [-]."""
 
-SETTINGS = SignatureSettings()
+PLAYS = (0.005, 0.02, 0.06)
+"""Plays whose crossing is simulated [rad or m]: the time of a crossing grows with the play."""
+
+NUDGE = 1e-3
+"""Change of a set-point for one sample that shows a joint's response [rad or m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,17 +90,17 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             theta = np.repeat(
                 np.append(fit.theta, [p.nominal for p in heavier])[None], 1 + len(heavier), axis=0
             )
-            theta[1:, len(fit.theta) :] *= 1 + SETTINGS.heavier * np.eye(len(heavier))
+            theta[1:, len(fit.theta) :] *= 1 + HEAVIER * np.eye(len(heavier))
             late = np.full(len(theta), fit.latency_s)
             masses = wide.predict(theta, late, data, x, v).observed
-            for p, column in zip(heavier, _changes(masses, data) / SETTINGS.heavier, strict=True):
+            for p, column in zip(heavier, _changes(masses, data) / HEAVIER, strict=True):
                 found.setdefault(("mass", p.elements[0]), []).append(column[..., None])
         path = _path(problem, fit, data)
         position, velocity, acceleration = _along(problem, data, *states[data.episode])
         for name, c in zip(problem.robot.description.joint_names, range(C)[joints], strict=True):
             forces = _forces(velocity[..., c], speed[c])
             forces["inertia"] = [acceleration[..., c] / max(float(np.std(acceleration[..., c])), 1e-300)]
-            size = SETTINGS.push * _inertia(problem, c) * float(np.std(acceleration[..., c]))
+            size = PUSH * _inertia(problem, c) * float(np.std(acceleration[..., c]))
             geared = name in problem.robot.description.actuated and problem.robot.base is None
             if geared:
                 forces["backlash"] = _crossing(problem, data, states[data.episode], c, size)
@@ -138,9 +132,9 @@ def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
         paths = np.repeat(path, 1 + A, axis=0)
         for step in range(stride):
             rows = np.minimum(at + step, paths.shape[1] - 1)
-            paths[1:, rows] += SETTINGS.nudge * np.eye(A)[:, None]
+            paths[1:, rows] += NUDGE * np.eye(A)[:, None]
         observed = _predict(problem, fit, data, e, paths)
-        responses.append((observed[1:] - observed[:1]) / (SETTINGS.nudge * stride * step_s))
+        responses.append((observed[1:] - observed[:1]) / (NUDGE * stride * step_s))
         edges = np.minimum(at[:, None] + stride * np.arange(data.windows.length + 1), path.shape[1] - 1)
         changes.append(np.diff(path[0][edges], axis=1))
     mean = np.nan_to_num(np.mean(np.concatenate(responses, axis=1), axis=1))
@@ -153,7 +147,7 @@ def held_direction(velocity: FloatArray, speed: float) -> FloatArray:
 
     ``speed`` is the rms of the velocity.
     """
-    moving = np.abs(velocity) > SETTINGS.still * speed
+    moving = np.abs(velocity) > STILL * speed
     index = np.where(moving, np.arange(velocity.shape[1]), 0)
     return np.asarray(np.sign(np.take_along_axis(velocity, np.maximum.accumulate(index, axis=1), axis=1)))
 
@@ -163,7 +157,7 @@ def _forces(velocity: FloatArray, speed: float) -> dict[Cause, list[FloatArray]]
     v = velocity / max(speed, 1e-300)
     against = -np.sign(v)
     return {
-        "friction": [against * np.exp(-np.abs(v) / s) for s in SETTINGS.low_speeds],
+        "friction": [against * np.exp(-np.abs(v) / s) for s in LOW_SPEEDS],
         "damping": [-v, -v * np.abs(v)],
         "load": [np.ones_like(v)],
     }
@@ -200,10 +194,10 @@ def _crossing(
     rows = np.arange(len(load)) * windows.stride
     fine = np.interp(np.arange(rows[-1] + windows.stride), rows, load)
     found = []
-    for play in SETTINGS.plays:
+    for play in PLAYS:
         place = place_in_play(fine / inertia, episode.step_s, play)
         relative = np.gradient(np.gradient(place, episode.step_s), episode.step_s)
-        found.append(-inertia * relative[at] / play * SETTINGS.plays[0] / size)
+        found.append(-inertia * relative[at] / play * PLAYS[0] / size)
     return found
 
 

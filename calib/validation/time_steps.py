@@ -26,33 +26,28 @@ from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
 from deal_hw.types import FloatArray
 
+SCAN_TICKS = 2
+"""Ticks on either side of the estimate that are fitted first."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanSettings:
-    """Settings of :func:`scan_latency`.
+SCAN_ITERATIONS = 10
+"""Most iterations of each fit."""
 
-    Attributes:
-        ticks: Ticks on either side of the estimate that are fitted first.
-        iterations: Most iterations of each fit.
-        contact_ticks: The same with feet on the floor, where a fit costs ten times as much.
-        contact_iterations: Likewise; these fits begin at fitted states.
-        hopeless: Predicted cost above the least at which a tick is not fitted [noise variances]: ten standard
-            deviations, the largest known shift by a kink.
-        worse: Cost above that of the free latency at which whole ticks have not converged; then the free
-            latency is kept.
-        most: Most ticks.
-    """
+CONTACT_TICKS = 1
+"""The same with feet on the floor, where a fit costs ten times as much."""
 
-    ticks: int = 2
-    iterations: int = 10
-    contact_ticks: int = 1
-    contact_iterations: int = 2
-    hopeless: float = 100.0
-    worse: float = 9.0
-    most: int = 15
+CONTACT_ITERATIONS = 2
+"""The same for iterations; these fits begin at fitted states."""
 
+HOPELESS = 100.0
+"""Predicted cost above the least at which a tick is not fitted [noise variances]: ten standard deviations,
+the largest known shift by a kink."""
 
-SCAN = ScanSettings()
+WORSE = 9.0
+"""Cost above that of the free latency at which whole ticks have not converged; then the free latency is
+kept."""
+
+MOST_TICKS = 15
+"""Most ticks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +77,7 @@ class LatencyScan:
 
     def decides(self, free: Refined) -> bool:
         """Return whether a whole tick explains the recordings about as well as a free latency."""
-        return self.refined[self.best].normal.cost < free.normal.cost + SCAN.worse
+        return self.refined[self.best].normal.cost < free.normal.cost + WORSE
 
 
 def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback | None) -> LatencyScan:
@@ -95,13 +90,13 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
     centre = round(refined.latency_s / tick)
     low, high = (round(v / tick) for v in problem.latency_range_s)
     contacts = problem.robot.base is not None
-    reach, iterations = SCAN.ticks, SCAN.iterations
+    reach, iterations = SCAN_TICKS, SCAN_ITERATIONS
     if contacts:
-        reach, iterations = SCAN.contact_ticks, SCAN.contact_iterations
+        reach, iterations = CONTACT_TICKS, CONTACT_ITERATIONS
     if not contacts:
         # In a smooth problem the curvature shows up to which distance a tick is worth a fit.
         variance = np.linalg.inv(_information(refined))[-1, -1]
-        worth_s = np.sqrt(SCAN.hopeless * max(1.0, refined.chi2) * variance)
+        worth_s = np.sqrt(HOPELESS * max(1.0, refined.chi2) * variance)
         low = max(low, min(math.ceil((refined.latency_s - worth_s) / tick), centre))
         high = min(high, max(math.floor((refined.latency_s + worth_s) / tick), centre))
     found: dict[int, Refined] = {}
@@ -110,7 +105,7 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
         found[centre] = refined
     waiting = [t for t in range(centre - reach, centre + reach + 1) if low <= t <= high and t not in found]
     shooting = refined.shooting.on(refined.shooting.data, fixed_latency=True)
-    while waiting and len(found) < SCAN.most:
+    while waiting and len(found) < MOST_TICKS:
         t = waiting.pop(0)
         start = shooting.followed(refined.point, refined.normal, _latency_step(refined, t * tick))
         found[t] = refine_windows(shooting, start, iterations)
@@ -159,28 +154,21 @@ def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertai
     return dataclasses.replace(best.with_covariance(covariance), latency_interval_s=interval_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StepSettings:
-    """Settings of :func:`check_step`.
+CLEARLY = 4.0
+"""Chi-square difference that decides between two steps [-]. If the finer step is in truth d standard
+deviations worse, the difference is -d^2 with a spread of 2 d. So by chance it is above 4 in at most 2.3 %
+of recordings, for any d."""
 
-    Attributes:
-        clearly: Chi-square difference that decides between two steps [-]. If the finer step is in truth d
-            standard deviations worse, the difference is -d^2 with a spread of 2 d. So by chance it is above 4
-            in at most 2.3 % of recordings, for any d.
-        noticed: Least share of the squared residual by which half the step must lower it for an alarm [-], as
-            for a cause of the residual. Intervals are widened by the step's shift without an alarm, too.
-        most_steps: Most physics steps of the comparison.
-        halvings: Most times that the step is halved to explain a residual. A fourth of it costs four local
-            fits, less than a search.
-    """
+NOTICED = 0.03
+"""Least share of the squared residual by which half the step must lower it for an alarm [-], as for a
+cause of the residual. Intervals are widened by the step's shift without an alarm, too."""
 
-    clearly: float = 4.0
-    noticed: float = 0.03
-    most_steps: float = 3e8
-    halvings: int = 2
+MOST_STEPS = 3e8
+"""Most physics steps of the comparison."""
 
-
-STEP = StepSettings()
+HALVINGS = 2
+"""Most times that the step is halved to explain a residual. A fourth of it costs four local fits, less
+than a search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +192,7 @@ class StepCheck:
     @property
     def coarse(self) -> bool:
         """Whether half the step explains the recordings better, by more than chance."""
-        return not self.note and self.gain > STEP.clearly and self.share > STEP.noticed
+        return not self.note and self.gain > CLEARLY and self.share > NOTICED
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -218,7 +206,7 @@ class StepCheck:
         }
 
 
-def check_step(problem: Problem, refined: Refined, settings: StepSettings | None = None) -> StepCheck:
+def check_step(problem: Problem, refined: Refined, most_steps: float = MOST_STEPS) -> StepCheck:
     """Compare predictions with the model's step and with half of it; the fit has linearised residuals."""
     step_s = problem.robot.step_s
     if problem.robot.base is not None:
@@ -226,7 +214,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
         return StepCheck(step_s, note="not compared for robots in contact")
     shooting, rows = refined.shooting, refined.normal.rows
     steps = 3.0 * shooting.device_periods * problem.episodes[0].step_s / step_s
-    if steps > (settings or STEP).most_steps:
+    if steps > most_steps:
         return StepCheck(step_s, note=f"not compared: it would take {steps:.1g} physics steps")
     finer = Shooting(halved(problem), shooting.length, data=shooting.data)
     before, after = shooting.residuals(refined.point), finer.residuals(refined.point)
@@ -246,7 +234,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
 
 def counted(problem: Problem, known: Uncertainty, found: StepCheck) -> Uncertainty:
     """Return ``known`` with intervals widened by the step's shift, unless the recordings contradict it."""
-    if found.note or found.gain < -STEP.clearly:
+    if found.note or found.gain < -CLEARLY:
         return known
     std = np.sqrt(np.diag(known.covariance)) + np.abs(found.bias[:-1]) / Z90
     known = known.widened_to(std)

@@ -12,36 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.intervals import MISMATCH
-from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
+from deal_hw.calib.fit.intervals import EVIDENCE
+from deal_hw.calib.fit.refinement import LOCAL_S, Refined, at_parameters, part_of, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.template import left_at_zero
 from deal_hw.types import FloatArray
 
+WINDOW_S = 0.2
+"""Windows of the fits [s]."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WiderSettings:
-    """Settings of :func:`fit_wider` and :func:`gain_of`.
+NOTICED = 0.03
+"""Least share of the held-out squared residual that more parameters explain [-]."""
 
-    Attributes:
-        window_s: Windows of the fits [s].
-        noticed: Least share of the held-out squared residual that more parameters explain [-].
-        most_inertia: Largest armature that is tried where the model has 0, in inertias of the joint [-]. A
-            real cart has six times its mass.
-        most_force: The same of dry friction, and of damping at the joint's rms speed, in rms forces that its
-            inertia needed [-].
-    """
+MOST_INERTIA = 20.0
+"""Largest armature that is tried where the model has 0, in inertias of the joint [-]. A real cart has six
+times its mass."""
 
-    window_s: float = 0.2
-    noticed: float = 0.03
-    most_inertia: float = 20.0
-    most_force: float = 5.0
-
-
-SETTINGS = WiderSettings()
+MOST_FORCE = 5.0
+"""The same of dry friction, and of damping at the joint's rms speed, in rms forces that its inertia needed
+[-]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +89,12 @@ def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
     """Fit with more parameters to a part of the recordings; None where it cannot be fitted."""
     wide = problem.with_more(more)
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
+    part = part_of(wide, min(LOCAL_S, total_s / 2))
     seen = [e.usable for e in part.episodes]
     rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
     try:
-        fit = refine(part, wide.space.nominal, problem.first_latency_s, (SETTINGS.window_s,))
-        length = samples_in(problem, SETTINGS.window_s)
+        fit = refine(part, wide.space.nominal, problem.first_latency_s, (WINDOW_S,))
+        length = samples_in(problem, WINDOW_S)
         prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
@@ -116,7 +107,7 @@ def wider_cost(problem: Problem, fits: bool) -> float:
     Each fit takes about half of its most iterations. The model as it is gets one, too.
     """
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    periods = min(REFINEMENT.local_s, total_s / 2) / problem.robot.step_s
+    periods = min(LOCAL_S, total_s / 2) / problem.robot.step_s
     # Derivatives by each value and start state, and a line of damped steps.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
     predictions = total_s / problem.robot.step_s
@@ -137,7 +128,7 @@ def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
     def gained(without: Refined) -> Gain | None:
         share = 1 - prediction.chi2 / without.chi2
         deviance = -without.normal.count * float(np.log(prediction.chi2 / without.chi2))
-        enough = deviance > MISMATCH.evidence and share > SETTINGS.noticed
+        enough = deviance > EVIDENCE and share > NOTICED
         return Gain(share, deviance, without.chi2) if enough else None
 
     try:
@@ -145,7 +136,7 @@ def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
         if gained(without) is None:
             return None
         # The wider fit may have left another minimum; a fit from there without more then predicts as well.
-        bare = refine(seen, fit.theta[: len(problem.space)], fit.latency_s, (SETTINGS.window_s,))
+        bare = refine(seen, fit.theta[: len(problem.space)], fit.latency_s, (WINDOW_S,))
         again = at_parameters(unseen, bare.theta, bare.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None
@@ -167,9 +158,9 @@ def zero_parameters(problem: Problem) -> list[Parameter]:
         accelerations = [np.gradient(v, e.period_s) for v, e in zip(moved, problem.episodes, strict=True)]
         push[j] = inertia[j] * np.std(np.concatenate(accelerations))
     most = {
-        "dof_armature": SETTINGS.most_inertia * inertia,
-        "dof_frictionloss": SETTINGS.most_force * push,
-        "dof_damping": SETTINGS.most_force * push / np.maximum(speed, 1e-9),
+        "dof_armature": MOST_INERTIA * inertia,
+        "dof_frictionloss": MOST_FORCE * push,
+        "dof_damping": MOST_FORCE * push / np.maximum(speed, 1e-9),
     }
     found = []
     for kind, elements in left_at_zero(robot.model).items():

@@ -20,14 +20,14 @@ from deal_hw.bench.rows import Cells, Row, Table, per_parameter, printed
 from deal_hw.bench.scores import check_truth
 from deal_hw.bench.settings import Go2Loop
 from deal_hw.calibration import CalibrationResult
-from deal_hw.control.loop import Outcome
-from deal_hw.control.velocity import ScriptVelocity
-from deal_hw.control.velocity_error import velocity_error
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth
 from deal_hw.errors import DealHwError
+from deal_hw.motions.scores.velocity_error import velocity_error
+from deal_hw.motions.velocity import ScriptVelocity
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingFiles

@@ -22,10 +22,10 @@ from deal_hw.bench.tables import line, print_summary
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
 from deal_hw.workflows.calibration.run import calibrate_episodes
@@ -113,7 +113,7 @@ def task_score(truth: CartpoleTruth, policy: Policy) -> tuple[float, float]:
 
     After an early end by the safety filter, the rest counts as fallen: pi rad, and a cart at rest.
     """
-    from deal_hw.control.balance import TASK_SECONDS, balance_result
+    from deal_hw.motions.scores.balance import TASK_SECONDS, balance_result
 
     virtual = VirtualCartpole(truth)
     angles, speeds = [], []

@@ -14,13 +14,13 @@ import numpy as np
 
 from deal_hw.bench.scores import check_truth
 from deal_hw.calib.data.problem import PopulationPolicy
-from deal_hw.control.excitation_level import ATTEMPTS
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
+from deal_hw.motions.excitation.level import ATTEMPTS
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps

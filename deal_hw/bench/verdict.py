@@ -20,7 +20,7 @@ from deal_hw.bench.rows import Cells, Table, printed
 from deal_hw.bench.scores import outside_range
 from deal_hw.bench.settings import Verdict
 from deal_hw.calib.report.verdict import trust
-from deal_hw.calib.validation.checks import SETTINGS
+from deal_hw.calib.validation.checks import MOST_CAUSES
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import (
@@ -130,7 +130,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             # Refused before any work: counts as red, and as named if the message names the fault.
             named = names(kind, fault, [], [str(err)])
             return row | {"colour": "refused", "named": named, "refusal": str(err)}
-    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[: SETTINGS.causes]]
+    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_CAUSES]]
     return row | {
         "causes": causes,
         "colour": trust(result).colour,

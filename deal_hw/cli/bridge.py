@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.claim import LocalClaim
-from deal_hw.control.realtime import FIFO_PRIORITY, priority
+from deal_hw.control.process.claim import LocalClaim
+from deal_hw.control.process.realtime import FIFO_PRIORITY, priority
 from deal_hw.drivers import claim_name
 from deal_hw.drivers.go2.bridge.bridge import COMMANDS, READABLE, Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig

@@ -88,7 +88,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     from rich.text import Text
 
     from deal_hw.calib.design.advice import next_step
-    from deal_hw.calib.fit.intervals import MISMATCH
+    from deal_hw.calib.fit.intervals import MISMATCH_CHI2
 
     table = Table(
         title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}",
@@ -128,7 +128,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         console.print(f"the data do not determine: {words}")
     dataset = result.provenance.get("dataset", "runs/first/dataset")
     # What a recording would tell was predicted by a model that does not explain this one.
-    first = "next, after the causes that alarms name" if result.chi2 > MISMATCH.chi2 else "next"
+    first = "next, after the causes that alarms name" if result.chi2 > MISMATCH_CHI2 else "next"
     for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
         console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))

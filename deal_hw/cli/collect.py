@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import tyro
 
 from deal_hw.cli.show import Terminal
-from deal_hw.control.excitation import RichConfig
-from deal_hw.control.loop import Outcome
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.workflows.collect import CollectSettings, run
 from deal_hw.workflows.running.report import RunReport
 

@@ -20,8 +20,8 @@ from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.cli.train import Train, train
-from deal_hw.control.excitation_level import LOWEST_LEVEL
 from deal_hw.data.run_folder import RunFolder
+from deal_hw.motions.excitation.level import LOWEST_LEVEL
 from deal_hw.types import FloatArray
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running.report import RunReport
@@ -166,8 +166,8 @@ def task_scores(run: RunReport, episodes: int) -> FloatArray:
 
     If the safety filter ended a run early, the missing part counts as fallen: pi rad, and a cart at rest.
     """
-    from deal_hw.control.balance import TASK_SECONDS, balance_result
     from deal_hw.data.recording.reader import read_trajectory
+    from deal_hw.motions.scores.balance import TASK_SECONDS, balance_result
 
     scores = []
     for path in run.paths:

@@ -18,14 +18,14 @@ from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, sh
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.train import Train, train
-from deal_hw.control.loop import Outcome
-from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.documentation import page
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.scores.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.types import FloatArray
 from deal_hw.workflows.emulation.go2 import read_track
 from deal_hw.workflows.emulation.process import EmulatorProcess

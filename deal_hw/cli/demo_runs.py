@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Final
 
-from deal_hw.control.loop import Outcome
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.errors import SafetyError, TransportError

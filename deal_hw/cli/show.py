@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from deal_hw.cli.design_excitation import note, print_design
 from deal_hw.cli.piped import PipedProgress
-from deal_hw.control.process_channel import MAKING_PASSIVE, RUNNING, Beat
+from deal_hw.control.process.channel import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.workflows.design_excitation import ExcitationReport
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.view import OnBeat, RunView, ignore

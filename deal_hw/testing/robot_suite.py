@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from deal_hw.control.behaviours import position_command
 from deal_hw.errors import (
     SafetyError,
     TransportError,
@@ -18,6 +17,7 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
+from deal_hw.motions.behaviours import position_command
 from deal_hw.robot import Robot
 from deal_hw.types import JointCommand, RobotState, Status
 

@@ -13,7 +13,7 @@ from typing_extensions import Self
 LATE = frozenset(
     {"state_stale", "action_late", "command_stale", "clock_jump", "device_watchdog", "device_disarmed"}
 )
-"""Flags of the safety module (see `deal_hw.control.safety`) that a busy computer can cause."""
+"""Flags of the safety module (see `deal_hw.control.safety.safety`) that a busy computer can cause."""
 
 
 @dataclass(frozen=True, slots=True)

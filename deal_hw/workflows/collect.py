@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from deal_hw.calibration import SHORTEST_S
-from deal_hw.control.excitation import RichConfig
-from deal_hw.control.excitation_level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
-from deal_hw.control.excitation_plan import FAMILIES, read_plan
+from deal_hw.motions.excitation.behaviours import RichConfig
+from deal_hw.motions.excitation.level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
+from deal_hw.motions.excitation.plan import FAMILIES, read_plan
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import OWN_ROBOT, File, RunSeconds, Seed, from_settings, given, refuse
 from deal_hw.workflows.running.plan import RunPlan

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 
 from deal_hw.calibration import LATENCY_RANGE_S
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.excitation.plan import (
     OF_FAMILY,
     ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
     make_plan,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.ranges import Range, check_ranges
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, from_settings, given, refuse

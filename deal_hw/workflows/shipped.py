@@ -8,9 +8,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
-from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import Behaviour, PolicyBehaviour
 
 SHIPPED: Final[Mapping[str, str]] = {
     "allegro": "allegro_turn",

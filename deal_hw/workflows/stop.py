@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.claim import LocalClaim
-from deal_hw.control.passive import PassiveConfig, make_passive
-from deal_hw.control.run_note import FoundRun, find_runs
+from deal_hw.control.process.claim import LocalClaim
+from deal_hw.control.process.run_note import FoundRun, find_runs
+from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.drivers import claim_name, default_transport, make_robot, wire_claim
 from deal_hw.errors import ConfigurationError, DealHwError, PortBusyError
 from deal_hw.ranges import Checked, Range

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.clock_check import judge_clock
-from deal_hw.control.leg_checks import tilt
+from deal_hw.control.safety.leg_checks import tilt
+from deal_hw.data.checks.clock_rate import judge_clock
 from deal_hw.documentation import page
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state

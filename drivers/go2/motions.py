@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from deal_hw.control.excitation_limits import fit_to_limits
-from deal_hw.control.excitation_plan import ExcitationPlan
-from deal_hw.control.waveforms import Steps
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
+from deal_hw.motions.excitation.limits import fit_to_limits
+from deal_hw.motions.excitation.plan import ExcitationPlan
+from deal_hw.motions.excitation.waveforms import Steps
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.legged.kinematics import standing_targets
 from deal_hw.types import FloatArray

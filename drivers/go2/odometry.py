@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.control.velocity_error import Track
 from deal_hw.drivers.go2.descriptions.leg_geometry import (
     WEIGHT_N,
     foot_jacobians,
     foot_loads,
     foot_positions,
 )
+from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.sim.legged.velocity_filter import filtered_velocity, rotated, standing_feet
 from deal_hw.types import FloatArray, Trajectory
 

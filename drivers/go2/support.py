@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.leg_checks import UNIT_TOLERANCE, tilt
+from deal_hw.control.safety.leg_checks import UNIT_TOLERANCE, tilt
 from deal_hw.drivers.go2.descriptions.driver import HELD_TILT_RAD
 from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_loads, foot_positions
 from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame

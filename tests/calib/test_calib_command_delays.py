@@ -20,7 +20,7 @@ from deal_hw.calib.fit.command_delays import (
     moved_commands,
     with_command_delays,
 )
-from deal_hw.calib.fit.intervals import MISMATCH, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
@@ -159,7 +159,7 @@ def test_a_fit_of_a_part_is_judged_by_that_part(noisy: Case, noisy_problem: Prob
     """A local fit that explains nothing ends after a part of the recordings, with that part's windows."""
     usable = [np.arange(len(e.sample)) < len(e.sample) // 2 for e in noisy_problem.episodes]
     found = refine(noisy_problem.part(usable), noisy.theta, noisy.latency_s, (0.2,), 1)
-    assert fit_delays(noisy_problem, found, MISMATCH.evidence) is None
+    assert fit_delays(noisy_problem, found, EVIDENCE) is None
 
 
 def test_a_cause_is_whitened_as_the_residual_is(noisy_problem: Problem, noisy_refined: Refined) -> None:
@@ -216,7 +216,7 @@ def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     space = problem.space
     constant = refine(problem, theta, jittering.latency_s)
     assert constant.chi2 > 2
-    late = fit_delays(problem, constant, MISMATCH.evidence)
+    late = fit_delays(problem, constant, EVIDENCE)
     assert late is not None and late.fit.chi2 < 1.1
     assert late.found.std_s == pytest.approx(1.12e-3, rel=0.5)
     known = uncertainty_at(late.problem, with_rows(late.fit))

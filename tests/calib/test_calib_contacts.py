@@ -10,7 +10,7 @@ import pytest
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import Sticking, settle
-from deal_hw.calib.fit.intervals import MISMATCH, correlation_time
+from deal_hw.calib.fit.intervals import CORRELATION_SAMPLES, MISMATCH_CHI2, correlation_time
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.validation.checks import unexplained
@@ -47,7 +47,7 @@ def test_smoothed_start_states_settle_to_the_noise(
     assert cost == pytest.approx(windows[1].sum())
     normal = shooting.normal(after)
     assert cost / normal.count < 1.25 < 3.0 < windows[0].sum() / normal.count
-    assert correlation_time(normal.residual) < MISMATCH.correlation_samples
+    assert correlation_time(normal.residual) < CORRELATION_SAMPLES
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three
     latency_s = sensed.latency_s
     problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1, fixed_latency_s=latency_s)
     found = refine(problem, truth * [1.08, 0.92, 1.08], latency_s, (0.4,), iterations=8)
-    assert found.chi2 < MISMATCH.chi2
+    assert found.chi2 < MISMATCH_CHI2
     assert not unexplained(found)
     np.testing.assert_allclose(found.theta, truth, rtol=0.05)
 
@@ -83,10 +83,7 @@ def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Know
     shooting = Shooting(problem, 20)
     point, cost = settle(shooting, shooting.start(truth, 0.0), 6)
     normal = shooting.normal(point)
-    assert (
-        cost / normal.count > MISMATCH.chi2
-        or correlation_time(normal.residual) > MISMATCH.correlation_samples
-    )
+    assert cost / normal.count > MISMATCH_CHI2 or correlation_time(normal.residual) > CORRELATION_SAMPLES
 
 
 def test_backward_differences_agree_with_forward_ones(small_problem: Callable[..., Problem]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import MISMATCH, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.report.verdict import trust
@@ -21,8 +21,7 @@ from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import Evidence, evidence, find_play, fit_play, name_causes
-from deal_hw.calib.validation.random_delay import SETTINGS as RANDOM_DELAY
-from deal_hw.calib.validation.random_delay import random_delay
+from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
 from deal_hw.calib.validation.residual_place import densest_stretch
 from deal_hw.calib.validation.signatures import (
     Cause,
@@ -155,7 +154,7 @@ def test_two_causes_are_named_and_the_larger_first() -> None:
     v, _ = _motion()
     found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
     assert [f.code for f in found] == ["load", "damping"]
-    assert found[0].deviance > found[1].deviance > MISMATCH.evidence
+    assert found[0].deviance > found[1].deviance > EVIDENCE
 
 
 def _with_masses(wrong: FloatArray, **effect: FloatArray) -> Evidence:
@@ -360,7 +359,7 @@ def test_random_delays_push_where_commands_change() -> None:
     """Impulses of 0.5 (standard deviation) times what each command changes: 0.5 s in these units."""
     rows, answers = _pushed(lambda change, rng: 0.5 * change * rng.standard_normal(change.shape))
     found = random_delay(rows, answers, PERIOD_S)
-    assert found is not None and found.gain > MISMATCH.evidence
+    assert found is not None and found.gain > EVIDENCE
     assert found.std_s == pytest.approx(0.5, rel=0.15)
 
 
@@ -375,7 +374,7 @@ def test_few_windows_end_in_an_answer_or_none(windows: int) -> None:
         answer, response=answer.response[:, :windows], change=answer.change[:windows]
     )
     found = random_delay([few], [answers], PERIOD_S)
-    assert (found is None) == (windows < RANDOM_DELAY.fewest)
+    assert (found is None) == (windows < FEWEST_WINDOWS)
 
 
 @pytest.mark.parametrize("slow", [False, True])
@@ -397,7 +396,7 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
         return 0.5 * change * rng.standard_normal(change.shape) + 0.18 * rng.standard_normal(change.shape)
 
     found = random_delay(*_pushed(both), PERIOD_S)
-    assert found is not None and found.gain > MISMATCH.evidence
+    assert found is not None and found.gain > EVIDENCE
     assert found.std_s == pytest.approx(0.5, rel=0.2)
 
 
@@ -519,7 +518,7 @@ def test_play_is_found_and_measured(
     cause = found.diagnosis
     assert cause.code == "backlash" and cause.subject == ("pivot",)
     assert "0.06 rad at pivot" in cause.seen and "servo_play" in cause.do
-    assert cause.share > diagnosis.SETTINGS.decisive
+    assert cause.share > diagnosis.DECISIVE
 
 
 @pytest.mark.slow
@@ -537,7 +536,7 @@ def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault 
         threads=1,
     )
     assert result.space.names == (*problem.space.names, "pivot.play") and result.steps < 5_000_000
-    assert result.provenance["search"] == "local fit" and result.chi2 < MISMATCH.chi2
+    assert result.provenance["search"] == "local fit" and result.chi2 < MISMATCH_CHI2
     true = np.array([robot.truth.get(name, PLAY) for name in result.space.names])
     np.testing.assert_allclose(result.estimate[-1], PLAY, rtol=0.02)
     inside = (result.interval[:, 0] <= true) & (true <= result.interval[:, 1])

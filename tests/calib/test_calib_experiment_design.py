@@ -12,7 +12,7 @@ import pytest
 from numpy.linalg import inv
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.design.advice import AdviceSettings, advise, menu_designs, next_step, predict_menu
+from deal_hw.calib.design.advice import advise, menu_designs, next_step, predict_menu
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.design.excitation_search import SearchSettings, score, search_excitation
 from deal_hw.calib.design.experiment_design import (
@@ -24,13 +24,13 @@ from deal_hw.calib.design.experiment_design import (
 )
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, Identifiability
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.cartpole.description import k9_space
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.excitation.plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray
@@ -342,9 +342,8 @@ def prior(parameters: ParameterSpace, recorded: FloatArray) -> Prior:
 def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:
     """An effort limit that was never reached needs a recording that reaches it; nothing else is advised."""
     parameters = space("mass", "damping", "effort_limit")
-    settings = AdviceSettings(seconds=1.6)
     found = result(parameters, np.array([0.02, 0.05, 0.6]))
-    (advice,) = advise(servo, found, seen(0.02, 0.05, 2.0), settings=settings, threads=1)
+    (advice,) = advise(servo, found, seen(0.02, 0.05, 2.0), seconds=1.6, threads=1)
     assert advice.parameter == "slide.effort_limit"
     assert advice.after < 0.1 * advice.before
     said = f"record {advice.excitation}: slide.effort_limit goes from 60 % to {100 * advice.after:.2g} %"
@@ -354,12 +353,11 @@ def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:
 def test_an_interval_that_model_error_widened_shrinks_as_if_it_were_noise(servo: RobotModel) -> None:
     """What the model lacks will be in the next recording, too: the promise is a factor on the interval."""
     parameters = space("mass", "damping", "effort_limit")
-    settings = AdviceSettings(seconds=1.6)
-    designs = menu_designs(servo.description, settings=settings)
+    designs = menu_designs(servo.description, seconds=1.6)
     menu = {name: make_plan(servo.description, design) for name, design in designs.items()}
     recorded = seen(0.02, 0.3, 0.1)
     found = result(parameters, np.array([0.02, 0.3, 0.6]))
-    advice = {one.parameter: one for one in advise(servo, found, recorded, settings=settings, threads=1)}
+    advice = {one.parameter: one for one in advise(servo, found, recorded, seconds=1.6, threads=1)}
     before = prior(parameters, recorded)
     alone = predict_menu(servo, found.distribution(), menu, before, threads=1)
     assert sum(p.std[2] > 0.05 for p in alone.values()) > 1
@@ -376,9 +374,8 @@ def test_an_interval_that_model_error_widened_shrinks_as_if_it_were_noise(servo:
 def test_advice_says_where_no_excitation_helps(servo: RobotModel) -> None:
     """Mass and armature of one slide cannot be told apart by any motion; a calibrated robot needs nothing."""
     parameters = space("mass", "armature")
-    settings = AdviceSettings(seconds=1.6)
     open_ = result(parameters, np.array([0.6, 0.7]))
-    advice = {a.parameter: a for a in advise(servo, open_, seen(9.0, 9.0), settings=settings, threads=1)}
+    advice = {a.parameter: a for a in advise(servo, open_, seen(9.0, 9.0), seconds=1.6, threads=1)}
     assert advice["slide.armature"].excitation == ""
     assert "measure it by other means" in advice["slide.armature"].sentence
     rows = [one.to_json() for one in advice.values()]

@@ -30,7 +30,7 @@ from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings, _Box
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
-from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.eki import NEAR_SPREAD, Eki
 from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
 from deal_hw.calib.validation.checks import Validation
@@ -568,7 +568,7 @@ def test_a_brief_search_ends_in_the_refinements_basin(search: Eki | Deal, popula
     problem = Problem(d.robot, d.space, [d.fit], threads=1)
     budget = Budget(population=population, generations=30, brief=True)
     found = search.run(problem, budget, np.random.default_rng(0))
-    assert found.trace[-1]["spread"] < search.settings.near_spread
+    assert found.trace[-1]["spread"] < NEAR_SPREAD
     assert len(found.trace) <= 15
     refined = refine(problem, found.estimate, found.latency_s)
     best = refine(problem, d.theta, d.latency_s)

@@ -16,11 +16,11 @@ from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate_output import print_result
 from deal_hw.cli.main import main
-from deal_hw.control.excitation_plan import read_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.drivers.go2.descriptions.floor import parameter_space
 from deal_hw.install import install_line
+from deal_hw.motions.excitation.plan import read_plan
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align

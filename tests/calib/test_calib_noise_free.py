@@ -11,7 +11,7 @@ import pytest
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import MISMATCH
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.validation.time_steps import scan_latency
 from deal_hw.errors import InsufficientDataError
@@ -62,7 +62,7 @@ def test_a_window_that_nothing_explains_bends_no_parameter_and_is_not_silenced(s
     problem = Problem(seen.robot, seen.space, [wrong], threads=1, fixed_latency_s=0.0)
     found = refine(problem, seen.truth * [1.1, 0.9, 1.1], 0.0)
     np.testing.assert_allclose(found.theta, seen.truth, rtol=1e-4)
-    assert found.chi2 > MISMATCH.chi2
+    assert found.chi2 > MISMATCH_CHI2
 
 
 def test_the_scan_takes_the_refinement_itself_at_its_own_step(seen: Seen) -> None:

@@ -18,9 +18,9 @@ from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.time_steps import (
-    STEP,
+    CLEARLY,
+    MOST_STEPS,
     StepCheck,
-    StepSettings,
     check_step,
     counted,
     halved,
@@ -67,7 +67,7 @@ def recording(step_s: float) -> str:
 
 
 def checked(
-    folder: Path, step_s: float, settings: StepSettings | None = None
+    folder: Path, step_s: float, most_steps: float = MOST_STEPS
 ) -> tuple[Problem, Uncertainty, StepCheck]:
     """Return problem, what is known and what half the step says, of data with a step."""
     (folder / "hinge.xml").write_text(HINGE.format(step=STEP_S, damping="0.07", armature="0.003"))
@@ -87,7 +87,7 @@ def checked(
     return (
         problem,
         uncertainty_at(problem, fit, fixed_latency=True),
-        check_step(problem, fit, settings),
+        check_step(problem, fit, most_steps),
     )
 
 
@@ -98,7 +98,7 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
     assert not inside.all()
     wider = counted(problem, known, found).interval
     assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
-    assert found.gain > STEP.clearly
+    assert found.gain > CLEARLY
     (alarm,) = step_alarm(known, found)
     # A shift that hardly changes predictions widens the intervals without an alarm.
     same = dataclasses.replace(found, share=0.02)
@@ -114,14 +114,14 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
     """The finer step explains them worse: nothing is said, no interval is widened."""
     problem, known, found = checked(tmp_path, STEP_S)
-    assert found.gain < -STEP.clearly and step_alarm(known, found) == ()
+    assert found.gain < -CLEARLY and step_alarm(known, found) == ()
     assert counted(problem, known, found) is known
     assert np.all(known.interval[:, 0] <= TRUTH) and np.all(known.interval[:, 1] >= TRUTH)
 
 
 def test_a_check_that_would_take_too_long_says_so(tmp_path: Path) -> None:
     """Nothing is compared, nothing is widened, and the provenance says why."""
-    problem, known, found = checked(tmp_path, STEP_S, StepSettings(most_steps=10.0))
+    problem, known, found = checked(tmp_path, STEP_S, most_steps=10.0)
     assert "it would take" in found.to_json()["note"]
     assert counted(problem, known, found) is known and step_alarm(known, found) == ()
 

@@ -17,9 +17,17 @@ from scipy.signal import lfilter
 from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.checks import check_excitation
-from deal_hw.calib.data.noise import DataSettings, noise_model, white_noise_std
+from deal_hw.calib.data.noise import HELD_STD, noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
+from deal_hw.calib.fit.intervals import (
+    CORRELATION_SAMPLES,
+    FALSE_ALARMS,
+    NEAR_STRETCH,
+    WHITE_SAMPLES,
+    correlation_time,
+    intervals,
+    uncertainty,
+)
 from deal_hw.calib.fit.null_space import NullSpace, null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
@@ -62,11 +70,11 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
         return dataclasses.replace(found, normal=normal, chi2=float(np.mean(residual**2)))
 
     assert correlation_time((pattern,)) == pytest.approx(1.5, rel=0.1)
-    assert conclusive(problem, leaving(white), MISMATCH.white_samples)
+    assert conclusive(problem, leaving(white), WHITE_SAMPLES)
     assert conclusive(problem, leaving(pattern))
-    assert not conclusive(problem, leaving(pattern), MISMATCH.white_samples)
+    assert not conclusive(problem, leaving(pattern), WHITE_SAMPLES)
     # What is far below the noise needs no explanation.
-    assert conclusive(problem, leaving(0.5 * pattern), MISMATCH.white_samples)
+    assert conclusive(problem, leaving(0.5 * pattern), WHITE_SAMPLES)
 
 
 def test_a_local_fit_is_reported_step_by_step(small_problem: Callable[..., Problem]) -> None:
@@ -309,7 +317,7 @@ def test_a_joint_at_rest_has_no_vote() -> None:
     assert white_noise_std([held, moved])[0] == found
     assert white_noise_std([_encoder(10.0, rest_s=60.0)])[0] == pytest.approx(found, rel=0.1)
     # Alone it shows nothing: it has the noise of a coarse encoder.
-    assert white_noise_std([held])[0] == DataSettings().held_std
+    assert white_noise_std([held])[0] == HELD_STD
 
 
 def test_timing_jitter_is_told_from_noise() -> None:
@@ -396,7 +404,7 @@ def test_an_alarm_of_autocorrelation_is_no_chance(terms: int, least: float, most
     alarms = []
     for w in white:
         summed = np.sum([w[:, k : k + 100] for k in range(terms)], axis=0)
-        alarms.append(correlation_time((summed,), MISMATCH.false_alarms) > MISMATCH.correlation_samples)
+        alarms.append(correlation_time((summed,), FALSE_ALARMS) > CORRELATION_SAMPLES)
     assert least <= np.mean(alarms) <= most
 
 
@@ -404,7 +412,7 @@ def test_an_alarm_of_autocorrelation_is_no_chance(terms: int, least: float, most
 def test_many_short_recordings_are_no_less_white_than_a_long_one(seed: int) -> None:
     """Ten of 480 samples: the worst of ten is beyond two standard errors now and then, not all together."""
     white = np.random.default_rng(seed).normal(size=(10, 3, 160, 2))
-    assert correlation_time(tuple(white)) < MISMATCH.white_samples
+    assert correlation_time(tuple(white)) < WHITE_SAMPLES
 
 
 def _two(low: float = 0.2, high: float = 5.0) -> ParameterSpace:
@@ -443,7 +451,7 @@ def test_k11_names_its_null_directions_on_real_information(noisy: Case) -> None:
     assert noisy.truth is not None
     theta = np.array([noisy.truth.parameters[name] for name in space.names])
     start = shooting.start(theta, noisy.latency_s, [noisy.fit_truth])
-    hessian = shooting.normal(start, stretch=SETTINGS.near, central=True).hessian
+    hessian = shooting.normal(start, stretch=NEAR_STRETCH, central=True).hessian
     words = _unseen(space, hessian[:-1, :-1])
     assert len(words) == 2
     assert all("mass" in text for text in words)

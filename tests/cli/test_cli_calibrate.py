@@ -14,12 +14,12 @@ from fakes.simulated_episode import simulated_episode
 from deal_hw.calibration import read_result
 from deal_hw.cli.calibrate import Calibrate, calibrate, calibrate_or_write_parameters
 from deal_hw.cli.calibrate_output import print_files
-from deal_hw.control.behaviours import Behaviour, HoldBehaviour
-from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
+from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
+from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
 from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.settings import Recordings

@@ -84,17 +84,3 @@ def test_a_held_out_recording_worse_than_nominal_is_red(calibrated: Calibrated, 
     code, said, _ = calibrated(DAMPING, "--holdout", str(tmp_path / "other.csv"))
     assert code == EXIT_OK and "Traceback" not in said
     assert "red: " in said and "is worse. Do not use it. Check units" in said
-
-
-def test_a_step_that_cannot_be_halved_in_time_is_said(
-    calibrated: Calibrated, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whether the physics step is fine enough stays open, and terminal and result say so."""
-    from deal_hw.calib.validation import time_steps
-
-    monkeypatch.setattr(time_steps, "STEP", time_steps.StepSettings(most_steps=10.0))
-    code, said, folder = calibrated(DAMPING)
-    assert code == EXIT_OK and "Traceback" not in said
-    assert "not compared: it would take" in said
-    note = json.loads((folder / "result.json").read_text())["provenance"]["physics_step"]["note"]
-    assert note.startswith("not compared: it would take")

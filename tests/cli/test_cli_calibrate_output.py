@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from deal_hw.calib.validation.time_steps import StepCheck
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate_output import ALARM_LINES, other_alarms, print_result, print_verdict
 from deal_hw.findings import Finding
@@ -54,6 +55,15 @@ def test_the_first_alarm_is_the_last_thing_printed(capsys: pytest.CaptureFixture
         < said.index("first alarm")
     )
     assert f"first alarm: {CAUSE.seen} {CAUSE.means}" in said
+
+
+def test_a_physics_step_that_was_not_compared_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """The reason of the check's note, with the step that it is about."""
+    check = StepCheck(0.002, note="not compared: it would take 4e+08 physics steps")
+    step = {"physics_step": check.to_json()}
+    print_result(dataclasses.replace(doubtful(), provenance=step), "record one")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "check of the physics step, 2 ms: not compared: it would take 4e+08 physics steps" in said
 
 
 def test_alarms_with_one_remedy_are_one_entry() -> None:

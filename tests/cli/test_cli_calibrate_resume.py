@@ -19,10 +19,10 @@ from deal_hw.calib.report import page
 from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli import calibrate as verb
 from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
-from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
 from deal_hw.workflows.calibration.best_so_far import BestSoFar
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 

@@ -26,13 +26,13 @@ from deal_hw.cli.demo import Demo, Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.deploy import Deploy
 from deal_hw.cli.main import main
-from deal_hw.control.loop import Outcome
-from deal_hw.control.posture import PostureConfig
-from deal_hw.control.process_channel import RUNNING, Beat
-from deal_hw.control.supervisor import Supervisor
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import RUNNING, Beat
+from deal_hw.control.process.supervisor import Supervisor
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
+from deal_hw.motions.posture import PostureConfig
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport

@@ -15,13 +15,13 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Identifiability
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.control.excitation_level import ExcitationLevelSearch
-from deal_hw.control.loop import Outcome
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import InsufficientDataError
+from deal_hw.motions.excitation.level import ExcitationLevelSearch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
 from deal_hw.workflows.calibration.dataset import choose_episodes

@@ -15,10 +15,8 @@ import pytest
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
 from deal_hw.clock import VirtualClock
-from deal_hw.control.excitation_limits import room
-from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
-from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -32,6 +30,8 @@ from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth
 from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.excitation.limits import room
+from deal_hw.motions.excitation.plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness", "damping"))

@@ -13,7 +13,7 @@ from deal_hw.calibration import Progress
 from deal_hw.cli import bench, calibrate_output, design_excitation, piped, show, train
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.clock import VirtualClock
-from deal_hw.control.process_channel import HOMING, MAKING_PASSIVE, RUNNING, Beat
+from deal_hw.control.process.channel import HOMING, MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.training import TrainingStatus
 
 

@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.main import EXIT_ERROR, VERBS, main
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import ExcitationDesign, make_plan
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.install import install_line
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.excitation.plan import ExcitationDesign, make_plan
 from deal_hw.workflows import shipped
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.train import udr_distribution

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.control.waveforms import Sweep, random_steps
 from deal_hw.data.export.lerobot import export_lerobot
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.grid import to_trajectories
@@ -40,6 +39,7 @@ from deal_hw.errors import (
     TransportError,
     UnknownNameError,
 )
+from deal_hw.motions.excitation.waveforms import Sweep, random_steps
 from deal_hw.parameters import Parameter
 from deal_hw.reading import object_of, texts
 from deal_hw.schema import from_values

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.control.clock_check import judge_clock
+from deal_hw.data.checks.clock_rate import judge_clock
 from deal_hw.findings import Severity
 
 S = 1_000_000_000

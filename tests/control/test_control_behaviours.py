@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 from fakes.linear_policy import LinearPolicy, feedback_spec
 
-from deal_hw.control.behaviours import HoldBehaviour, PolicyBehaviour, ReplayBehaviour
-from deal_hw.control.centring import Centring
-from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
+from deal_hw.motions.behaviours import HoldBehaviour, PolicyBehaviour, ReplayBehaviour
+from deal_hw.motions.excitation.behaviours import (
+    ChirpBehaviour,
+    ChirpConfig,
+    RichBehaviour,
+    RichConfig,
+    Segment,
+)
+from deal_hw.motions.excitation.centring import Centring
 from deal_hw.types import FloatArray, RobotState, Status, Trajectory
 
 SPEC = feedback_spec(DESCRIPTION)

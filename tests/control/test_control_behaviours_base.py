@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from deal_hw.control.behaviours import PolicyBehaviour
-from deal_hw.control.velocity import FixedVelocity
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import PolicyError, PolicyMismatchError
+from deal_hw.motions.behaviours import PolicyBehaviour
+from deal_hw.motions.velocity import FixedVelocity
 from deal_hw.policy import Observation, ObservationBuilder, ObservationTerm, PolicySpec
 from deal_hw.types import BodyState, FloatArray, RobotState, Status
 

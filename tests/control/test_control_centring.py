@@ -8,12 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from deal_hw.control import excitation, excitation_plan
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.excitation import behaviours as excitation
+from deal_hw.motions.excitation import plan as excitation_plan
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.excitation.plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.types import RobotState, Status
 
 pytestmark = pytest.mark.real_time

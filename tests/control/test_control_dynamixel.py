@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.control.loop import Outcome
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.types import Status, Trajectory
 from deal_hw.workflows.emulation.process import EmulatorProcess

@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
-from deal_hw.control.excitation_level import (
+from deal_hw.control.safety.filter import SafetyFilter
+from deal_hw.data.recording.excitation import Excitation
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.errors import ConfigurationError
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig, Segment
+from deal_hw.motions.excitation.level import (
     HIGHEST_LEVEL,
     LOWEST_LEVEL,
     ExcitationLevelSearch,
     shortfalls,
     with_excitation_level,
 )
-from deal_hw.control.safety_filter import SafetyFilter
-from deal_hw.data.recording.excitation import Excitation
-from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.errors import ConfigurationError
 from deal_hw.types import RobotState, Status
 
 AT_REST = RobotState(np.zeros(2), np.zeros(2), np.zeros(2), 0, 0, 0, -1, -1, Status.ARMED)

@@ -12,10 +12,9 @@ from typing import Any
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.passive import PassiveConfig, make_passive
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.safety.passive import PassiveConfig, make_passive
+from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
@@ -29,6 +28,7 @@ from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError
+from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.transport import Message
 from deal_hw.types import RobotState, Status
 

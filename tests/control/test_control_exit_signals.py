@@ -19,15 +19,15 @@ from fakes.go2 import STIFF, FakeBench
 
 from deal_hw import signals
 from deal_hw.clock import VirtualClock
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.passive import PassiveConfig, make_passive
-from deal_hw.control.realtime import PARENT_DIED, kill_self_after, parent_is_gone
-from deal_hw.control.safety import Safety
-from deal_hw.control.supervisor import PATIENCE_S, Supervisor
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.process.realtime import PARENT_DIED, kill_self_after, parent_is_gone
+from deal_hw.control.process.supervisor import PATIENCE_S, Supervisor
+from deal_hw.control.safety.passive import PassiveConfig, make_passive
+from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.go2.messages.low_command import decode_low_command
 from deal_hw.drivers.go2.robot import Go2OnStandRobot
+from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.workflows.running import control_process
 from deal_hw.workflows.running.control_process import _Stopper
 
@@ -179,7 +179,8 @@ def test_a_child_that_starts_is_not_ended_before_it_can_act() -> None:
 def test_the_last_resort_needs_no_signal_that_others_could_send() -> None:
     """A process that hangs in C, with the interpreter's lock, is killed; SIGALRM does not end it."""
     program = (
-        "import ctypes, os, signal; from deal_hw import signals; from deal_hw.control.realtime import *; "
+        "import ctypes, os, signal; from deal_hw import signals; "
+        "from deal_hw.control.process.realtime import *; "
         "signals.take(lambda number: print(number, flush=True)); kill_self_after(0.3); "
         "os.kill(os.getpid(), signal.SIGALRM); signal.pthread_sigmask(signal.SIG_BLOCK, signals.ENDING); "
         "[ctypes.PyDLL(None).sleep(600) for _ in range(9)]"
@@ -443,7 +444,7 @@ class Child:
 
 def test_every_pair_of_signals_asks_once_and_kills_only_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGTERM and SIGHUP of an ending session are one request: the control process is damping then."""
-    monkeypatch.setattr("deal_hw.control.supervisor.hurry", lambda pid: None)
+    monkeypatch.setattr("deal_hw.control.process.supervisor.hurry", lambda pid: None)
     for first in SENT:
         for second in SENT:
             clock, child = VirtualClock(0), Child()

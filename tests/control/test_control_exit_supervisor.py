@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control import supervisor as module
-from deal_hw.control.process_channel import Beat
-from deal_hw.control.realtime import SUPERVISOR_PRIORITY
-from deal_hw.control.supervisor import ChildEnd, Supervisor
+from deal_hw.control.process import supervisor as module
+from deal_hw.control.process.channel import Beat
+from deal_hw.control.process.realtime import SUPERVISOR_PRIORITY
+from deal_hw.control.process.supervisor import ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
 from deal_hw.signals import OPERATOR, SUSPENDED
 

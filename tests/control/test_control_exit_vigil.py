@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.claim import LocalClaim
-from deal_hw.control.process_channel import HEARTBEAT, StatusReceiver, StatusSender, socket_pair
-from deal_hw.control.realtime import priority
-from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
+from deal_hw.control.process.channel import HEARTBEAT, StatusReceiver, StatusSender, socket_pair
+from deal_hw.control.process.claim import LocalClaim
+from deal_hw.control.process.realtime import priority
+from deal_hw.control.process.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 from deal_hw.errors import PortBusyError
 
 pytestmark = pytest.mark.real_time
@@ -117,7 +117,7 @@ def test_the_kernels_wait_is_what_is_left_of_the_time(monkeypatch: pytest.Monkey
         waits.append(timeout_s)
         return [], [], []
 
-    monkeypatch.setattr("deal_hw.control.vigil.select.select", wait)
+    monkeypatch.setattr("deal_hw.control.process.vigil.select.select", wait)
     rig.vigil._clock = Scripted()
     rig.vigil.start()
     assert rig.silent.wait(PATIENCE_S)
@@ -211,7 +211,7 @@ def test_a_claim_says_with_what_command_it_is_held(
     """Six words at most, without their folders, 120 letters in all; an empty word counts and is not shown."""
     holder = tmp_path / "holder.py"
     holder.write_text(
-        "import sys\nfrom deal_hw.control.claim import LocalClaim\n"
+        "import sys\nfrom deal_hw.control.process.claim import LocalClaim\n"
         "with LocalClaim('a robot'):\n    print(flush=True)\n    sys.stdin.read()\n"
     )
     command = [sys.executable, str(holder), *arguments]

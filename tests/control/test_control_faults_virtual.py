@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 from fakes.linear_policy import LinearPolicy, feedback_spec
 
-from deal_hw.control.behaviours import PolicyBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.types import FloatArray
 
 MS = 1_000_000

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from fakes.linear_policy import LinearPolicy, feedback_spec
 
-from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
-from deal_hw.control.passive import PassiveConfig
-from deal_hw.control.planned_end import ENDING_EVENT, PlannedEnd
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.safety.passive import PassiveConfig
+from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
+from deal_hw.motions.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
+from deal_hw.motions.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 

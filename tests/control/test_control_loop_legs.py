@@ -12,12 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.behaviours import Behaviour, HoldBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
-from deal_hw.control.passive import PassiveConfig
-from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.process_channel import RUNNING
-from deal_hw.control.safety import CycleInput, Safety, SafetyDecision
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
+from deal_hw.control.process.channel import RUNNING
+from deal_hw.control.safety.passive import PassiveConfig
+from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision
 from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
@@ -30,6 +28,8 @@ from deal_hw.drivers.go2.messages.low_command import decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.transport import Message
 from deal_hw.types import JointCommand, RobotState, Status
 

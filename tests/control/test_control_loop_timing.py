@@ -9,7 +9,7 @@ from array import array
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop_timing import LoopTiming, LoopTimingReport, Spread
+from deal_hw.control.loop.timing import LoopTiming, LoopTimingReport, Spread
 from deal_hw.errors import ConfigurationError
 
 MS = 1_000_000

@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.loop import Outcome
-from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.velocity import FixedVelocity, SlowedVelocity
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import HoldBehaviour
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.motions.velocity import FixedVelocity, SlowedVelocity
 from deal_hw.types import BodyState, FloatArray, JointCommand, RobotState, Status
 
 REST = (0.0, 1.36, -2.65) * 4

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.control.process_channel import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
-from deal_hw.control.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, hurry
+from deal_hw.control.process.channel import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
+from deal_hw.control.process.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, hurry
 from deal_hw.data.recording.record import CycleRecord, decode
 from deal_hw.errors import DatasetError
 from deal_hw.transport import Message
@@ -115,7 +115,7 @@ def test_what_the_system_refuses_is_a_warning_with_its_remedy(monkeypatch: pytes
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr("deal_hw.control.realtime._lock_memory", lambda: "Cannot allocate memory")
+    monkeypatch.setattr("deal_hw.control.process.realtime._lock_memory", lambda: "Cannot allocate memory")
     granted = become_realtime()
     assert granted.scheduling == "default"
     assert "SCHED_FIFO was refused (Operation not permitted)" in granted.warnings[0]

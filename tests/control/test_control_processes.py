@@ -24,8 +24,8 @@ from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.replay import Replay, replay
-from deal_hw.control.loop import Outcome
-from deal_hw.control.process_channel import RUNNING, Beat
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.drivers.cartpole.description import DESCRIPTION

@@ -18,13 +18,13 @@ import pytest
 from fakes.logind import FakeLogind
 
 from deal_hw.cli.show import Terminal
-from deal_hw.control.loop import Outcome
-from deal_hw.control.planned_end import ENDING_EVENT
-from deal_hw.control.posture import PostureConfig
-from deal_hw.control.process_channel import RUNNING, Beat
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError
+from deal_hw.motions.planned_end import ENDING_EVENT
+from deal_hw.motions.posture import PostureConfig
 from deal_hw.signals import reason
 from deal_hw.types import Status
 from deal_hw.workflows.emulation.process import EmulatorProcess

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.control.replay_error import replay_error
+from deal_hw.motions.scores.replay_error import replay_error
 from deal_hw.types import Trajectory
 
 COMMANDS = 50

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.control.safety import CycleInput, Safety, SafetyConfig, SafetyFlags, SafetyState
-from deal_hw.control.safety_filter import SafetyFilter
-from deal_hw.control.safety_machine import SafetyMachine
+from deal_hw.control.safety.filter import SafetyFilter
+from deal_hw.control.safety.machine import SafetyMachine
+from deal_hw.control.safety.safety import CycleInput, Safety, SafetyConfig, SafetyFlags, SafetyState
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import SafetyError

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.control.leg_checks import LegChecks
-from deal_hw.control.safety import CycleInput, Safety, SafetyConfig, SafetyState
-from deal_hw.control.safety_filter import SafetyFilter, keep_effort
-from deal_hw.control.safety_machine import SafetyFlags
+from deal_hw.control.safety.filter import SafetyFilter, keep_effort
+from deal_hw.control.safety.leg_checks import LegChecks
+from deal_hw.control.safety.machine import SafetyFlags
+from deal_hw.control.safety.safety import CycleInput, Safety, SafetyConfig, SafetyState
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import SafetyError
@@ -348,7 +348,7 @@ def test_the_window_of_lost_commands_to_the_nanosecond(late: bool) -> None:
 
 def test_a_longer_window_allows_more_lost_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit is a rate: in a window of 2 s, 100 may be lost at 50 a second."""
-    monkeypatch.setattr("deal_hw.control.leg_checks.LOST_WINDOW_S", 2.0)
+    monkeypatch.setattr("deal_hw.control.safety.leg_checks.LOST_WINDOW_S", 2.0)
     for lost in (100, 101):
         checks = LegChecks(robot(), LEGS)
         assert checks.failures(state(T0, body=body())) == {}

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.control.safety_filter import SafetyFilter, is_finite, keep_effort
+from deal_hw.control.safety.filter import SafetyFilter, is_finite, keep_effort
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.go2.descriptions.driver import LEG_LIMITS
 from deal_hw.types import FloatArray, JointCommand

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.control.leg_checks import LegChecks, tilt
-from deal_hw.control.safety import CycleInput, Safety, SafetyDecision, SafetyState
+from deal_hw.control.safety.leg_checks import LegChecks, tilt
+from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import SafetyError
@@ -267,7 +267,7 @@ def test_a_norm_off_by_exactly_the_tolerance_passes() -> None:
     """Norms 1.25 and 0.75 are exact in binary, and so is a tolerance of 0.25."""
     checks = LegChecks(robot(), LEGS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("deal_hw.control.leg_checks.UNIT_TOLERANCE", 0.25)
+        patch.setattr("deal_hw.control.safety.leg_checks.UNIT_TOLERANCE", 0.25)
         for norm in (0.75, 1.25):
             assert checks.failures(sensed(0, orientation=np.array([norm, 0.0, 0.0, 0.0]))) == {}
 

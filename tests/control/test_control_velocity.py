@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.control.velocity import (
+from deal_hw.errors import ConfigurationError
+from deal_hw.motions.velocity import (
     KEY_LIFE_S,
     KEYS,
     LARGEST,
@@ -20,7 +21,6 @@ from deal_hw.control.velocity import (
     limited_axes,
     make_source,
 )
-from deal_hw.errors import ConfigurationError
 from deal_hw.types import BodyState, RobotState, Status
 
 

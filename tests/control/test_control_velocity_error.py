@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.control.planned_end import ENDING_EVENT
-from deal_hw.control.velocity_error import (
+from deal_hw.motions.planned_end import ENDING_EVENT
+from deal_hw.motions.scores.velocity_error import (
     VELOCITY_EVENT,
     Track,
     VelocityErrorSettings,

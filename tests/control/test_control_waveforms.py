@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.control.waveforms import (
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.motions.excitation.waveforms import (
     Steps,
     Sweep,
     Tones,
@@ -21,7 +22,6 @@ from deal_hw.control.waveforms import (
     random_steps,
     schroeder_phases,
 )
-from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.schema import from_values
 from deal_hw.types import FloatArray
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from deal_hw.control.process_channel import HEARTBEAT, Beat, StatusReceiver, StatusSender, socket_pair
-from deal_hw.control.supervisor import ChildEnd, Supervisor
+from deal_hw.control.process.channel import HEARTBEAT, Beat, StatusReceiver, StatusSender, socket_pair
+from deal_hw.control.process.supervisor import ChildEnd, Supervisor
 
 pytestmark = pytest.mark.real_time
 
@@ -18,7 +18,7 @@ import json, os, signal, socket, sys
 
 signal.alarm(20)  # Whoever says nothing to this process waits no longer.
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.process_channel import StatusSender
+from deal_hw.control.process.channel import StatusSender
 
 orders = json.load(sys.stdin)
 status = StatusSender(socket.socket(fileno=orders["status_fd"]))

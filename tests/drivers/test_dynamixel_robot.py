@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.passive import make_passive
+from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.cartpole.dynamixel.device import OVERLOAD, DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fakes.go2 import RESTING, STIFF, FakeBench, FakeGo2
 
-from deal_hw.control.passive import make_passive
+from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import decode_low_command

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.passive import make_passive
+from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, joint_ranges
 from deal_hw.drivers.go2.descriptions.leg_geometry import (
     WEIGHT_N,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fakes.go2 import RESTING, STANDING, STIFF, FakeBench
 
-from deal_hw.control.passive import make_passive
+from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
 from deal_hw.drivers.go2.messages.rpc import Request, Response, encode_note, encode_response

@@ -11,12 +11,10 @@ from fakes.go2 import STIFF, FakeGo2
 from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.passive import make_passive
-from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.process_channel import RUNNING
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.process.channel import RUNNING
+from deal_hw.control.safety.passive import make_passive
+from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers import make_robot
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -39,6 +37,8 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
+from deal_hw.motions.behaviours import HoldBehaviour
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.types import RobotState, Status
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
-from deal_hw.control.passive import PassiveConfig, make_passive
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.safety.passive import PassiveConfig, make_passive
+from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
@@ -21,6 +20,7 @@ from deal_hw.drivers.transports.listen_only import ListenOnly, ListenOnlyTopics,
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, UnknownNameError
+from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.robot import Robot
 from deal_hw.transport import Message, Transport
 

@@ -11,7 +11,7 @@ from typing import get_args
 import pytest
 
 from deal_hw.cli.main import JOBS
-from deal_hw.control.safety_machine import SafetyFlags
+from deal_hw.control.safety.machine import SafetyFlags
 from deal_hw.data.recording.record import CycleFlag
 from deal_hw.data.recording.schemas import CHANNELS, STANDARD
 from deal_hw.policy import Quantity

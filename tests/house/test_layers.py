@@ -11,7 +11,7 @@ from import_graph import imports, module_name, package_folders
 
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
-SERVICES = ("control", "data", "sim", "testing", "viz")
+SERVICES = ("control", "data", "motions", "sim", "testing", "viz")
 VOCABULARY = (
     "errors",
     "types",
@@ -44,6 +44,12 @@ BESIDE = {("cli.bench", "bench"), ("deal_hw", "workflows"), ("deal_hw", "transpo
 The package names its workflows and their settings, and loads them on use."""
 
 ROOMS = {
+    "control": ({"process", "safety"}, {"loop"}),
+    "motions": (
+        {"planned_end", "velocity"},
+        {"behaviours", "scores"},
+        {"excitation", "posture"},
+    ),
     "calib": (
         {"data"},
         {"search", "fit"},

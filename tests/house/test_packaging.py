@@ -23,6 +23,12 @@ FOLDERS = ("deal_hw", *LEAVES)
 BASE_FOLDERS = (
     "deal_hw",
     "deal_hw/control",
+    "deal_hw/control/loop",
+    "deal_hw/control/process",
+    "deal_hw/control/safety",
+    "deal_hw/motions",
+    "deal_hw/motions/excitation",
+    "deal_hw/motions/scores",
     "deal_hw/data",
     "deal_hw/data/checks",
     "deal_hw/data/export",

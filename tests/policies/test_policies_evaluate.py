@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 
-from deal_hw.control.balance import balance_result, wrapped_angle
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.motions.scores.balance import balance_result, wrapped_angle
 from deal_hw.policies.evaluate import evaluate_batch
 from deal_hw.policies.servo_loop import EXACT_SENSOR
 from deal_hw.policy import Observation

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.control.safety_filter import SafetyFilter
+from deal_hw.control.safety.filter import SafetyFilter
 from deal_hw.drivers import parameter_spaces, recorded_description, robot_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace

@@ -20,7 +20,6 @@ from fakes.faulty_policy import Fault, faulty_policy
 from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 from onnx import helper
 
-from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.ant.description import DESCRIPTION as ANT
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
@@ -29,6 +28,7 @@ from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.so101.description import DESCRIPTION as SO101
 from deal_hw.errors import MissingExtraError, PolicyError, PolicyMismatchError
 from deal_hw.install import install_line
+from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.policies import onnx_runtime
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import OnnxPolicy

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import InsufficientDataError
+from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig, Segment
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps

@@ -54,6 +54,25 @@ TREE = {
     ),
     "tools/one.py": "a = 1\nb = 2\n",
 }
+SETTINGS = {
+    "calib/effort.py": (
+        "from dataclasses import dataclass, replace\nfrom functools import partial\nLIMIT = 3\n"
+        "@dataclass(frozen=True)\nclass FitSettings:\n    steps: int = 3\n"
+        "    reach: float = 1.0\n    far: int = 2\n"
+        "@dataclass(frozen=True)\nclass LongSettings(FitSettings):\n    late: bool = False\n"
+        "@dataclass(frozen=True)\nclass FixedSettings:\n    share: float = 0.5\n"
+        "class Settings:\n    pass\n"
+        "FIXED = FixedSettings()\nlong = partial(LongSettings, late=True)\n"
+    ),
+    "tests/test_effort.py": (
+        "from deal_hw.calib import effort\n"
+        "def test_it(monkeypatch):\n"
+        "    monkeypatch.setattr(effort, 'LIMIT', 1)\n    monkeypatch.setattr(effort, 'run', print)\n"
+        "    monkeypatch.setattr('deal_hw.calib.effort.FitSettings', None)\n"
+        "    effort.LongSettings(4)\n"
+    ),
+    "tools/try_effort.py": "def far(x: FitSettings):\n    return replace(x, far=1)\n",
+}
 
 
 @pytest.fixture
@@ -129,6 +148,25 @@ def test_least_squares_candidates(counted: dict[str, Any]) -> None:
     """A loop that solves by an imported step is found, and so is a comprehension; one call alone is not."""
     found = [(row["function"], row["accepting"]) for row in counted["least_squares_candidates"]]
     assert found == [("calib/fit/solver.py:plain", False), ("calib/fit/solver.py:solve_it", True)]
+
+
+def test_settings_and_who_sets_them(tree: Path) -> None:
+    """A keyword, a value in order and `replace` set a field, also of a base class; a default does not."""
+    for name, text in SETTINGS.items():
+        (tree / name).parent.mkdir(exist_ok=True)
+        (tree / name).write_text(text, encoding="utf-8")
+    counted = structure.count(tree)
+    assert {row["class"]: row["fields"] for row in counted["settings"]} == {
+        "FitSettings": {"steps": ["tests"], "reach": [], "far": ["tools"]},
+        "LongSettings": {"late": ["product"]},
+        "FixedSettings": {"share": []},
+    }
+    assert counted["summary"]["calib/ settings classes that nobody gives an argument"] == 1
+    assert counted["summary"]["calib/ settings fields that nobody sets"] == 2
+    assert counted["replaced_by_tests"] == [
+        "tests/test_effort.py:3 effort.LIMIT",
+        "tests/test_effort.py:5 deal_hw.calib.effort.FitSettings",
+    ]
 
 
 def test_init_that_is_imported_from_is_a_room(tree: Path) -> None:

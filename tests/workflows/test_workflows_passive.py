@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import deal_hw
-from deal_hw.calib.data.noise import SETTINGS, white_noise_std
+from deal_hw.calib.data.noise import HELD_STD, white_noise_std
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.prepare import prepare
@@ -140,6 +140,6 @@ def test_a_joint_that_never_moves_does_not_outweigh_the_others() -> None:
     """Of a position of one value, the noise is unknown, not 0.3 micrometres."""
     moving = recording(0.0, 0)["hub_pos"]
     parts = [np.stack([moving, np.full(moving.size, 0.25)], axis=1)] * 2
-    assert white_noise_std(parts)[1] == SETTINGS.held_std
+    assert white_noise_std(parts)[1] == HELD_STD
     parts[1] = parts[1] + 1e-4
     assert white_noise_std(parts)[1] == pytest.approx(1e-4 / np.sqrt(12))

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.excitation import RichConfig, Segment
-from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.velocity import FixedVelocity, KeyboardVelocity, RemoteVelocity, ScriptVelocity
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.motions.behaviours import HoldBehaviour
+from deal_hw.motions.excitation.behaviours import RichConfig, Segment
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.motions.velocity import FixedVelocity, KeyboardVelocity, RemoteVelocity, ScriptVelocity
 from deal_hw.transport import WireOptions
 from deal_hw.types import RobotState, Status
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import deal_hw
-from deal_hw.control.excitation_level import ExcitationLevelSearch
-from deal_hw.control.loop import Outcome
+from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults
 from deal_hw.errors import ConfigurationError, PolicyMismatchError, TransportError
+from deal_hw.motions.excitation.level import ExcitationLevelSearch
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT
 from deal_hw.workflows.emulation.common import next_line

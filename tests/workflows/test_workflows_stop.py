@@ -14,8 +14,8 @@ import pytest
 
 from deal_hw.cli.main import main
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.control.claim import LocalClaim
-from deal_hw.control.run_note import RunNote, find_runs
+from deal_hw.control.process.claim import LocalClaim
+from deal_hw.control.process.run_note import RunNote, find_runs
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import ConfigurationError, PortBusyError, UnknownNameError
 from deal_hw.workflows import stop as module
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.real_time
 PATIENCE_S = 60.0
 HOLDER = """
 import sys, time
-from deal_hw.control.run_note import RunNote
+from deal_hw.control.process.run_note import RunNote
 
 with RunNote("go2", {"claim": "x"}) as note:
     note.say_passive(None)

@@ -12,7 +12,7 @@ from typing import Literal
 
 from typing_extensions import Self
 
-from deal_hw.control.realtime import TRANSPORT_PRIORITY, priority
+from deal_hw.control.process.realtime import TRANSPORT_PRIORITY, priority
 
 State = Literal["open", "frozen", "refused"]
 _READ = 65536

@@ -17,7 +17,6 @@ import numpy as np
 import zstandard
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.data.files import INDEX_NAME
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.episode_info import summarize
@@ -30,6 +29,7 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.description import digest_of
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
+from deal_hw.motions.excitation.plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.transport import Message
 from deal_hw.types import BodyState, Event, JointCommand, RobotState, Status
 from fuzz.kind import FileKind, Kind

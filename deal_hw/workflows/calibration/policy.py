@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
-from deal_hw.control.velocity import FixedVelocity, make_source
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.motions.velocity import FixedVelocity, make_source
 from deal_hw.workflows.options import refuse
 
 if TYPE_CHECKING:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldoutErrors
-    from deal_hw.control.behaviours import Behaviour
+    from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
 
@@ -146,7 +146,7 @@ def calibrate_episodes(
         from threadpoolctl import threadpool_limits
 
         from deal_hw.calib.data.checks import check_delays, target_changes
-        from deal_hw.calib.data.noise import SETTINGS as DATA
+        from deal_hw.calib.data.noise import SMOOTHING_S
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.pipeline.methods import make_method
         from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
@@ -167,7 +167,7 @@ def calibrate_episodes(
         latency_range_s=latency_range_s,
         fixed_latency_s=latency_s,
         known_std=known_std,
-        settings=DATA if smoothing_s is None else dataclasses.replace(DATA, smoothing_s=smoothing_s),
+        smoothing_s=SMOOTHING_S if smoothing_s is None else smoothing_s,
         policy=policy,
     )
     check_delays(problem)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.control.velocity_error import wanted_velocity
+from deal_hw.motions.scores.velocity_error import wanted_velocity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 from deal_hw.workflows.say import Say

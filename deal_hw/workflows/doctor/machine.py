@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from deal_hw.control.realtime import FIFO_PRIORITY
+from deal_hw.control.process.realtime import FIFO_PRIORITY
 from deal_hw.findings import Finding, Severity
 from deal_hw.install import install_line
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.clock_check import judge_clock
-from deal_hw.control.safety import SafetyConfig
+from deal_hw.control.safety.safety import SafetyConfig
+from deal_hw.data.checks.clock_rate import judge_clock
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.findings import Finding, Severity
 from deal_hw.robot import Robot

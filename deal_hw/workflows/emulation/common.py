@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.realtime import priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
 from deal_hw.signals import ENDING, taken

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.velocity_error import Track
 from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.errors import ConfigurationError, MissingExtraError, shown
+from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
 from deal_hw.workflows.emulation.common import (
     choose_truth,

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import Clock, VirtualClock
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation_level import ATTEMPTS, ExcitationLevelSearch, shortfalls
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.safety import Safety
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord
@@ -25,6 +23,8 @@ from deal_hw.drivers.cartpole.chips.device import CartpoleDevice, EmulatedDevice
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.excitation.level import ATTEMPTS, ExcitationLevelSearch, shortfalls
 from deal_hw.robot import Robot
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.transport import Transport

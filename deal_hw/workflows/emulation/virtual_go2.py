@@ -12,13 +12,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.behaviours import PolicyBehaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport
-from deal_hw.control.planned_end import PlannedEnd
-from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.safety import Safety
-from deal_hw.control.velocity import NotedVelocity, SlowedVelocity, VelocitySource
-from deal_hw.control.velocity_error import VELOCITY_EVENT, Track, Wanted, velocity_data, wanted_in
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -27,6 +22,11 @@ from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.motions.behaviours import PolicyBehaviour
+from deal_hw.motions.planned_end import PlannedEnd
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, Track, Wanted, velocity_data, wanted_in
+from deal_hw.motions.velocity import NotedVelocity, SlowedVelocity, VelocitySource
 from deal_hw.policy import Policy
 from deal_hw.types import Event, FloatArray, Trajectory
 

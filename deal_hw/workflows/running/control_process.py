@@ -16,15 +16,15 @@ from typing import Any
 
 from deal_hw import signals
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.process_channel import LOADING, RecordSender, StatusSender
-from deal_hw.control.realtime import (
+from deal_hw.control.process.channel import LOADING, RecordSender, StatusSender
+from deal_hw.control.process.realtime import (
     Granted,
     become_realtime,
     die_with_parent,
     kill_self_after,
     parent_is_gone,
 )
-from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
+from deal_hw.control.process.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 
 _START_SILENCE_S = 30.0
 _ORPHAN_S = 5.0
@@ -105,13 +105,13 @@ def _run(
     orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper
 ) -> dict[str, Any]:
     # Imported here, so that a stop signal during these imports is handled, too.
-    from deal_hw.control.loop import ControlLoop, LoopConfig
-    from deal_hw.control.passive import PassiveConfig
-    from deal_hw.control.planned_end import PlannedEnd
-    from deal_hw.control.safety import Safety
-    from deal_hw.control.velocity import END_KEY, KeyboardVelocity, NotedVelocity
-    from deal_hw.control.velocity_error import VELOCITY_EVENT, velocity_data
+    from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+    from deal_hw.control.safety.passive import PassiveConfig
+    from deal_hw.control.safety.safety import Safety
     from deal_hw.drivers import adopt_robot, make_robot
+    from deal_hw.motions.planned_end import PlannedEnd
+    from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, velocity_data
+    from deal_hw.motions.velocity import END_KEY, KeyboardVelocity, NotedVelocity
     from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
     plan = RunPlan.from_json(orders)

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.balance import BalanceResult
-from deal_hw.control.passive import PassiveConfig, make_passive
-from deal_hw.control.process_channel import (
+from deal_hw.control.process.channel import (
     CONNECTING,
     HANDING_BACK,
     HOMING,
@@ -20,15 +18,17 @@ from deal_hw.control.process_channel import (
     STARTING,
     Beat,
 )
-from deal_hw.control.replay_error import ReplayError, replay_error
-from deal_hw.control.run_note import RunNote
-from deal_hw.control.supervisor import Supervisor
-from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
+from deal_hw.control.process.run_note import RunNote
+from deal_hw.control.process.supervisor import Supervisor
+from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.drivers import BALANCE, ODOMETRY, balanced, on_this_computer, walked
 from deal_hw.errors import DealHwError
+from deal_hw.motions.scores.balance import BalanceResult
+from deal_hw.motions.scores.replay_error import ReplayError, replay_error
+from deal_hw.motions.scores.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.robot import Robot
 from deal_hw.signals import OPERATOR
 from deal_hw.version import __version__

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from deal_hw.control.loop import Outcome
-from deal_hw.control.loop_timing import LoopTimingReport
-from deal_hw.control.supervisor import ChildEnd
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.loop.timing import LoopTimingReport
+from deal_hw.control.process.supervisor import ChildEnd
 from deal_hw.signals import OPERATOR, name
 from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
 from deal_hw.workflows.running.report import EpisodeReport

@@ -11,8 +11,8 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 
-from deal_hw.control.velocity import END_KEY
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.velocity import END_KEY
 from deal_hw.workflows.say import Say, aloud
 
 STOP_KEY = "\x1b"

@@ -12,10 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
-from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
-from deal_hw.control.excitation_level import with_excitation_level
-from deal_hw.control.excitation_plan import (
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
+from deal_hw.motions.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
+from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
+from deal_hw.motions.excitation.level import with_excitation_level
+from deal_hw.motions.excitation.plan import (
     FAMILIES,
     ExcitationBehaviour,
     ExcitationDesign,
@@ -23,17 +25,15 @@ from deal_hw.control.excitation_plan import (
     make_plan,
     read_plan,
 )
-from deal_hw.control.planned_end import PlannedEnd
-from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.velocity import (
+from deal_hw.motions.planned_end import PlannedEnd
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.motions.velocity import (
     BoundedSource,
     SlowedVelocity,
     VelocitySource,
     limited_axes,
     make_source,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.policy import VERDICT, Policy
 from deal_hw.schema import OPEN, from_values
 from deal_hw.transport import WireOptions
@@ -67,7 +67,7 @@ class RunPlan:
         port: The robot's port, for transports without a descriptor to inherit.
         wire: Options of a transport of topics.
         velocity: Source of a walking policy's requested velocity; see
-        :func:`deal_hw.control.velocity.make_source`.
+        :func:`deal_hw.motions.velocity.make_source`.
         stand: Whether to stand up first and to lie down at the end; not counted in ``seconds``.
         posture: Durations of standing up and lying down.
         robot_settings: The driver's own settings.

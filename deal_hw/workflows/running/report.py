@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from deal_hw import errors
-from deal_hw.control.balance import FALLEN_RAD, BalanceResult
-from deal_hw.control.loop import Outcome
-from deal_hw.control.loop_timing import LoopTimingReport
-from deal_hw.control.replay_error import ReplayError
-from deal_hw.control.velocity_error import VelocityError
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.loop.timing import LoopTimingReport
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.documentation import page
+from deal_hw.motions.scores.balance import FALLEN_RAD, BalanceResult
+from deal_hw.motions.scores.replay_error import ReplayError
+from deal_hw.motions.scores.velocity_error import VelocityError
 from deal_hw.workflows.say import html_table, text_table
 
 _HEAD = ("episode", "outcome", "reason", "states", "clipped cycles", "recording")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.documentation import page
 from deal_hw.drivers import default_transport, driver_description
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.posture import PostureConfig
 from deal_hw.ranges import Checked, option
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import GO2, File, given, refuse

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 from deal_hw import errors
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.excitation_level import ExcitationLevelSearch, shortfalls
-from deal_hw.control.loop import Outcome
-from deal_hw.control.process_channel import Beat
+from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Beat
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
+from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
 from deal_hw.workflows.options import File
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun
@@ -113,7 +113,7 @@ def run_episodes(
         view: Shows messages and asks questions; by default none.
         on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
         attempts: Most recordings of an episode of the motion `rich`, each stronger, until it moves enough;
-            see :mod:`deal_hw.control.excitation_level`.
+            see :mod:`deal_hw.motions.excitation.level`.
 
     Raises:
         DealHwError: The run failed; the robot was made passive and the recording closed.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from deal_hw.control.process_channel import Beat
+from deal_hw.control.process.channel import Beat
 from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:

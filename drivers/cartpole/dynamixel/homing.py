@@ -8,7 +8,6 @@ import math
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.behaviours import position_command
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.dynamixel.servos import PoleAngle, Servos
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
@@ -19,6 +18,7 @@ from deal_hw.drivers.servo_bus.registers import (
     explain_hardware_error,
 )
 from deal_hw.errors import SafetyError, TransportTimeoutError
+from deal_hw.motions.behaviours import position_command
 
 _PERIOD_NS = 10_000_000
 """Time between two requests; short enough for the belt servo's watchdog."""

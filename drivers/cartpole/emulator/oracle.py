@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.behaviours import position_command
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.lqr import TARGET_LIMIT_M, LqrController, design_lqr
@@ -15,6 +14,7 @@ from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, candidate_truth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportTimeoutError
+from deal_hw.motions.behaviours import position_command
 from deal_hw.parameters import ParameterSpace
 
 BALANCE_S = 6.0

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour, centre, position_command
-from deal_hw.control.centring import Centring
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import Behaviour, centre, position_command
+from deal_hw.motions.excitation.centring import Centring
 from deal_hw.schema import STRICT
 from deal_hw.types import FloatArray, JointCommand, RobotState
 

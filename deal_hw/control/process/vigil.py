@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 
 from deal_hw.clock import Clock
-from deal_hw.control.process_channel import HEARTBEAT, StatusSender
+from deal_hw.control.process.channel import HEARTBEAT, StatusSender
 
 SUPERVISOR_SILENCE_S = 1.0
 """A supervisor without a heartbeat for this long counts as stopped [s]. It sends one every 50 ms; without

@@ -14,11 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour, position_command
-from deal_hw.control.planned_end import PlannedEnd, battery_reason
-from deal_hw.control.velocity import SlowedVelocity
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import Behaviour, position_command
+from deal_hw.motions.planned_end import PlannedEnd, battery_reason
+from deal_hw.motions.velocity import SlowedVelocity
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
 SLOW_S: Final = 0.8

@@ -6,8 +6,8 @@ import enum
 from dataclasses import dataclass, field
 from typing import Any
 
-from deal_hw.control.loop_timing import LoopTimingReport
-from deal_hw.control.passive import PassiveConfig
+from deal_hw.control.loop.timing import LoopTimingReport
+from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.errors import ConfigurationError
 
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.control.excitation import RichConfig, Segment
-from deal_hw.control.excitation_limits import room
-from deal_hw.control.excitation_plan import largest_factor
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.excitation.behaviours import RichConfig, Segment
+from deal_hw.motions.excitation.limits import room
+from deal_hw.motions.excitation.plan import largest_factor
 
 LEAST_FOLLOWED = 0.3
 """An actuated joint that covers less than this share of its commanded range hardly moves."""

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
-from deal_hw.control.loop_timing import LoopTiming, LoopTimingReport
-from deal_hw.control.passive import make_passive
-from deal_hw.control.planned_end import ENDING_EVENT, PlannedEnd
-from deal_hw.control.process_channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
-from deal_hw.control.repeater import Repeater
-from deal_hw.control.safety import CycleInput, Safety, SafetyDecision, SafetyState
+from deal_hw.control.loop.repeater import Repeater
+from deal_hw.control.loop.report import LoopConfig, LoopReport, Outcome
+from deal_hw.control.loop.timing import LoopTiming, LoopTimingReport
+from deal_hw.control.process.channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
+from deal_hw.control.safety.passive import make_passive
+from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
 from deal_hw.errors import TransportError, TransportTimeoutError
+from deal_hw.motions.behaviours import Behaviour
+from deal_hw.motions.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.robot import Robot
 from deal_hw.transport import Message
 from deal_hw.types import Event, JointCommand, RobotState

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.control.behaviours import centre
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.motions.behaviours import centre
 from deal_hw.types import FloatArray
 
 MARGIN = 0.9

@@ -3,7 +3,7 @@
 It owns the port as long as it lives. No other program can then take the robot, and the passive command can
 still be sent after the control process has died. It never sends while the control process lives: two writers
 on one port would corrupt each other's frames. It sends nothing if the control process had not begun to
-command the robot. The control process also watches the supervisor ( :mod:`deal_hw.control.vigil`).
+command the robot. The control process also watches the supervisor ( :mod:`deal_hw.control.process.vigil`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 
 from deal_hw.child_process import own_process_group
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.process_channel import (
+from deal_hw.control.process.channel import (
     BUFFER_BYTES,
     HEARTBEAT,
     STARTING,
@@ -29,7 +29,7 @@ from deal_hw.control.process_channel import (
     StatusReceiver,
     socket_pair,
 )
-from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
+from deal_hw.control.process.realtime import SUPERVISOR_PRIORITY, hurry, priority
 from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
 from deal_hw.signals import held_back, name, reason, taken
 

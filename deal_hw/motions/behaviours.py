@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from deal_hw.control.velocity import FixedVelocity, VelocitySource
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
+from deal_hw.motions.velocity import FixedVelocity, VelocitySource
 from deal_hw.policy import (
     BASE_QUANTITIES,
     WORLD_QUANTITIES,

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.control.leg_checks import LegChecks
-from deal_hw.control.safety_filter import SafetyFilter
-from deal_hw.control.safety_machine import SafetyFlags, SafetyMachine, SafetyState
+from deal_hw.control.safety.filter import SafetyFilter
+from deal_hw.control.safety.leg_checks import LegChecks
+from deal_hw.control.safety.machine import SafetyFlags, SafetyMachine, SafetyState
 from deal_hw.description import RobotDescription
 from deal_hw.errors import SafetyError
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status

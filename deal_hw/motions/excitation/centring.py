@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.control.excitation_limits import MARGIN
 from deal_hw.description import RobotDescription
+from deal_hw.motions.excitation.limits import MARGIN
 from deal_hw.types import FloatArray, RobotState
 
 CROSSING_S = 0.4

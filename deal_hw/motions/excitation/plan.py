@@ -16,11 +16,13 @@ from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour, centre, position_command
-from deal_hw.control.centring import Centring
-from deal_hw.control.excitation import Segment, segment_command
-from deal_hw.control.excitation_limits import fit_to_limits, room
-from deal_hw.control.waveforms import (
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.motions.behaviours import Behaviour, centre, position_command
+from deal_hw.motions.excitation.behaviours import Segment, segment_command
+from deal_hw.motions.excitation.centring import Centring
+from deal_hw.motions.excitation.limits import fit_to_limits, room
+from deal_hw.motions.excitation.waveforms import (
     Arrangement,
     Law,
     Sweep,
@@ -29,8 +31,6 @@ from deal_hw.control.waveforms import (
     multisine,
     random_steps,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, UnknownNameError, shown
 from deal_hw.reading import read_json, reading
 from deal_hw.schema import FINITE, from_values
 from deal_hw.types import FloatArray, JointCommand, RobotState

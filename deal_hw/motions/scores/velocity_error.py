@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.control.planned_end import ENDING_EVENT
-from deal_hw.control.velocity import AXES
+from deal_hw.motions.planned_end import ENDING_EVENT
+from deal_hw.motions.velocity import AXES
 from deal_hw.types import Event, FloatArray, Trajectory
 
 VELOCITY_EVENT = "velocity"

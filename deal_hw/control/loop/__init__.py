@@ -1,0 +1,1 @@
+"""The control loop: its cycle, timing and report."""

@@ -1,0 +1,1 @@
+"""Supervisor and control process: heartbeat, claims, scheduling, and what they tell each other."""

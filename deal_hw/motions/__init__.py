@@ -1,0 +1,1 @@
+"""Motions of a run, before the safety filter: behaviours, excitation, posture, and how well they went."""

@@ -1,0 +1,1 @@
+"""Motions that excite a robot for calibration, within its limits."""
