@@ -40,8 +40,13 @@ def calibrate_settings(settings: Real) -> CalibrateSettings:
     """Return the settings of a calibration that reads the recordings as ``deal-hw calibrate`` does.
 
     Raises:
-        ConfigurationError: No recordings were named.
+        ConfigurationError: No recordings were named, or a file of parameters is to be written.
     """
+    if settings.recordings.write_parameters is not None:
+        raise ConfigurationError(
+            "--write-parameters: `deal-hw calibrate` writes that file; edit it, and name it here by "
+            "--parameters"
+        )
     if settings.recordings.model is None and settings.dataset is None:
         raise ConfigurationError(
             "bench real needs --model robot.xml --data rec.csv ... or --dataset DIR, and --holdout other.csv "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -99,3 +100,10 @@ def test_recordings_must_be_named(tmp_path: Path) -> None:
     """Without a model the error says what to give."""
     with pytest.raises(ConfigurationError, match="--model"):
         bench(Real(out=tmp_path / "real.json"))
+
+
+def test_a_file_of_parameters_is_written_by_calibrate(hinge: Recordings, tmp_path: Path) -> None:
+    """A bench only reads one."""
+    asked = dataclasses.replace(hinge, write_parameters=tmp_path / "new.yaml")
+    with pytest.raises(ConfigurationError, match="`deal-hw calibrate` writes that file"):
+        bench(Real(recordings=asked, out=tmp_path / "real.json"))

@@ -295,7 +295,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     patch("deal_hw.calib.design.excitation_search.search_excitation")
     monkeypatch.setattr("deal_hw.calib.design.experiment_design.Experiment", note("experiment", experiment))
     patch("deal_hw.cli.bridge.Go2Bridge")
-    patch("deal_hw.bench.rows.run_cells")
+    monkeypatch.setattr("deal_hw.bench.rows.run_cells", _note_cells(did))
     emulator = types.SimpleNamespace(
         open=lambda: "port", close=lambda: None, changes=[], report=lambda: {}, slips=0, dropped=0
     )
@@ -323,6 +323,16 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         monkeypatch.setattr(module, "realtime_priority", contextlib.nullcontext)
     patch("deal_hw.bench.go2_codec.bench_codec")
     return did
+
+
+def _note_cells(did: list[str]) -> Callable[..., Any]:
+    """Note what a bench would run, and its file; what is called after each row holds all settings."""
+
+    def run_cells(cells: Any, out: Path, after: Any) -> None:
+        did.append(f"{told(cells)} {out}")
+        raise SeenError
+
+    return run_cells
 
 
 def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
