@@ -21,7 +21,7 @@ from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray
 
 ASSETS: Final = Path(__file__).parent / "assets"
-SHIPPED: Final = ("allegro", "ant", "cartpole", "go2", "humanoid")
+SHIPPED: Final = tuple(sorted(path.name.removesuffix("_udr.onnx") for path in ASSETS.glob("*_udr.onnx")))
 """Robots whose demonstration policy is shipped."""
 
 TARGET_RAD: Final = (0.0, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""The table of training tasks: robot -> environment, trainer and settings; classes are imported on use."""
+"""Training tasks: environment, trainer and settings. A robot's entry in `deal_hw.robots` names its task."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from deal_hw.errors import UnknownNameError
 from deal_hw.policies.trainers import make_trainer
 
 _BALANCE_PPO: Final = {
@@ -111,31 +110,27 @@ def _simulated(
     )
 
 
-TASKS: Final = {
-    "allegro": _simulated("hand_env:HandEnv", motors=16, udr_ratio=1.75, ppo=_TURN_PPO, members=256),
-    "ant": _simulated("run_env:RunEnv", motors=8, udr_ratio=5.0),
-    "cartpole": TrainingTask(
-        environment="deal_hw.policies.cartpole_env:CartPoleEnv",
-        trainer="sac",
-        members={"ppo": 128, "sac": 32},
-        settings={"ppo": _BALANCE_PPO},
-        udr_ratio=5.0,
-        udr_latency_s=(0.0, 0.03),
-    ),
-    "go2": TrainingTask(
-        environment="deal_hw.policies.go2_env:Go2Env",
-        trainer="ppo",
-        members={"ppo": 200, "sac": 64},
-        settings={"sac": {**_LEGGED_SAC, "target_entropy": -12.0}},
-        udr_ratio=1.75,
-        udr_latency_s=(0.0, 0.012),
-    ),
-    "humanoid": _simulated(
-        "humanoid_env:HumanoidEnv", motors=21, udr_ratio=1.75, ppo=_STRIDE_PPO, members=128
-    ),
-}
-
-
+ALLEGRO: Final = _simulated("hand_env:HandEnv", motors=16, udr_ratio=1.75, ppo=_TURN_PPO, members=256)
+ANT: Final = _simulated("run_env:RunEnv", motors=8, udr_ratio=5.0)
+CARTPOLE: Final = TrainingTask(
+    environment="deal_hw.policies.cartpole_env:CartPoleEnv",
+    trainer="sac",
+    members={"ppo": 128, "sac": 32},
+    settings={"ppo": _BALANCE_PPO},
+    udr_ratio=5.0,
+    udr_latency_s=(0.0, 0.03),
+)
+GO2: Final = TrainingTask(
+    environment="deal_hw.policies.go2_env:Go2Env",
+    trainer="ppo",
+    members={"ppo": 200, "sac": 64},
+    settings={"sac": {**_LEGGED_SAC, "target_entropy": -12.0}},
+    udr_ratio=1.75,
+    udr_latency_s=(0.0, 0.012),
+)
+HUMANOID: Final = _simulated(
+    "humanoid_env:HumanoidEnv", motors=21, udr_ratio=1.75, ppo=_STRIDE_PPO, members=128
+)
 OWN_TASK: Final = TrainingTask(
     environment="deal_hw.policies.own_env:OwnVectorEnv",
     trainer="sac",
@@ -145,14 +140,3 @@ OWN_TASK: Final = TrainingTask(
     udr_latency_s=(0.0, 0.0),
 )
 """The user's own Gymnasium environment; good settings for it are not known."""
-
-
-def training_task(robot: str) -> TrainingTask:
-    """Return a robot's task.
-
-    Raises:
-        UnknownNameError: There is none; the message lists the robots.
-    """
-    if robot not in TASKS:
-        raise UnknownNameError("robot with a training environment", robot, TASKS)
-    return TASKS[robot]

@@ -28,8 +28,8 @@ from deal_hw.data.export.lerobot import export_lerobot
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
-from deal_hw.drivers import recorded_description
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.robots import recorded_description
 from deal_hw.sim.engine.model import load_model
 from deal_hw.training import TrainingFiles
 from deal_hw.types import Event, Trajectory

@@ -22,8 +22,8 @@ import numpy as np
 from measuring import parser
 
 from deal_hw.bench.rows import load_rows
-from deal_hw.drivers import parameter_spaces
 from deal_hw.errors import ConfigurationError
+from deal_hw.robots import parameter_spaces
 from deal_hw.types import FloatArray
 
 BENCHES = ("fixed-range", "mismatch")

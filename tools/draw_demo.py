@@ -23,7 +23,7 @@ from PIL import Image
 
 from deal_hw.calibration import read_result
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.drivers import recorded_description
+from deal_hw.robots import recorded_description
 from deal_hw.sim.recordings.overlay import compute_overlay
 from deal_hw.types import FloatArray
 

@@ -20,9 +20,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from deal_hw.drivers import recorded_description
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.tasks import training_task
+from deal_hw.robots import recorded_description, training_task
 from deal_hw.types import FloatArray
 from deal_hw.workflows.train import udr_distribution
 

@@ -29,13 +29,13 @@ import numpy as np
 from measuring import parser
 
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import driver_description
 from deal_hw.errors import PolicyError
 from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.trial import TrialSettings, check_policy
 from deal_hw.policies.trial_states import ProbeStates
 from deal_hw.policy import Observation, PolicySpec
+from deal_hw.robots import driver_description
 from deal_hw.types import FloatArray
 from deal_hw.workflows.shipped import shipped_policy
 

@@ -27,12 +27,12 @@ from fault_rig import ANY, ARMING, CONNECTING, ENDING, LYING_DOWN, RISING, RUNNI
 from fault_table import main
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, OFF, STIFF
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.topics import LOW_COMMAND
 from deal_hw.motions.posture import PostureConfig
+from deal_hw.robots import make_topic_transport
 from deal_hw.transport import Message, WireOptions
 
 POSTURE = PostureConfig(fold_s=0.3, rise_s=0.6, settle_s=0.2, lie_s=0.6)

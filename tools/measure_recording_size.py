@@ -21,7 +21,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.recording.schemas import STANDARD
-from deal_hw.drivers import recorded_description
+from deal_hw.robots import recorded_description
 from deal_hw.transport import Message
 from deal_hw.types import BodyState, JointCommand, RobotState, Status
 

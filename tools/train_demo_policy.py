@@ -35,11 +35,10 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.drivers import recorded_description
 from deal_hw.policies.checkpoint import read_checkpoint, write_checkpoint
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.tasks import training_task
+from deal_hw.robots import recorded_description, training_task
 from deal_hw.training import TrainingFiles, TrainingStatus
 from deal_hw.workflows.train import train_policy, udr_distribution
 

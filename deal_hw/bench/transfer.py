@@ -32,7 +32,7 @@ from deal_hw.data.run_folder import git_commit
 from deal_hw.errors import CalibrationError, ConfigurationError, DealHwError, PolicyError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.tasks import training_task
+from deal_hw.robots import training_task
 from deal_hw.training import TrainingFiles
 from deal_hw.workflows.say import Say, silent
 from deal_hw.workflows.shipped import required_policy

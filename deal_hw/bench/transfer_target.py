@@ -10,7 +10,7 @@ from deal_hw.bench.rows import Row
 from deal_hw.bench.tasks import Case
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.demonstration import BatchPolicy
-from deal_hw.policies.tasks import training_task
+from deal_hw.robots import training_task
 from deal_hw.sim.engine.model import load_model
 from deal_hw.types import FloatArray
 from deal_hw.workflows.robot import described

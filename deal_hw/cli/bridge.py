@@ -16,7 +16,6 @@ import tyro
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.claim import LocalClaim
 from deal_hw.control.process.realtime import FIFO_PRIORITY, priority
-from deal_hw.drivers import claim_name
 from deal_hw.drivers.go2.bridge.bridge import COMMANDS, READABLE, Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.drivers.transports.dds_transport import DdsTransport
@@ -25,6 +24,7 @@ from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpo
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.ranges import Checked, Range
+from deal_hw.robots import claim_name
 from deal_hw.signals import reason, taken
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.common import run_until

@@ -170,10 +170,10 @@ def calibrate(config: Calibrate) -> CalibrateReport:
 def _print_next(report: CalibrateReport, robot: str, folder: Path) -> None:
     """Print the line that trains with the result, where there is a task and the result can be used."""
     from deal_hw.calib.report.verdict import trust
-    from deal_hw.policies.tasks import TASKS
+    from deal_hw.robots import has_task
 
     file = report.files.get("distribution.json")
-    if file is not None and robot in TASKS and trust(report.result).colour != "red":
+    if file is not None and has_task(robot) and trust(report.result).colour != "red":
         print(f"to train with it: deal-hw train {robot} --distribution {file} --out {folder}")
 
 

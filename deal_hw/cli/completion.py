@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from deal_hw.cli.arguments import Option, options_of
-from deal_hw.drivers import ROBOTS
 from deal_hw.errors import ConfigurationError
+from deal_hw.robots import driven_robots
 from deal_hw.workflows.kinds import Kinds, one_kind
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def completion(shell: str, verbs: Mapping[str, Verb]) -> str:
         first = [one for one in found.get("", ()) if one.positional and one.choices][:1]
         words = [*filter(None, found), *(choice for one in first for choice in one.choices)]
         if any(one.positional and one.name == "robot" for one in found.get("", ())):
-            words = words or list(ROBOTS)
+            words = words or list(driven_robots())
         kinds.append(f'    {name}) kinds="{" ".join(words)}" ;;')
         # Without a known kind, such as behind a path: the options of all.
         every = {one.name: one for entries in found.values() for one in entries}

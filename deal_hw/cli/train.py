@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.documentation import page
-from deal_hw.drivers import ROBOTS
+from deal_hw.robots import driven_robots
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import InterruptedTrainingError, Training, TrainSettings, run
 
@@ -51,7 +51,7 @@ def train(config: Train) -> Training:
 def train_and_say_next(config: Train) -> Training:
     """Train, and print the line that runs the policy."""
     training = train(config)
-    if not config.quiet and config.robot in ROBOTS:
+    if not config.quiet and config.robot in driven_robots():
         print(f"next: deal-hw deploy {config.robot} --port PORT --policy {training.path}")
     return training
 

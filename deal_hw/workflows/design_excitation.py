@@ -24,6 +24,7 @@ from deal_hw.motions.excitation.plan import (
 )
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.ranges import Range, check_ranges
+from deal_hw.robots import is_known, robot_entry, robots
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, from_settings, given, refuse
 from deal_hw.workflows.robot import described, described_spaces
 from deal_hw.workflows.shipped import balancer
@@ -209,23 +210,26 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
 
 
 def _sway(config: ExcitationSettings, description: RobotDescription) -> ExcitationPlan:
-    if description.name != "go2":
+    entry = robot_entry(description.name) if is_known(description.name) else None
+    if entry is None or not entry.sway:
+        able = ", ".join(one.name for one in robots().entries() if one.sway)
         raise ConfigurationError(
-            f"robot {description.name!r} does not sway: that is for go2, which stands on four feet; choose "
-            "another --family"
+            f"robot {description.name!r} does not sway: that is for robots that stand on feet ({able}); "
+            "choose another --family"
         )
     try:
-        from deal_hw.drivers.go2.motions import sway_plan
+        sway_plan = entry.load(entry.sway)
         from deal_hw.sim.engine.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
-    return sway_plan(
+    plan: ExcitationPlan = sway_plan(
         load_model(description),
         np.random.default_rng(config.seed),
         config.seconds,
         (config.low_hz, config.high_hz),
         config.amplitude,
     )
+    return plan
 
 
 def _search(

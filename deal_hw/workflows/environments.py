@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.policies.registration import register as _register
+from deal_hw.robots import robots
 
 if TYPE_CHECKING:
     from deal_hw.parameters import ParameterDistribution
@@ -34,9 +35,8 @@ def make_vector(
         UnknownNameError: There is no such robot.
         ConfigurationError: The distribution cannot be read.
     """
-    from deal_hw.drivers import recorded_description
     from deal_hw.parameters import ParameterDistribution
-    from deal_hw.policies.tasks import training_task
+    from deal_hw.robots import recorded_description, training_task
     from deal_hw.workflows.train import read_distribution, udr_distribution
 
     if distribution is None:
@@ -60,7 +60,10 @@ def make_single(
 
 def register() -> None:
     """Register the tasks with Gymnasium; a second call changes nothing."""
-    _register("deal_hw.workflows.environments:make_single", "deal_hw.workflows.environments:make_vector")
+    tasks = {entry.environment: entry.name for entry in robots().entries() if entry.environment}
+    _register(
+        tasks, "deal_hw.workflows.environments:make_single", "deal_hw.workflows.environments:make_vector"
+    )
 
 
 register()

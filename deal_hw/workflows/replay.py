@@ -9,9 +9,9 @@ from typing import Annotated
 
 from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_trajectory
-from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.behaviours import ReplayBehaviour
+from deal_hw.robots import driver_description
 from deal_hw.types import Trajectory
 from deal_hw.workflows.options import OWN_ROBOT, File, from_settings, refuse
 from deal_hw.workflows.robot import carries_robot, user_robot

@@ -12,11 +12,11 @@ import numpy as np
 
 from deal_hw.data.files import dataset_of, write_bytes
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import DESCRIPTIONS, ROBOTS, parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.findings import Finding, Severity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Checked, Range
+from deal_hw.robots import is_known, parameter_spaces, recorded_description
 from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.say import html_table
 
@@ -150,7 +150,7 @@ def load_robot(path: Path) -> UserRobot:
 
 def is_ours(name: str) -> bool:
     """Return whether a name is that of a robot of deal-hw."""
-    return name in ROBOTS or name in DESCRIPTIONS
+    return is_known(name)
 
 
 def is_user_robot(robot: str) -> bool:

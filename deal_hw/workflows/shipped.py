@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Final
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.behaviours import Behaviour, PolicyBehaviour
-
-SHIPPED: Final[Mapping[str, str]] = {
-    "allegro": "allegro_turn",
-    "go2": "go2_walk",
-    "humanoid": "humanoid_walk",
-}
-"""Shipped policies not named ROBOT_udr. These robots' policies of that name only excite them in benches."""
+from deal_hw.robots import is_known, robot_entry
 
 
 def shipped_policy(robot: str) -> Path | None:
     """Return the policy that is shipped for a robot, or None."""
-    name = SHIPPED.get(robot, f"{robot}_udr")
-    path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{name}.onnx"))
-    return path if path.is_file() else None
+    package, _, file = (robot_entry(robot).policy if is_known(robot) else "").partition(":")
+    path = Path(str(resources.files(package) / file)) if package else None
+    return path if path is not None and path.is_file() else None
 
 
 def required_policy(robot: str) -> Path:
@@ -35,8 +28,10 @@ def required_policy(robot: str) -> Path:
     """
     path = shipped_policy(robot)
     if path is None:
-        tool = "train_udr_policy.py" if robot == "cartpole" else "train_demo_policy.py"
-        raise ConfigurationError(f"no policy is shipped for robot {robot!r}; tools/{tool} trains one")
+        raise ConfigurationError(
+            f"no policy is shipped for robot {robot!r}; tools/train_udr_policy.py trains one for the "
+            "cart-pole, tools/train_demo_policy.py for others"
+        )
     return path
 
 

@@ -13,9 +13,9 @@ from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.process.claim import LocalClaim
 from deal_hw.control.process.run_note import FoundRun, find_runs
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
-from deal_hw.drivers import claim_name, default_transport, make_robot, wire_claim
 from deal_hw.errors import ConfigurationError, DealHwError, PortBusyError
 from deal_hw.ranges import Checked, Range
+from deal_hw.robots import claim_name, default_transport, make_robot, same_machine, wire_claim
 from deal_hw.signals import taken
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import GO2, from_settings, given, refuse, refuse_others
@@ -131,7 +131,7 @@ def run_stop(settings: StopSettings, say: Say) -> StopReport:
 
 def _is_meant(settings: StopSettings, run: FoundRun) -> bool:
     """Return whether a run commands this robot; a Go2 on a stand is a Go2."""
-    if run.facts["robot"].partition("_")[0] != settings.robot.partition("_")[0]:
+    if not same_machine(run.facts["robot"], settings.robot):
         return False
     return not settings.port or run.facts["claim"] == _claim(settings)
 

@@ -262,7 +262,8 @@ def train_policy(
     import inspect
 
     from deal_hw.policies.onnx_export import export_network
-    from deal_hw.policies.tasks import OWN_TASK, training_task
+    from deal_hw.policies.tasks import OWN_TASK
+    from deal_hw.robots import training_task
 
     task = OWN_TASK if env else training_task(robot)
     teacher, config = task.trainer_and_config(trainer, steps)
@@ -360,7 +361,7 @@ def udr_distribution(robot: str) -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot.
     """
-    from deal_hw.policies.tasks import training_task
+    from deal_hw.robots import training_task
 
     task = training_task(robot)
     return ParameterDistribution.uniform(_space(robot).with_ratio(task.udr_ratio), task.udr_latency_s)
@@ -372,7 +373,7 @@ def nominal_distribution(robot: str) -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot.
     """
-    from deal_hw.policies.tasks import training_task
+    from deal_hw.robots import training_task
 
     task, space = training_task(robot), _space(robot)
     K = len(space)
@@ -399,7 +400,7 @@ def _with_verdict(path: Path) -> tuple[ParameterDistribution, str]:
 
 
 def _space(robot: str) -> ParameterSpace:
-    from deal_hw.drivers import parameter_spaces
+    from deal_hw.robots import parameter_spaces
 
     return next(iter(parameter_spaces(robot).values()))()
 

@@ -52,6 +52,11 @@ def open_can(
     return PythonCanTransport(port, clock, accept)
 
 
+def adopt_can(fd: int, clock: Clock | None = None, port: str = "") -> CanTransport:
+    """Return a transport over the descriptor of a serial adapter that a parent process opened."""
+    return open_can(port, clock, fd=fd)
+
+
 class PythonCanTransport(CanTransport):
     """An adapter that python-can drives: socketcan, virtual, pcan, kvaser and others.
 

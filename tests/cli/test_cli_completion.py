@@ -12,7 +12,7 @@ import pytest
 
 from deal_hw.cli.completion import completion
 from deal_hw.cli.main import EXIT_ERROR, VERBS, main
-from deal_hw.drivers import ROBOTS
+from deal_hw.robots import driven_robots
 
 pytestmark = pytest.mark.real_time
 
@@ -72,7 +72,7 @@ def test_tab_completes(script: Path, tmp_path: Path, words: tuple[str, ...], exp
 def test_tab_offers_every_verb_and_robot(script: Path, tmp_path: Path) -> None:
     """From the tables, so that a new one is there."""
     assert offered(script, tmp_path, "") >= set(VERBS)
-    assert offered(script, tmp_path, "deploy", "") >= set(ROBOTS)
+    assert offered(script, tmp_path, "deploy", "") >= set(driven_robots())
 
 
 def test_bash_offers_files_where_nothing_fits(script: Path) -> None:

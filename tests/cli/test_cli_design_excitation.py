@@ -143,7 +143,7 @@ def test_playing_needs_no_extra(optimal: Path) -> None:
     """The control process plays an optimal excitation without torch, mujoco and scipy."""
     code = (
         "import sys; from deal_hw.workflows.running.plan import RunPlan, make_behaviour; "
-        "from deal_hw.drivers import robot_description; import deal_hw.cli.collect; "
+        "from deal_hw.robots import robot_description; import deal_hw.cli.collect; "
         f"plan = RunPlan(robot='cartpole', motion='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
         "seconds=2.0); make_behaviour(plan, robot_description('cartpole')); "
         "print([m for m in ('torch', 'mujoco', 'scipy') if m in sys.modules])"

@@ -22,9 +22,9 @@ from verb_options import Option, kind_of, options
 
 from deal_hw.cli.main import VERBS, main, parse
 from deal_hw.errors import DealHwError
+from deal_hw.robots import robot_entry
 from deal_hw.workflows.emulation import cartpole as emulated_cartpole
 from deal_hw.workflows.emulation import go2 as emulated_go2
-from deal_hw.workflows.emulation.settings import CARTPOLE_EMULATORS
 from deal_hw.workflows.train import udr_distribution
 
 MJCF = """<mujoco model="arm"><compiler angle="radian"/><option timestep="0.005" integrator="implicitfast"/>
@@ -299,8 +299,8 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     emulator = types.SimpleNamespace(
         open=lambda: "port", close=lambda: None, changes=[], report=lambda: {}, slips=0, dropped=0
     )
-    for path in CARTPOLE_EMULATORS.values():
-        monkeypatch.setattr(path.replace(":", "."), note("emulator", emulator))
+    for wire in robot_entry("cartpole").wires:
+        monkeypatch.setattr(str(wire.emulator).replace(":", "."), note("emulator", emulator))
     from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
 

@@ -20,7 +20,6 @@ from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
-from deal_hw.drivers import parameter_spaces
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as SIMULATED
 from deal_hw.drivers.go2.descriptions.floor import LEGS
@@ -32,6 +31,7 @@ from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.excitation.limits import room
 from deal_hw.motions.excitation.plan import ExcitationDesign, make_plan, read_plan
+from deal_hw.robots import parameter_spaces
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness", "damping"))

@@ -26,7 +26,6 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.run_folder import RunFolder
-from deal_hw.drivers import make_topic_transport, make_transport
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.go2.emulator.sport_service import SportMode
@@ -42,6 +41,7 @@ from deal_hw.errors import (
 from deal_hw.motions.excitation.waveforms import Sweep, random_steps
 from deal_hw.parameters import Parameter
 from deal_hw.reading import object_of, texts
+from deal_hw.robots import make_topic_transport, make_transport
 from deal_hw.schema import from_values
 from deal_hw.sim.engine.single import SingleSimulation
 from deal_hw.sim.mjcf.changes import differences

@@ -19,7 +19,6 @@ from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.emulate import Emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.drivers import claim_name, make_robot
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator.can_emulator import can_device, can_devices, can_emulator
 from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
@@ -42,6 +41,7 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
+from deal_hw.robots import claim_name, make_robot
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command

@@ -10,7 +10,6 @@ import pytest
 
 from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
@@ -25,6 +24,7 @@ from deal_hw.errors import (
     TransportLostError,
     UnknownNameError,
 )
+from deal_hw.robots import adopt_robot, make_robot
 from deal_hw.testing.robot_suite import default_command
 from deal_hw.transport import Message
 from deal_hw.types import Status

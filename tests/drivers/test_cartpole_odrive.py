@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole.chips import native
 from deal_hw.drivers.cartpole.emulator.odrive_drive import OdriveFirmware
 from deal_hw.drivers.cartpole.emulator.odrive_emulator import odrive_device
@@ -32,6 +31,7 @@ from deal_hw.errors import (
     TransportTimeoutError,
     WrongDeviceError,
 )
+from deal_hw.robots import make_robot
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command

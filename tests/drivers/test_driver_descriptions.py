@@ -15,24 +15,24 @@ import pytest
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import (
-    DESCRIPTIONS,
-    ROBOTS,
-    SPACES,
-    make_robot,
-    parameter_spaces,
-    robot_description,
-)
 from deal_hw.drivers.ant import model as ant_model
 from deal_hw.drivers.ant.description import DEFAULT, PAPER
 from deal_hw.drivers.humanoid import model as humanoid_model
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.robots import (
+    make_robot,
+    parameter_spaces,
+    robot_description,
+    robots,
+)
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.sim.parameters import KIND_TABLE, check_space
 
-EVERY = [(robot, name) for robot in SPACES for name in parameter_spaces(robot)]
+ENTRIES = robots().entries()
+DESCRIBED = [entry.name for entry in ENTRIES if entry.description]
+EVERY = [(entry.name, name) for entry in ENTRIES for name in entry.parameter_spaces()]
 SIZES = {
     ("allegro", "default"): 42,
     ("allegro", "paper"): 122,
@@ -64,7 +64,7 @@ def _space(robot: str, name: str) -> ParameterSpace:
     return parameter_spaces(robot)[name]()
 
 
-@pytest.mark.parametrize("name", DESCRIPTIONS)
+@pytest.mark.parametrize("name", DESCRIBED)
 def test_description_agrees_with_its_model(name: str) -> None:
     """Joints in model order, one actuator each, the base as said, effort limits as described."""
     description = robot_description(name)
@@ -94,7 +94,7 @@ def test_description_agrees_with_its_model(name: str) -> None:
         assert low <= pose <= high
 
 
-@pytest.mark.parametrize("name", DESCRIPTIONS)
+@pytest.mark.parametrize("name", DESCRIBED)
 def test_every_number_has_a_source(name: str) -> None:
     """What a reader may doubt says where it comes from."""
     needed = {
@@ -127,7 +127,7 @@ def test_space_has_its_size_and_fits_its_model(robot: str, name: str) -> None:
         assert np.all((wide.center > wide.low) & (wide.center < wide.high))
 
 
-@pytest.mark.parametrize("robot", [name for name in DESCRIPTIONS if name != "go2_suspended"])
+@pytest.mark.parametrize("robot", [name for name in DESCRIBED if name != "go2_suspended"])
 def test_default_preset_is_what_the_model_has(robot: str) -> None:
     """The nominal values of the first parameter set are the MJCF's own."""
     space, loaded = _space(robot, next(iter(parameter_spaces(robot)))), load_model(robot_description(robot))
@@ -323,7 +323,7 @@ def test_allegro_holds_its_cube() -> None:
 
 def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
     """A description is not a driver."""
-    for name in set(DESCRIPTIONS) - set(ROBOTS):
+    for name in (entry.name for entry in ENTRIES if not entry.driven):
         with pytest.raises(ConfigurationError, match=f"{name!r}.*no driver yet.*cartpole"):
             make_robot(name, "serial", "x", MonotonicClock())
     with pytest.raises(UnknownNameError, match=r"cartpole, go2, go2_on_stand, allegro, ant"):
@@ -331,15 +331,15 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
     with pytest.raises(UnknownNameError, match="go2_suspended"):
         parameter_spaces("gotwo")
     # The Go2 on the floor is simulated at other rates than its wire has.
-    assert set(ROBOTS) & set(DESCRIPTIONS) == {"go2"}
+    assert [entry.name for entry in ENTRIES if entry.driven and entry.description] == ["go2"]
 
 
 def test_descriptions_load_no_simulator() -> None:
     """Facts are read where neither MuJoCo nor gymnasium is loaded."""
-    names = list(DESCRIPTIONS)
+    names = list(DESCRIBED)
     code = (
         "import sys\n"
-        "from deal_hw.drivers import parameter_spaces, robot_description\n"
+        "from deal_hw.robots import parameter_spaces, robot_description\n"
         f"for name in {names}: robot_description(name); parameter_spaces(name)\n"
         "print([m for m in ('torch', 'mujoco', 'scipy', 'gymnasium', 'yaml') if m in sys.modules])\n"
     )

@@ -6,24 +6,25 @@ import sys
 import pytest
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import (
-    REACHED_BY,
-    ROBOTS,
-    TOPIC_TRANSPORTS,
-    TRANSPORTS,
+from deal_hw.errors import ConfigurationError, PortNotFoundError, UnknownNameError
+from deal_hw.robot import Robot
+from deal_hw.robots import (
     adopt_robot,
+    carries_topics,
     default_transport,
     driver_description,
     make_robot,
     robot_description,
+    robots,
+    transports,
 )
-from deal_hw.errors import ConfigurationError, PortNotFoundError, UnknownNameError
-from deal_hw.robot import Robot
 
 pytestmark = pytest.mark.real_time
 
+DRIVEN = {entry.name: [wire.name for wire in entry.wires] for entry in robots().entries() if entry.driven}
 
-@pytest.mark.parametrize("name", ROBOTS)
+
+@pytest.mark.parametrize("name", DRIVEN)
 def test_every_robot_is_described_under_its_name(name: str) -> None:
     """The description's name is the table's, its model is there, its digest is stable."""
     description = driver_description(name)
@@ -40,7 +41,7 @@ NOWHERE = {
     "zenoh": "tcp/127.0.0.1:1",
     "dynamixel": "/dev/does_not_exist?pole_id=3",
 }
-PAIRS = [(name, transport) for name in ROBOTS for transport in REACHED_BY[name]]
+PAIRS = [(name, wire) for name, wires in DRIVEN.items() for wire in wires]
 
 
 @pytest.mark.parametrize(("name", "transport"), PAIRS)
@@ -55,7 +56,7 @@ def test_every_pair_can_be_made_without_touching_the_port(name: str, transport: 
 @pytest.mark.parametrize(("name", "transport"), PAIRS)
 def test_descriptors_are_inherited_where_there_are_any(name: str, transport: str) -> None:
     """A serial port is adopted; a transport of topics says that each process opens its own."""
-    if transport in TOPIC_TRANSPORTS:
+    if carries_topics(transport):
         with pytest.raises(ConfigurationError, match="make_robot"):
             adopt_robot(name, transport, 999, MonotonicClock())
     else:
@@ -63,12 +64,12 @@ def test_descriptors_are_inherited_where_there_are_any(name: str, transport: str
         assert isinstance(made, Robot)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", DRIVEN)
 def test_a_robot_says_how_it_is_reached(name: str) -> None:
     """The first of its transports is the default, and others are refused with the choice."""
-    assert default_transport(name) == REACHED_BY[name][0]
-    for transport in set(TRANSPORTS) - set(REACHED_BY[name]):
-        with pytest.raises(ConfigurationError, match=REACHED_BY[name][0]):
+    assert default_transport(name) == DRIVEN[name][0]
+    for transport in set(transports().names()) - set(DRIVEN[name]):
+        with pytest.raises(ConfigurationError, match=DRIVEN[name][0]):
             make_robot(name, transport, NOWHERE[transport], MonotonicClock())
 
 
@@ -87,7 +88,7 @@ def test_a_driver_loads_neither_torch_nor_mujoco_nor_scipy() -> None:
     code = (
         "import sys\n"
         "from deal_hw.clock import MonotonicClock\n"
-        "from deal_hw.drivers import make_robot\n"
+        "from deal_hw.robots import make_robot\n"
         "make_robot('cartpole', 'serial', 'x', MonotonicClock())\n"
         "print([m for m in ('torch', 'mujoco', 'scipy', 'pytest', 'rerun') if m in sys.modules])\n"
     )

@@ -22,7 +22,6 @@ from dynamixel_sdk import (
 )
 
 from deal_hw.clock import Clock, MonotonicClock, VirtualClock
-from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole.dynamixel.connect import dynamixel_robot, parse_port
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
@@ -36,6 +35,7 @@ from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError
 from deal_hw.findings import Finding, Severity
+from deal_hw.robots import make_robot
 from deal_hw.transport import Transport
 
 pytestmark = pytest.mark.real_time

@@ -12,7 +12,6 @@ from fakes.memory_wire import MemoryWire
 
 from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
 from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, Go2Faults
@@ -23,6 +22,7 @@ from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncod
 from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
+from deal_hw.robots import make_topic_transport
 from deal_hw.transport import Message, WireOptions
 from deal_hw.workflows.emulation.go2 import free_port, summary
 from deal_hw.workflows.emulation.process import EmulatorProcess

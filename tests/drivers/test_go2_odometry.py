@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.drivers import walked
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.motions.scores.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.motions.velocity import ScriptVelocity
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.robots import walked
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.legged.weighing import standing_mass
 from deal_hw.workflows.emulation.virtual_go2 import VirtualWalk, walk

@@ -15,7 +15,6 @@ from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopRepor
 from deal_hw.control.process.channel import RUNNING
 from deal_hw.control.safety.passive import make_passive
 from deal_hw.control.safety.safety import Safety
-from deal_hw.drivers import make_robot
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
@@ -39,6 +38,7 @@ from deal_hw.errors import (
 )
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.robots import make_robot
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.types import RobotState, Status
 

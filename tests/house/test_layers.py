@@ -32,10 +32,11 @@ LAYER = {
     **dict.fromkeys(CONTRACTS, 1),
     **dict.fromkeys(SERVICES, 2),
     **dict.fromkeys(LEAVES, 3),
-    "workflows": 4,
-    "cli": 5,
-    "bench": 5,
-    "__main__": 6,
+    "robots": 4,
+    "workflows": 5,
+    "cli": 6,
+    "bench": 6,
+    "__main__": 7,
 }
 """Layer of each part; a part may import parts of lower layers and itself."""
 
@@ -222,7 +223,7 @@ def test_repository_keeps_the_order() -> None:
         ("drivers/x.py", "import deal_hw.calib.deal", "drivers imports calib"),
         ("calib/x.py", "from deal_hw import policies", "calib imports policies"),
         ("policies/x.py", "def f():\n    import deal_hw.drivers.cartpole", "policies imports drivers"),
-        ("deal_hw/control/x.py", "from deal_hw.drivers import ROBOTS", "control imports drivers"),
+        ("deal_hw/control/x.py", "from deal_hw.drivers import go2", "control imports drivers"),
         ("deal_hw/robot.py", "from deal_hw.data.reader import read", "robot imports data"),
         ("deal_hw/types.py", "from deal_hw.robot import Robot", "types imports robot"),
         ("drivers/x.py", "from deal_hw.cli import main", "drivers imports cli"),
@@ -243,6 +244,9 @@ def test_repository_keeps_the_order() -> None:
         ("drivers/x.py", "run(['-m', 'deal_hw.cli.demo'])", "drivers imports cli"),
         ("policies/x.py", "TABLE = {'deal': 'deal_hw.calib.deal:Deal'}", "policies imports calib"),
         ("drivers/x.py", "import mujoco", "loads mujoco"),
+        ("drivers/x.py", "from deal_hw.robots import make_robot", "drivers imports robots"),
+        ("policies/x.py", "from deal_hw.robots import robots", "policies imports robots"),
+        ("deal_hw/robots/x.py", "from deal_hw.workflows import train", "robots imports workflows"),
         ("deal_hw/cli/x.py", "import rerun as rr", "loads rerun"),
         ("deal_hw/cli/x.py", "from deal_hw.bench import rows", "cli imports bench"),
         ("deal_hw/bench/x.py", "from deal_hw.cli import calibrate", "bench imports cli"),
@@ -266,7 +270,7 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
     [
         (
             "deal_hw/cli/x.py",
-            "import tyro\nfrom deal_hw.calib import deal\nfrom deal_hw.drivers import ROBOTS",
+            "import tyro\nfrom deal_hw.calib import deal\nfrom deal_hw.robots import robots",
         ),
         (
             "calib/x.py",

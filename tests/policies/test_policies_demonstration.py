@@ -15,7 +15,6 @@ from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings
 from deal_hw.calib.search.resume import digest
 from deal_hw.calib.search.rollouts import control_ticks, rollout_population
 from deal_hw.calibration import Budget
-from deal_hw.drivers import parameter_spaces, robot_description
 from deal_hw.errors import PolicyMismatchError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.policies.demonstration import (
@@ -29,8 +28,8 @@ from deal_hw.policies.demonstration import (
 from deal_hw.policies.go2_env import walk_spec
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.tasks import training_task
 from deal_hw.policy import Observation, PolicySpec, in_base_frame
+from deal_hw.robots import parameter_spaces, robot_description, training_task
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
 from deal_hw.sim.recordings.target import TargetRecording, record_target

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from deal_hw.drivers import parameter_spaces, robot_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.demonstration import Demonstration
 from deal_hw.policies.hand_env import HandEnv, TurnTask, turn_spec
 from deal_hw.policies.locomotion import judge
 from deal_hw.policy import Observation, rotation_between
+from deal_hw.robots import parameter_spaces, robot_description
 from deal_hw.types import FloatArray
 
 HAND = robot_description("allegro")

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.drivers import robot_description
 from deal_hw.drivers.humanoid.description import GEAR_NM
 from deal_hw.drivers.humanoid.model import joint_type
 from deal_hw.errors import ConfigurationError, PolicyError
@@ -20,6 +19,7 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.ppo import PpoConfig, PpoTrainer
 from deal_hw.policies.vector_env import Mirror
 from deal_hw.policy import ObservationTerm
+from deal_hw.robots import robot_description
 from deal_hw.types import FloatArray
 from deal_hw.workflows.train import nominal_distribution
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from deal_hw.control.safety.filter import SafetyFilter
-from deal_hw.drivers import parameter_spaces, recorded_description, robot_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
@@ -23,6 +22,7 @@ from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.run_env import RunEnv, RunTask, run_spec
 from deal_hw.policy import Observation, PolicySpec
+from deal_hw.robots import parameter_spaces, recorded_description, robot_description
 from deal_hw.types import FloatArray, JointCommand
 
 ROOT = Path(__file__).resolve().parents[2]

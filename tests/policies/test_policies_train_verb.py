@@ -15,12 +15,12 @@ import pytest
 import deal_hw.cli.main as cli
 import deal_hw.cli.train as train_module
 from deal_hw.cli.train import Train, train
-from deal_hw.drivers import driver_description
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import VERDICT
+from deal_hw.robots import driver_description
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import read_distribution, udr_distribution
 

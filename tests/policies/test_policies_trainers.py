@@ -29,9 +29,9 @@ from deal_hw.policies.sac import SacConfig, SacTrainer
 from deal_hw.policies.sb3_model import model_path, read_start, restore_optimisers
 from deal_hw.policies.servo_loop import EXACT_SENSOR
 from deal_hw.policies.single_env import SingleEnv
-from deal_hw.policies.tasks import TASKS
 from deal_hw.policies.trainers import TRAINERS, make_trainer
 from deal_hw.policy import Policy
+from deal_hw.robots import trained_robots, training_task
 from deal_hw.testing.trainer_suite import TrainerCase, TrainerSuite
 from deal_hw.training import TrainingFiles
 
@@ -281,12 +281,12 @@ def test_unknown_trainer_lists_the_trainers() -> None:
 
 
 @pytest.mark.parametrize("name", list(TRAINERS))
-@pytest.mark.parametrize("robot", list(TASKS))
+@pytest.mark.parametrize("robot", trained_robots())
 def test_every_task_has_settings_for_every_trainer(robot: str, name: str) -> None:
     """A trainer beside the usual one can be chosen for each robot, and the steps with it."""
-    trainer, config = TASKS[robot].trainer_and_config(name, 123_456)
+    trainer, config = training_task(robot).trainer_and_config(name, 123_456)
     assert (trainer.name, config.steps) == (name, 123_456)
-    assert TASKS[robot].members[name] > 0
+    assert training_task(robot).members[name] > 0
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,12 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
-from deal_hw.policies.registration import IDS
 from deal_hw.policies.single_env import SingleEnv
+from deal_hw.robots import robots
 from deal_hw.workflows import environments
 from deal_hw.workflows.train import udr_distribution
+
+IDS = [entry.environment for entry in robots().entries() if entry.environment]
 
 
 @pytest.mark.parametrize("name", IDS)

@@ -13,9 +13,9 @@ from deal_hw.calibration import listed
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.data.recording.spikes import SpikeSettings
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import parameter_spaces
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.robots import parameter_spaces
 from deal_hw.types import Trajectory
 from deal_hw.workflows.calibration.policy import recorded_policy
 from deal_hw.workflows.calibration.run import CalibrationInputs

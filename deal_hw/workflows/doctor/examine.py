@@ -6,19 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import (
-    CAN_BUSES,
-    TOPIC_TRANSPORTS,
-    can_bus,
+from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.findings import Finding, Severity
+from deal_hw.ranges import Checked, Range
+from deal_hw.robots import (
     default_transport,
     make_robot,
     make_topic_transport,
     on_this_computer,
+    other_wires,
+    reached_over,
 )
-from deal_hw.errors import ConfigurationError, DealHwError
-from deal_hw.findings import Finding, Severity
-from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.doctor.robot import examine_robot
@@ -103,8 +102,7 @@ def doctor(settings: DoctorSettings) -> DoctorReport:
 
 def examine(config: DoctorSettings) -> Iterator[Finding]:
     """Yield each finding at once; see :func:`doctor`."""
-    from deal_hw.drivers.transports.can_transport import open_can
-    from deal_hw.workflows.doctor.can import list_adapters, listen_to_bus
+    from deal_hw.workflows.doctor.can import list_adapters
 
     name = _transport(config)
     yield from examine_machine()
@@ -114,28 +112,31 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
         return
     clock = MonotonicClock()
     try:
-        if name not in TOPIC_TRANSPORTS:
-            if name in CAN_BUSES:
-                bus, nodes = can_bus(name, config.port)
-                yield from listen_to_bus(open_can(bus, clock), clock, min(1.0, config.seconds), *nodes)
-            if name == "dynamixel":
-                from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
-
-                yield from examine_servos(config.port, clock)
-            robot = make_robot(config.robot, name, config.port, clock, config.wire)
-            local = on_this_computer(name, config.port)
-            yield from examine_robot(config.robot, robot, clock, config.seconds, local)
-            return
-        from deal_hw.drivers.go2.doctor import Go2Doctor
-
-        link = make_topic_transport(name, config.port, clock, config.wire)
-        yield from Go2Doctor(link, clock, config.seconds, config.state_check, config.simulator).run()
+        yield from _examine_link(config, name, clock)
     except DealHwError as error:
         yield Finding("link", Severity.FAIL, str(error))
-        if config.robot == "cartpole":
-            from deal_hw.drivers.cartpole.wire.other_wires import name_other_wire
+        yield from other_wires(config.robot, config.port, name, clock)
 
-            yield from name_other_wire(config.port, name, clock)
+
+def _examine_link(config: DoctorSettings, name: str, clock: Clock) -> Iterator[Finding]:
+    """Yield findings on a robot and its wire; what is looked at beside the robot is the wire's."""
+    from deal_hw.drivers.transports.can_transport import open_can
+    from deal_hw.workflows.doctor.can import listen_to_bus
+
+    entry, wire = reached_over(config.robot, name)
+    if wire.doctor:
+        link = make_topic_transport(wire.transport, config.port, clock, config.wire)
+        doctor = entry.load(wire.doctor)
+        yield from doctor(link, clock, config.seconds, config.state_check, config.simulator).run()
+        return
+    if wire.bus:
+        bus, nodes = entry.load(wire.bus)(config.port)
+        yield from listen_to_bus(open_can(bus, clock), clock, min(1.0, config.seconds), *nodes)
+    if wire.examine:
+        yield from entry.load(wire.examine)(config.port, clock)
+    robot = make_robot(config.robot, name, config.port, clock, config.wire)
+    local = on_this_computer(name, config.port)
+    yield from examine_robot(config.robot, robot, clock, config.seconds, local)
 
 
 def _transport(config: DoctorSettings) -> str:

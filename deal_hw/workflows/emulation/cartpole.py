@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
 from deal_hw.errors import MissingExtraError
+from deal_hw.robots import robot_entry
 from deal_hw.workflows.emulation.common import (
     choose_truth,
     happenings,
@@ -18,7 +18,6 @@ from deal_hw.workflows.emulation.common import (
     run_until,
 )
 from deal_hw.workflows.emulation.settings import (
-    CARTPOLE_EMULATORS,
     CARTPOLE_RANGE_RATIO,
     ON_CAN,
     WITH_FIRMWARE,
@@ -43,9 +42,10 @@ def emulate_cartpole(
         announce: Called with the port first, and with the truth at the end.
         say: Called with a summary at the end.
     """
-    module, _, function = CARTPOLE_EMULATORS[config.transport or "serial"].partition(":")
+    entry = robot_entry(config.robot)
+    wire = entry.wire(config.transport or entry.emulated_on[0])
     try:
-        make = getattr(importlib.import_module(module), function)
+        make = entry.load(wire.emulator)
     except ModuleNotFoundError as error:
         if error.name in ("mujoco", "scipy"):
             raise MissingExtraError(error.name, "sim") from error
@@ -53,7 +53,7 @@ def emulate_cartpole(
     truth = _truth(config)
     own: dict[str, str] = {}
     runs = ""
-    if (config.transport or "serial") in WITH_FIRMWARE:
+    if wire.name in WITH_FIRMWARE:
         from deal_hw.drivers.cartpole.chips.firmwares import usable_firmware
 
         own["firmware"] = usable_firmware(config.firmware)

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.errors import ConfigurationError, MissingExtraError, shown
 from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
+from deal_hw.robots import make_topic_transport, robot_entry
 from deal_hw.workflows.emulation.common import (
     choose_truth,
     happenings,
@@ -28,7 +28,7 @@ from deal_hw.workflows.emulation.common import (
     reveal,
     run_until,
 )
-from deal_hw.workflows.emulation.settings import DEFAULT_PORTS, EmulateSettings
+from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -52,16 +52,18 @@ def emulate_go2(
         announce: Called with the port first, and with the truth at the end.
         say: Called with a summary at the end.
     """
+    entry = robot_entry(config.robot)
+    own_wire = entry.wire(config.transport or entry.emulated_on[0])
     try:
-        from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
+        Go2Emulator = entry.load(own_wire.emulator)
     except ModuleNotFoundError as error:
         if error.name == "mujoco":
             raise MissingExtraError(error.name, "sim") from error
         raise
     truth = _truth(config)
     device = _device(config, truth)
-    transport = config.transport or "dds"
-    port = free_port(config.port or DEFAULT_PORTS[transport])
+    transport = own_wire.name
+    port = free_port(config.port or own_wire.emulator_port)
     wire = make_topic_transport(transport, port, MonotonicClock(), config.go2.wire(transport))
     emulator = Go2Emulator(device, wire)
     gc.collect()

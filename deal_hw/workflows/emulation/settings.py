@@ -10,13 +10,12 @@ from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.ranges import Checked, Range, check_ranges
+from deal_hw.robots import emulated_robots, robot_entry
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import CARTPOLE, File, Only, Ratio, Seed, Share, given, refuse, refuse_others
 from deal_hw.workflows.robot import is_user_robot
 
 GO2 = Only(("go2",))
-DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
-"""Transports of the Go2, and the emulator's default port on each: reachable on this machine only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,20 +82,10 @@ class Go2Options(Checked):
         )
 
 
-CARTPOLE_EMULATORS = {
-    "serial": "deal_hw.drivers.cartpole.emulator.emulator:serial_emulator",
-    "can": "deal_hw.drivers.cartpole.emulator.can_emulator:can_emulator",
-    "odrive": "deal_hw.drivers.cartpole.emulator.odrive_emulator:odrive_emulator",
-    "dynamixel": "deal_hw.drivers.cartpole.dynamixel.emulator:dynamixel_emulator",
-}
-"""Wires of the cart-pole -> "module:function"; the function is called as
-``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
 ON_CAN = ("can", "odrive")
 """Wires of the cart-pole with a CAN bus."""
 WITH_FIRMWARE = ("serial", "can", "odrive")
 """Wires of the cart-pole with our firmware; their functions also take ``firmware=...``."""
-TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
-"""Robots to emulate and their wires; the first wire is the default."""
 CARTPOLE_RANGE_RATIO = 5.0
 
 
@@ -198,12 +187,11 @@ class EmulateSettings:
                 f"{self.robot}: deal-hw has no driver for this robot, so there is nothing to emulate; "
                 "`deal-hw collect robot.yaml --simulated` records its simulation"
             )
-        if self.robot not in TRANSPORTS:
-            raise UnknownNameError("robot to emulate", self.robot, TRANSPORTS)
-        if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:
-            raise UnknownNameError("transport to emulate on", self.transport, TRANSPORTS[self.robot])
+        wires = emulated_wires(self.robot)
+        if self.transport is not None and self.transport not in wires:
+            raise UnknownNameError("transport to emulate on", self.transport, wires)
         refuse_others(self, "emulate", self.robot)
-        wire = self.transport or TRANSPORTS[self.robot][0]
+        wire = self.transport or wires[0]
         if wire not in ON_CAN:
             refuse(given(self.can, CanFaults()), "only `--transport can` and `odrive` have a CAN bus")
         if wire != "dynamixel":
@@ -223,3 +211,14 @@ class EmulateSettings:
             raise ConfigurationError(
                 "--return-after-s needs --vanish-after-s and --link: the new port has another name"
             )
+
+
+def emulated_wires(robot: str) -> tuple[str, ...]:
+    """Return the wires on which a robot can be emulated; the first is the default.
+
+    Raises:
+        UnknownNameError: It has no emulator.
+    """
+    if robot not in (known := emulated_robots()):
+        raise UnknownNameError("robot to emulate", robot, known)
+    return robot_entry(robot).emulated_on

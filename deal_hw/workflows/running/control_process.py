@@ -108,10 +108,10 @@ def _run(
     from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
     from deal_hw.control.safety.passive import PassiveConfig
     from deal_hw.control.safety.safety import Safety
-    from deal_hw.drivers import adopt_robot, make_robot
     from deal_hw.motions.planned_end import PlannedEnd
     from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, velocity_data
     from deal_hw.motions.velocity import END_KEY, KeyboardVelocity, NotedVelocity
+    from deal_hw.robots import adopt_robot, make_robot
     from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
     plan = RunPlan.from_json(orders)

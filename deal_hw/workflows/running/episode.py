@@ -24,12 +24,12 @@ from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
-from deal_hw.drivers import BALANCE, ODOMETRY, balanced, on_this_computer, walked
 from deal_hw.errors import DealHwError
 from deal_hw.motions.scores.balance import BalanceResult
 from deal_hw.motions.scores.replay_error import ReplayError, replay_error
 from deal_hw.motions.scores.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.robot import Robot
+from deal_hw.robots import balanced, on_this_computer, robot_entry, walked
 from deal_hw.signals import OPERATOR
 from deal_hw.version import __version__
 from deal_hw.workflows.running.episode_end import account
@@ -169,14 +169,14 @@ class EpisodeRun:
 
     def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""
-        if self._plan.robot not in ODOMETRY:
+        if not robot_entry(self._plan.robot).odometry:
             return None
         wanted, track = wanted_velocity(trajectory), walked(self._plan.robot, trajectory)
         return None if wanted is None or track is None else velocity_error(track, wanted)
 
     def _balance(self, trajectory: Trajectory) -> BalanceResult | None:
         """Return how well a policy held the pole up."""
-        if self._plan.robot not in BALANCE or self._plan.motion != "balance":
+        if self._plan.motion != "balance":
             return None
         return balanced(self._plan.robot, trajectory)
 

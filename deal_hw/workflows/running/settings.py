@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from deal_hw.description import RobotDescription
 from deal_hw.documentation import page
-from deal_hw.drivers import default_transport, driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.ranges import Checked, option
+from deal_hw.robots import default_transport, driver_description
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import GO2, File, given, refuse
 from deal_hw.workflows.robot import is_user_robot

@@ -14,10 +14,10 @@ from deal_hw.control.safety.safety import Safety
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.record import CycleRecord
-from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.ranges import Checked, Range
+from deal_hw.robots import driver_description
 from deal_hw.version import __version__
 from deal_hw.workflows.options import File, Ratio, Seed, given, refuse
 from deal_hw.workflows.robot import default_space, is_user_robot, user_robot

@@ -15,8 +15,8 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.process.channel import Beat
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import make_robot
 from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
+from deal_hw.robots import make_robot
 from deal_hw.workflows.options import File
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun

@@ -1,0 +1,172 @@
+"""The robots and transports of deal-hw."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
+
+TRANSPORTS: Final = (
+    TransportEntry(
+        name="serial",
+        api_version=API_VERSION,
+        transport="deal_hw.drivers.transports.serial_transport:SerialTransport",
+        adopt="deal_hw.drivers.transports.serial_transport:SerialTransport.from_fd",
+        claim="deal_hw.robots.ports:path_claim",
+        local="deal_hw.robots.ports:path_is_local",
+    ),
+    TransportEntry(
+        name="can",
+        api_version=API_VERSION,
+        transport="deal_hw.drivers.transports.can_transport:open_can",
+        adopt="deal_hw.drivers.transports.can_transport:adopt_can",
+        claim="deal_hw.robots.ports:can_claim",
+        local="deal_hw.robots.ports:can_is_local",
+        needs="deal-hw[can]",
+    ),
+    TransportEntry(
+        name="dds",
+        api_version=API_VERSION,
+        transport="deal_hw.drivers.transports.dds_transport:DdsTransport",
+        topics=True,
+        options=("domain",),
+        claim="deal_hw.robots.ports:dds_claim",
+        local="deal_hw.robots.ports:dds_is_local",
+        needs="deal-hw[dds]",
+    ),
+    TransportEntry(
+        name="zenoh",
+        api_version=API_VERSION,
+        transport="deal_hw.drivers.transports.zenoh_transport:ZenohTransport",
+        topics=True,
+        options=("listen", "mode", "insecure", "ca", "certificate", "key"),
+        claim="deal_hw.robots.ports:zenoh_claim",
+        local="deal_hw.robots.ports:zenoh_is_local",
+        needs="deal-hw[zenoh]",
+    ),
+)
+
+
+def _go2_wires(emulator: str = "") -> tuple[WireEntry, ...]:
+    """Return the wires of a Go2; its stand has no emulator of its own (``emulate go2 --on-stand``)."""
+    return tuple(
+        WireEntry(
+            name=name,
+            transport=name,
+            emulator=emulator,
+            emulator_port=port if emulator else "",
+            claim="deal_hw.drivers.go2.claim:WireClaim",
+            doctor="deal_hw.drivers.go2.doctor:Go2Doctor",
+        )
+        for name, port in (("dds", "127.0.0.1"), ("zenoh", "tcp/127.0.0.1:7447"))
+    )
+
+
+CARTPOLE: Final = RobotEntry(
+    name="cartpole",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.cartpole.robots.robot:CartpoleRobot",
+    wires=(
+        WireEntry(
+            name="serial",
+            transport="serial",
+            emulator="deal_hw.drivers.cartpole.emulator.emulator:serial_emulator",
+        ),
+        WireEntry(
+            name="can",
+            transport="can",
+            driver="deal_hw.drivers.cartpole.robots.can_robot:can_robot",
+            opens_port=True,
+            emulator="deal_hw.drivers.cartpole.emulator.can_emulator:can_emulator",
+            bus="deal_hw.drivers.cartpole.robots.can_robot:can_bus",
+        ),
+        WireEntry(
+            name="odrive",
+            transport="can",
+            driver="deal_hw.drivers.cartpole.robots.odrive_robot:odrive_robot",
+            opens_port=True,
+            emulator="deal_hw.drivers.cartpole.emulator.odrive_emulator:odrive_emulator",
+            bus="deal_hw.drivers.cartpole.robots.odrive_robot:odrive_bus",
+        ),
+        WireEntry(
+            name="dynamixel",
+            transport="serial",
+            driver="deal_hw.drivers.cartpole.dynamixel.connect:dynamixel_robot",
+            opens_port=True,
+            emulator="deal_hw.drivers.cartpole.dynamixel.emulator:dynamixel_emulator",
+            examine="deal_hw.drivers.cartpole.dynamixel.doctor:examine_servos",
+        ),
+    ),
+    spaces="deal_hw.drivers.cartpole.description:SPACES",
+    balance="deal_hw.motions.scores.balance:recorded_balance",
+    other_wires="deal_hw.drivers.cartpole.wire.other_wires:name_other_wire",
+    task="deal_hw.policies.tasks:CARTPOLE",
+    environment="deal_hw/CartPole-v0",
+    policy="deal_hw.policies:assets/cartpole_udr.onnx",
+)
+GO2: Final = RobotEntry(
+    name="go2",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.go2.robot:Go2Robot",
+    wires=_go2_wires("deal_hw.drivers.go2.emulator.emulator:Go2Emulator"),
+    # On the floor it is simulated at other rates than its wire has.
+    description="deal_hw.drivers.go2.descriptions.floor:DESCRIPTION",
+    spaces="deal_hw.drivers.go2.descriptions.floor:SPACES",
+    simulators={"unitree_mujoco": "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoRobot"},
+    odometry="deal_hw.drivers.go2.odometry:walked",
+    sway="deal_hw.drivers.go2.motions:sway_plan",
+    task="deal_hw.policies.tasks:GO2",
+    environment="deal_hw/Go2-v0",
+    policy="deal_hw.policies:assets/go2_walk.onnx",
+)
+GO2_ON_STAND: Final = RobotEntry(
+    name="go2_on_stand",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.go2.robot:Go2OnStandRobot",
+    wires=_go2_wires(),
+    spaces="deal_hw.drivers.go2.descriptions.on_stand:SPACES",
+    simulators={"unitree_mujoco": "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot"},
+    machine="go2",
+)
+ALLEGRO: Final = RobotEntry(
+    name="allegro",
+    api_version=API_VERSION,
+    description="deal_hw.drivers.allegro.description:DESCRIPTION",
+    spaces="deal_hw.drivers.allegro.description:SPACES",
+    task="deal_hw.policies.tasks:ALLEGRO",
+    environment="deal_hw/Allegro-v0",
+    policy="deal_hw.policies:assets/allegro_turn.onnx",
+)
+ANT: Final = RobotEntry(
+    name="ant",
+    api_version=API_VERSION,
+    description="deal_hw.drivers.ant.description:DESCRIPTION",
+    spaces="deal_hw.drivers.ant.description:SPACES",
+    task="deal_hw.policies.tasks:ANT",
+    environment="deal_hw/Ant-v0",
+    policy="deal_hw.policies:assets/ant_udr.onnx",
+)
+GO2_SUSPENDED: Final = RobotEntry(
+    name="go2_suspended",
+    api_version=API_VERSION,
+    description="deal_hw.drivers.go2.descriptions.on_stand_recording:DESCRIPTION",
+    spaces="deal_hw.drivers.go2.descriptions.on_stand_recording:SPACES",
+    machine="go2",
+)
+HUMANOID: Final = RobotEntry(
+    name="humanoid",
+    api_version=API_VERSION,
+    description="deal_hw.drivers.humanoid.description:DESCRIPTION",
+    spaces="deal_hw.drivers.humanoid.description:SPACES",
+    task="deal_hw.policies.tasks:HUMANOID",
+    environment="deal_hw/Humanoid-v0",
+    policy="deal_hw.policies:assets/humanoid_walk.onnx",
+)
+SO101: Final = RobotEntry(
+    name="so101",
+    api_version=API_VERSION,
+    description="deal_hw.drivers.so101.description:DESCRIPTION",
+    spaces="deal_hw.drivers.so101.description:SPACES",
+)
+ROBOTS: Final = (CARTPOLE, GO2, GO2_ON_STAND, ALLEGRO, ANT, GO2_SUSPENDED, HUMANOID, SO101)
+"""Those with a driver first: messages list them in this order."""

@@ -1,0 +1,339 @@
+"""Robots and transports by name: what the verbs call, over the table of robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.transports.listen_only import listen_only
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.findings import Finding
+from deal_hw.parameters import ParameterSpace
+from deal_hw.robot import Robot
+from deal_hw.robots.entry import RobotEntry, TransportEntry, WireEntry
+from deal_hw.robots.registry import (
+    driven_entry,
+    is_known,
+    robot_entry,
+    robots,
+    transport_entry,
+    transport_of,
+    transports,
+    wires,
+)
+from deal_hw.transport import TopicTransport, Transport, WireOptions
+from deal_hw.types import Trajectory
+
+if TYPE_CHECKING:
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.velocity_error import Track
+    from deal_hw.policies.tasks import TrainingTask
+
+
+def make_robot(
+    name: str,
+    transport_name: str,
+    port: str,
+    clock: Clock,
+    options: WireOptions | None = None,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    can_send: bool = True,
+) -> Robot:
+    """Return a robot that will be reached over a port; nothing is opened yet.
+
+    Args:
+        name: The robot.
+        transport_name: How it is reached.
+        port: Where: a serial port, a network interface, an endpoint.
+        clock: Gives the stamps.
+        options: More about a transport of topics.
+        settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2. ``simulator`` names
+            a simulator in place of the robot, and thereby the driver.
+        can_send: False for listening only, as in a dry run.
+
+    Raises:
+        UnknownNameError: There is no such robot or transport.
+        ConfigurationError: The robot has a description but no driver, is not reached that way, or its driver
+            has no such setting.
+    """
+    entry, wire = reached_over(name, transport_name)
+    given = dict(settings or {})
+    driver = _simulator(entry, given.pop("simulator")) if "simulator" in given else entry.driver_of(wire)
+    if wire.opens_port:
+        _refuse_options(transport_entry(wire.transport), options, wire.name)
+        arguments: tuple[Any, ...] = (port, clock)
+        given["can_send"] = can_send
+    else:
+        link = make_transport(wire.transport, port, clock, options)
+        arguments = (link if can_send else listen_only(link), clock)
+    try:
+        made: Robot = driver(*arguments, **given)
+    except TypeError as error:
+        if not settings:
+            raise
+        raise ConfigurationError(
+            f"{_options(settings)} would have no effect: robot {name!r} has no such setting"
+        ) from error
+    return made
+
+
+def adopt_robot(
+    name: str, transport_name: str, fd: int, clock: Clock, *, port: str = "", can_send: bool = True
+) -> Robot:
+    """Return a robot over a descriptor that a parent process opened and this process inherited.
+
+    Args:
+        name: The robot.
+        transport_name: How it is reached.
+        fd: The descriptor.
+        clock: Gives the stamps.
+        port: What the parent opened, to open it again where the device vanishes and comes back.
+        can_send: False for a robot that is only listened to, as in a dry run.
+
+    Raises:
+        UnknownNameError: There is no such robot or transport.
+        ConfigurationError: The robot has a description, but no driver, or the transport has no descriptor.
+    """
+    entry, wire = reached_over(name, transport_name)
+    driver = entry.driver_of(wire)
+    if wire.opens_port:
+        return driver(port, clock, fd=fd, can_send=can_send)  # type: ignore[no-any-return]
+    transport = transport_entry(wire.transport)
+    if not transport.adopt:
+        raise ConfigurationError(
+            f"transport {transport_name!r} has no descriptor to inherit; each process opens its own "
+            "connection by make_robot()"
+        )
+    link: Transport = transport.load(transport.adopt)(fd, clock=clock, port=port)
+    made: Robot = driver(link if can_send else listen_only(link), clock)
+    return made
+
+
+def make_transport(
+    transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
+) -> Transport:
+    """Return a transport; nothing is opened yet. Arguments and errors as :func:`make_robot`."""
+    entry = transport_entry(transport_name)
+    if entry.topics:
+        return make_topic_transport(transport_name, port, clock, options)
+    _refuse_options(entry, options)
+    made: Transport = entry.load(entry.transport)(port, clock=clock)
+    return made
+
+
+def make_topic_transport(
+    transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
+) -> TopicTransport:
+    """Return a transport of topics; nothing is opened yet.
+
+    Raises:
+        UnknownNameError: There is no such transport, or it carries no topics.
+        ConfigurationError: An option would be ignored.
+    """
+    entry = transports().find(transport_name)
+    if entry is None or not entry.topics:
+        raise UnknownNameError(
+            "transport of topics", transport_name, [one.name for one in transports().entries() if one.topics]
+        )
+    _refuse_options(entry, options)
+    made: TopicTransport = entry.load(entry.transport)(port, clock, options)
+    return made
+
+
+def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
+    """Return the name under which a robot is claimed on this computer: its transport and port."""
+    entry = transport_of(transport_name)
+    where = entry.load(entry.claim)(port, options) if entry.claim else port
+    return f"{transport_name} on {where}"
+
+
+def on_this_computer(transport_name: str, port: str) -> bool:
+    """Return whether a port leads to a program on this computer, such as an emulator: there is no cable."""
+    entry = transport_of(transport_name)
+    return bool(entry.local and entry.load(entry.local)(port))
+
+
+def carries_topics(transport_name: str) -> bool:
+    """Return whether a wire carries messages with topics."""
+    return transport_of(transport_name).topics
+
+
+def wire_claim(
+    name: str, transport_name: str, port: str, clock: Clock, holder: str, options: WireOptions
+) -> Any | None:
+    """Return the claim on a robot that other programs on its wire see; None if the port itself is exclusive.
+
+    Args:
+        name: The robot.
+        transport_name: How it is reached.
+        port: Where.
+        clock: For the waiting.
+        holder: Text that names the claiming program, for messages of other programs.
+        options: More about a transport of topics.
+    """
+    entry, wire = reached_over(name, transport_name)
+    if not wire.claim:
+        return None
+    link = make_topic_transport(wire.transport, port, clock, options)
+    return entry.load(wire.claim)(link, clock, holder)
+
+
+def reached_over(name: str, transport_name: str) -> tuple[RobotEntry, WireEntry]:
+    """Return a robot's entry and its wire of that name.
+
+    Raises:
+        UnknownNameError: There is no such robot or wire.
+        ConfigurationError: The robot has no driver, or is not reached that way.
+    """
+    entry = driven_entry(name)
+    own = [wire.name for wire in entry.wires]
+    if transport_name in own:
+        return entry, entry.wire(transport_name)
+    known = dict.fromkeys((*(wire.name for wire in wires()), *transports().names()))
+    if transport_name not in known:
+        raise UnknownNameError("transport", transport_name, known)
+    raise ConfigurationError(
+        f"robot {name!r} is not reached by transport {transport_name!r}; "
+        f"choose --transport {' or '.join(own)}"
+    )
+
+
+def driver_description(name: str) -> RobotDescription:
+    """Return the facts about a robot in its driver, with the rates of its real wire.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    return driven_entry(name).driver_description()
+
+
+def recorded_description(name: str) -> RobotDescription:
+    """Return the facts under which a robot's recordings were made: its driver's, where it has one.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    return robot_entry(name).recorded_description()
+
+
+def robot_description(name: str) -> RobotDescription:
+    """Return the facts about a robot, whether it has a driver or not.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        MissingExtraError: The package that carries the robot's model is not installed.
+    """
+    return robot_entry(name).model_description()
+
+
+def parameter_spaces(name: str) -> Mapping[str, Callable[[], ParameterSpace]]:
+    """Return a robot's parameter sets by name; the first is the default.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: A plug-in's robot has none.
+    """
+    entry = robot_entry(name)
+    if not entry.spaces:
+        raise ConfigurationError(
+            f"robot {name!r} ({entry.origin}) has no parameter sets; give one with --parameters FILE"
+        )
+    return entry.parameter_spaces()
+
+
+def default_transport(name: str) -> str:
+    """Return the transport that usually reaches a robot.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    return driven_entry(name).wires[0].name
+
+
+def same_machine(one: str, other: str) -> bool:
+    """Return whether two names are entries of one machine: a Go2 on a stand is a Go2.
+
+    A name may be that of a robot which is not installed any more, as in the note of a run.
+    """
+    return _machine(one) == _machine(other)
+
+
+def walked(name: str, trajectory: Trajectory) -> Track | None:
+    """Return a robot's path by its own sensors; None if it does not walk or has no odometry."""
+    entry = robot_entry(name)
+    found: Track | None = entry.load(entry.odometry)(trajectory) if entry.odometry else None
+    return found
+
+
+def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
+    """Return how well a robot's pole was held up; None without a pole, or without a duration."""
+    entry = robot_entry(name)
+    found: BalanceResult | None = entry.load(entry.balance)(trajectory) if entry.balance else None
+    return found
+
+
+def training_task(name: str) -> TrainingTask:
+    """Return a robot's training task.
+
+    Raises:
+        UnknownNameError: There is none; the message lists the robots.
+    """
+    if not has_task(name):
+        raise UnknownNameError("robot with a training environment", name, trained_robots())
+    entry = robot_entry(name)
+    found: TrainingTask = entry.load(entry.task)
+    return found
+
+
+def has_task(name: str) -> bool:
+    """Return whether a robot has a training task."""
+    return is_known(name) and bool(robot_entry(name).task)
+
+
+def trained_robots() -> tuple[str, ...]:
+    """Return the names of the robots with a training task."""
+    return tuple(sorted(entry.name for entry in robots().entries() if entry.task))
+
+
+def other_wires(name: str, port: str, transport_name: str, clock: Clock) -> Iterator[Finding]:
+    """Yield findings on what else a port carries, after a robot did not answer there."""
+    entry = driven_entry(name)
+    if entry.other_wires:
+        yield from entry.load(entry.other_wires)(port, transport_name, clock)
+
+
+def _machine(name: str) -> str:
+    return (robot_entry(name).machine if is_known(name) else "") or name
+
+
+def _simulator(entry: RobotEntry, simulator: str) -> Any:
+    if not entry.simulators:
+        raise ConfigurationError(
+            f"--simulator would have no effect: there is no simulator for robot {entry.name!r}; leave it out"
+        )
+    if simulator not in entry.simulators:
+        raise UnknownNameError(f"simulator of robot {entry.name!r}", simulator, entry.simulators)
+    return entry.load(entry.simulators[simulator])
+
+
+def _options(names: Iterable[str]) -> str:
+    """Return settings as they are typed."""
+    return ", ".join("--" + name.replace("_", "-") for name in names)
+
+
+def _refuse_options(entry: TransportEntry, options: WireOptions | None, wire: str = "") -> None:
+    """Refuse settings that a transport would ignore, by its name or that of the robot's wire."""
+    default = WireOptions().to_json()
+    given = [name for name, value in (options or WireOptions()).to_json().items() if value != default[name]]
+    foreign = [name for name in given if name not in entry.options]
+    if not foreign:
+        return
+    takes = f"takes {_options(entry.options)}" if entry.options else "is no network; leave it out"
+    raise ConfigurationError(
+        f"{_options(foreign)} would have no effect: transport {wire or entry.name!r} {takes}"
+    )
