@@ -223,12 +223,12 @@ class TrialPolicy:
                 )
             reply: dict[str, Any] = json.loads(self._connection.recv_bytes(_MAX_REPLY_BYTES))
         except (EOFError, OSError) as err:
-            raise PolicyError(f"{self.path}: {self._obituary()}") from err
+            raise PolicyError(f"{self.path}: {self._describe_end()}") from err
         if "error" in reply:
             raise PolicyError(reply["error"])
         return reply
 
-    def _obituary(self) -> str:
+    def _describe_end(self) -> str:
         """Return text on how the process ended."""
         try:
             code = self._child.wait(_DYING_S)

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -68,6 +69,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: (not in_real_time(item), -slow[item.path]))
         names = [item.nodeid for item in items if in_real_time(item)]
         Path(config.workerinput["real_time_to"]).write_text(json.dumps(names), encoding="utf-8")
+
+
+LOADED = pytest.StashKey[frozenset[str]]()
+"""Names of the modules that collecting the tests loaded."""
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Note what is loaded before the first test runs: tests/house/test_collection.py looks at it."""
+    session.config.stash[LOADED] = frozenset(sys.modules)
+
+
+@pytest.fixture(scope="session")
+def loaded_by_collection(pytestconfig: pytest.Config) -> frozenset[str]:
+    """The modules that collecting the tests loaded, by their full names."""
+    return pytestconfig.stash[LOADED]
 
 
 computing = False

@@ -124,7 +124,9 @@ class BridgeClient:
         end_ns = self._clock.now_ns() + round(PATIENCE_S * 1e9)
         while not until():
             if self._clock.now_ns() > end_ns:
-                raise TransportTimeoutError(f"not heard within {PATIENCE_S:g} s; the bridge: {self.status}")
+                raise TransportTimeoutError(
+                    f"not received within {PATIENCE_S:g} s; the bridge: {self.status}"
+                )
             self.listen(0.02)
 
     def take_over(self) -> None:

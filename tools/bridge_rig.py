@@ -112,14 +112,14 @@ class BridgeRig:
         """Return the options of a client by its certificate's name."""
         return wire(self.keys, name)
 
-    def told(self) -> list[tuple[int, str]]:
+    def reported(self) -> list[tuple[int, str]]:
         """Return the robot's commands so far: host time [ns], kind of command."""
         lines = self._events.read_text(encoding="utf-8").splitlines()
         return [(stamp_ns, what) for _, stamp_ns, what in map(json.loads, lines)]
 
     def commands(self) -> list[str]:
         """Return the kinds of motor commands so far, in order of change."""
-        return [what for _, what in self.told() if what in ("stiff", "damping", "off")]
+        return [what for _, what in self.reported() if what in ("stiff", "damping", "off")]
 
     def await_commands(self, kinds: Sequence[str]) -> None:
         """Return once the robot has received motor commands of these kinds.

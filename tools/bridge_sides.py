@@ -42,7 +42,7 @@ def run(side: str, orders: dict[str, Any]) -> dict[str, Any]:
     granted = become_realtime()
     link.declare(publish=[own], subscribe=[other])
     sent: dict[int, int] = {}
-    heard: dict[int, int] = {}
+    received: dict[int, int] = {}
     stopped: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: stopped.append(number))
     with link:
@@ -64,8 +64,8 @@ def run(side: str, orders: dict[str, Any]) -> dict[str, Any]:
                     message = link.receive(left_ns * 1e-9)
                     came_ns = clock.now_ns()
                     if came_ns - begin_ns > WARM_NS:
-                        heard[read(message.payload)] = came_ns
-    return {"sent": sent, "heard": heard, "scheduling": granted.scheduling}
+                        received[read(message.payload)] = came_ns
+    return {"sent": sent, "heard": received, "scheduling": granted.scheduling}
 
 
 def _state() -> Callable[[int], bytes]:

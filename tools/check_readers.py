@@ -119,13 +119,13 @@ def make_samples(folder: Path) -> None:
     )
     space = k9_space()
     estimate = space.nominal * 1.1
-    told: list[Identifiability] = ["identifiable"] * (len(space) - 1)
+    reported: list[Identifiability] = ["identifiable"] * (len(space) - 1)
     result = CalibrationResult(
         method="sample",
         space=space,
         estimate=estimate,
         interval=np.stack([0.9 * estimate, 1.1 * estimate], axis=1),
-        verdicts=("not identifiable", *told),
+        verdicts=("not identifiable", *reported),
         latency_s=0.012,
         latency_interval_s=(0.011, 0.013),
     )
@@ -180,7 +180,7 @@ def check(reader: Reader, samples: Path, folder: Path, pip_args: list[str]) -> l
     code = (
         "import sys, importlib.metadata as m; print(', '.join(f'{n} {m.version(n)}' for n in sys.argv[1:]))"
     )
-    told = subprocess.run([python, "-c", code, *names], capture_output=True, text=True, check=False)
+    reported = subprocess.run([python, "-c", code, *names], capture_output=True, text=True, check=False)
     findings = []
     for name in reader.inputs:
         call = [str(python), str(SCRIPTS / reader.script), str(samples / name)]
@@ -189,7 +189,7 @@ def check(reader: Reader, samples: Path, folder: Path, pip_args: list[str]) -> l
         findings.append(
             Finding(
                 reader=reader.name,
-                versions=told.stdout.strip(),
+                versions=reported.stdout.strip(),
                 input=name,
                 passed=done.returncode == 0,
                 words=lines[-1],

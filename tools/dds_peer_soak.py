@@ -118,10 +118,10 @@ def soak(role: str, side: Side, domain: int, seconds: float) -> dict[str, Any]:
         side.run(wire, seconds)
         survey = wire.survey()
         alive = peer.poll() is None
-        said, warnings = peer.communicate()
+        printed, warnings = peer.communicate()
     hashes = {end.topic: end.type_hash for end in survey.endpoints if end.topic in TYPES}
     result = {
-        "peer": json.loads(said) if said else {},
+        "peer": json.loads(printed) if printed else {},
         "peer_alive_at_the_end": alive,
         "peer_exit_code": peer.returncode,
         "peer_warnings": warnings.splitlines(),

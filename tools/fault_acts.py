@@ -162,7 +162,7 @@ def second_run(elsewhere: bool = False) -> Callable[[Rig], None]:
         rig.notes += [] if code == 2 else [f"the second run ended with {code}"]
         text = (rig.folder / "out" / "second").read_text()
         rig.notes += [] if "in use" in text else [f"the second run said {headline(text)!r}"]
-        rig.said.append(f"second run, after {time.monotonic() - begun:.1f} s: {headline(text)}")
+        rig.printed.append(f"second run, after {time.monotonic() - begun:.1f} s: {headline(text)}")
         if rig.run.poll() is not None:
             rig.notes.append("the first run did not go on")
             return

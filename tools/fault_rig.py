@@ -130,7 +130,7 @@ class Rig(ABC):
         self.port = ""
         self.proxy: FaultyProxy | None = None
         self.run: subprocess.Popen[str]
-        self.said: list[str] = []
+        self.printed: list[str] = []
         self._events_at = 0
         self._pids: set[int] = set()
 
@@ -258,7 +258,7 @@ class Rig(ABC):
         """Return the first time of an event [host ns]; 0: not yet. "start": the start of the run."""
         if what == "start":
             return self.start_ns
-        return next((ns for ns, told in self.events if told == what), 0)
+        return next((ns for ns, reported in self.events if reported == what), 0)
 
     def await_moment(self) -> None:
         """Draw a phase and a moment of it, and return then.
@@ -297,8 +297,8 @@ class Rig(ABC):
     def is_active(self) -> bool:
         """Whether the motors follow commands, by the emulator's events so far."""
         self.pump()
-        told = [what for _, what in self.events if what in self.active | self.inactive]
-        return bool(told) and told[-1] in self.active
+        reported = [what for _, what in self.events if what in self.active | self.inactive]
+        return bool(reported) and reported[-1] in self.active
 
     # Actions.
 
@@ -342,9 +342,9 @@ def process_state(pid: int) -> str:
         return "X"
 
 
-def headline(said: str) -> str:
+def headline(printed: str) -> str:
     """Return the operator's line on the end of the run."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    lines = [line.strip() for line in printed.splitlines() if line.strip()]
     wanted = [line for line in lines if re.match(r"(tripped|finished|stopped|failed|deal-hw: error)", line)]
     return (wanted or lines or [""])[0]
 

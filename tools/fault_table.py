@@ -101,7 +101,7 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         **row,
         **judge(rig, report),
         "operator": headline(rig.output).replace(f"{rig.folder}/", "PORT/"),
-        "notes": rig.said,
+        "notes": rig.printed,
         "complaints": complaints(rig, report, row),
         "fault_ns": rig.fault_ns,
         "start_ns": rig.start_ns,
@@ -124,9 +124,9 @@ def recording(folder: Path) -> dict[str, Any]:
     last_ns = -1
     if episodes and len(starts := episodes[-1].cycles.start_s):
         # The faulty cycle is the first passive one, or, if it never ended, the one after the last record.
-        said = episodes[-1].cycles.safety_state
-        good = [i for i in range(len(starts)) if said[i] != "passive"]
-        passive = [i for i in range(len(starts)) if said[i] == "passive"]
+        printed = episodes[-1].cycles.safety_state
+        good = [i for i in range(len(starts)) if printed[i] != "passive"]
+        passive = [i for i in range(len(starts)) if printed[i] == "passive"]
         index = passive[0] if passive else good[-1]
         last_ns = episodes[-1].start_ns + round(starts[index] * 1e9) + (0 if passive else CYCLE_NS)
     return {"dataset": "whole" if states else "empty", "states": states, "last_cycle_ns": last_ns}
@@ -312,9 +312,11 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         each = [r for row in known for r in row["repetitions"]]
         codes = ", ".join(str(code) for code in sorted({r["exit_code"] for r in each}))
         data = ", ".join(sorted({r["dataset"].partition(":")[0] for r in each}))
-        said = next((r["operator"] for r in each if r["operator"]), "(nothing)").replace("|", "/")
+        printed = next((r["operator"] for r in each if r["operator"]), "(nothing)").replace("|", "/")
         cells = " | ".join(cell(row) for row in rows)
-        lines.append(f"| {name} | {known[0]['expected']} | {cells} | {codes} | {data} | {shortened(said)} |")
+        lines.append(
+            f"| {name} | {known[0]['expected']} | {cells} | {codes} | {data} | {shortened(printed)} |"
+        )
     bad = []
     for row in (row for result in results for row in result["rows"]):
         if row["as_expected"] < row["count"]:
@@ -324,10 +326,10 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
     return "\n".join(lines).rstrip() + "\n"
 
 
-def shortened(said: str) -> str:
+def shortened(printed: str) -> str:
     """Return the operator's message without addresses of this machine."""
-    said = re.sub(r"/tmp/\S+|tcp/\S+", "PORT:", said)
-    return said if len(said) <= 110 else said[:107] + "..."
+    printed = re.sub(r"/tmp/\S+|tcp/\S+", "PORT:", printed)
+    return printed if len(printed) <= 110 else printed[:107] + "..."
 
 
 def cell(row: Mapping[str, Any] | None) -> str:

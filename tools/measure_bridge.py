@@ -143,11 +143,11 @@ def _side(name: str, link: str, end_point: str, config: MeasureBridge, keys: Pat
         yield process
 
 
-def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any]:
+def _one_way(sent: Mapping[str, int], received: Mapping[str, int]) -> dict[str, Any]:
     """Return statistics of the times from sending to arrival, and the number of lost messages."""
-    ages_ms = np.array([heard[number] - sent[number] for number in heard if number in sent]) * 1e-6
-    first, last = min(map(int, heard)), max(map(int, heard))
-    lost = sum(1 for number in sent if first <= int(number) <= last and number not in heard)
+    ages_ms = np.array([received[number] - sent[number] for number in received if number in sent]) * 1e-6
+    first, last = min(map(int, received)), max(map(int, received))
+    lost = sum(1 for number in sent if first <= int(number) <= last and number not in received)
     p50, p99 = np.percentile(ages_ms, (50, 99))
     return {
         "p50_ms": round(float(p50), 4),
@@ -173,13 +173,13 @@ def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
         for _ in range(config.cuts):
             with BridgeClient(rig.port, rig.options("controller")) as client:
                 client.take_over()
-                told = rig.commands()
+                reported = rig.commands()
                 cut_ns = MonotonicClock().now_ns()
                 switch(False)
-                rig.await_commands([*told, "damping"])
-                times.append((cut_ns, rig.told()[-1][0]))
+                rig.await_commands([*reported, "damping"])
+                times.append((cut_ns, rig.reported()[-1][0]))
                 switch(True)
-        _, said = rig.bridge.stop()
+        _, printed = rig.bridge.stop()
     delays = sorted((damped - cut) * 1e-6 for cut, damped in times)
     return {
         "how": "interface of a network namespace set down (SIOCSIFFLAGS)",
@@ -189,7 +189,7 @@ def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
         "longest_without_the_machines_pauses_ms": round(
             max(seen.awake_ns(*each) for each in times) * 1e-6, 2
         ),
-        "bridge_said": said.splitlines()[-1][:300],
+        "bridge_said": printed.splitlines()[-1][:300],
     }
 
 
@@ -248,17 +248,17 @@ def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
         for _ in range(config.restarts):
             with BridgeClient(rig.port, rig.options("controller")) as client:
                 client.take_over()
-                told = rig.commands()
+                reported = rig.commands()
                 rig.kill_bridge()
                 client.status = {}
                 begun_ns = MonotonicClock().now_ns()
                 rig.start_bridge()
-                rig.await_commands([*told, "damping"])
-                delays.append((rig.told()[-1][0] - begun_ns) * 1e-6)
+                rig.await_commands([*reported, "damping"])
+                delays.append((rig.reported()[-1][0] - begun_ns) * 1e-6)
                 client.hear(lambda: client.status.get("refused", {}).get("handover", 0) > 100)
                 refused += client.status["refused"]["handover"]
                 admitted += client.status["admitted"]
-                rig.await_commands([*told, "damping"])
+                rig.await_commands([*reported, "damping"])
     return {
         "from": "start of the new process to the first damping at the robot",
         **_spread(delays),
@@ -274,7 +274,7 @@ def refuse(config: MeasureBridge, folder: Path) -> dict[str, Any]:
         # Opened before the first one commands, because a handshake would delay the threads of this process.
         with BridgeClient(rig.port, options) as client, BridgeClient(rig.port, options) as second:
             client.take_over()
-            told = rig.commands()
+            reported = rig.commands()
 
             def refused(*kinds: str) -> int:
                 return sum(client.status["refused"].get(kind, 0) for kind in kinds)
@@ -290,7 +290,7 @@ def refuse(config: MeasureBridge, folder: Path) -> dict[str, Any]:
                 return refused("sequence", "age") > 200
 
             client.hear(replay)
-            undisturbed = client.in_charge and rig.commands() == told
+            undisturbed = client.in_charge and rig.commands() == reported
             return {"refused": client.status["refused"], "controller_undisturbed": undisturbed}
 
 

@@ -67,7 +67,7 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
                 open_at[robot.last_sequence] = now_ns
             robot.passive()
             errors = robot.transport_errors - errors
-        out, said = emulator.stop()
+        out, printed = emulator.stop()
     return {
         "transport": transport,
         "rate_hz": rate_hz,
@@ -78,7 +78,7 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
         "late_ms": spread(late),
         "transport_errors": errors,
         "wire_ms": WIRE_MS.get(transport),
-        "emulator": (out + said).strip().splitlines()[-1],
+        "emulator": (out + printed).strip().splitlines()[-1],
     }
 
 

@@ -98,7 +98,7 @@ def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
         options.transport,
         *(("--domain", str(options.domain)) * (options.transport == "dds")),
     )
-    said = []
+    printed = []
     robot = f"--port {PORTS[options.transport]} --on-stand --profile {options.profile} --seed {seed}".split()
     with EmulatorProcess("go2", *wire, *robot, "--reveal-to", str(run / "truth.json")) as emulator:
         for excite, seconds in (("multisine", options.seconds), (options.heldout, options.heldout_seconds)):
@@ -109,8 +109,8 @@ def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
                 verb(*design.split(), "--seed", str(seed), "--out", plan)
             words = ("--excite", plan, "--seconds", str(seconds), "--seed", str(seed), "--out", str(run))
             report = verb("collect", DESCRIPTION.name, *wire, "--port", emulator.port, *words)
-            said.append(report.replace(str(run), "RUN"))
-    return said
+            printed.append(report.replace(str(run), "RUN"))
+    return printed
 
 
 def verb(*words: str) -> str:
@@ -127,8 +127,8 @@ def verb(*words: str) -> str:
         check=False,
     )
     if done.returncode:
-        said = (done.stdout + done.stderr).strip()[-2000:]
-        raise RuntimeError(f"{' '.join(words)}: {done.returncode}: {said}")
+        printed = (done.stdout + done.stderr).strip()[-2000:]
+        raise RuntimeError(f"{' '.join(words)}: {done.returncode}: {printed}")
     return done.stdout.strip()
 
 

@@ -27,7 +27,7 @@ from deal_hw.workflows.deploy import deploy
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.walk_script import PROFILE, PROFILE_S, Script, write_script
 from deal_hw.workflows.running.settings import LegOptions, LinkOptions
-from deal_hw.workflows.say import aloud
+from deal_hw.workflows.say import to_stderr
 
 MIB = 2**20
 EVERY_S = 5.0
@@ -42,7 +42,7 @@ def repeated(seconds: float) -> Script:
 
 
 class Memory(threading.Thread):
-    """Takes the resident set of this process and its children until it is told to stop."""
+    """Takes the resident set of this process and its children until :meth:`stop`."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -97,7 +97,7 @@ def measure(transport: str, profile: str, seed: int, seconds: float) -> dict[str
             legs=LegOptions(velocity=str(script)),
             seconds=seconds,
             out=folder,
-            say=aloud,
+            say=to_stderr,
         ).episodes
         sizes = memory.stop()
         if episode.path is None:

@@ -89,8 +89,8 @@ def hang_up_bridge(rig: Rig) -> None:
             break
         time.sleep(0.01)
     port = rig.bridge.port
-    _, said = rig.bridge.stop()
-    rig.said.append(f"bridge: {said.strip().splitlines()[-2:]}"[:200])
+    _, printed = rig.bridge.stop()
+    rig.printed.append(f"bridge: {printed.strip().splitlines()[-2:]}"[:200])
     rig.start_bridge(port)
 
 

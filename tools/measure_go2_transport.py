@@ -87,7 +87,7 @@ def bench_transport(settings: TransportBench) -> int:
         0, or 1 where a frozen peer delayed a control cycle by more than :data:`FREEZE_LIMIT_S`.
 
     Raises:
-        TransportError: A process failed; the message holds what it said.
+        TransportError: A process failed; the message holds what it printed.
     """
     machine = describe_machine()
     row = summary(settings, *measure(settings))

@@ -88,10 +88,10 @@ def broken(folder: Path) -> Iterator[str]:
 def measure(verb: str, dataset: Path, number: signal.Signals, after_s: float) -> dict[str, Any]:
     """Start a verb, send it a signal, and return what became of it."""
     mark = uuid.uuid4().hex
-    with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile() as printed:
         process = subprocess.Popen(
             command(verb, dataset, Path(out)),
-            stdout=said,
+            stdout=printed,
             stderr=subprocess.STDOUT,
             env={**os.environ, MARK: mark},
             # A shell lets programs in the background ignore SIGINT, and this one may be such a program.
@@ -107,8 +107,8 @@ def measure(verb: str, dataset: Path, number: signal.Signals, after_s: float) ->
             process.kill()
             code = process.wait()
         took_s = time.monotonic() - sent
-        said.seek(0)
-        words = said.read().decode(errors="replace").strip().splitlines()
+        printed.seek(0)
+        words = printed.read().decode(errors="replace").strip().splitlines()
         return {
             "verb": verb,
             "signal": number.name,

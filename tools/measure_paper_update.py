@@ -25,9 +25,9 @@ import numpy as np
 from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.settings import parse_ratios
+from deal_hw.calib.paper.algorithm1 import PaperSettings, literal
+from deal_hw.calib.paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 from deal_hw.calib.pipeline.methods import PAPER_POPULATION
-from deal_hw.calib.search.algorithm1 import PaperSettings, literal
-from deal_hw.calib.search.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 
 
 @dataclass(frozen=True, slots=True)

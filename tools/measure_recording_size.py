@@ -126,13 +126,13 @@ def main() -> None:
     for robot in ("cartpole", "go2"):
         made = cycles(robot, round(options.seconds * 50), np.random.default_rng(0))
         without, with_ = record(robot, made, frozenset(STANDARD)), record(robot, made, frozenset())
-        said = (
+        printed = (
             f"{robot}: {without[0] / 1e3:.1f} kB/s without, {with_[0] / 1e3:.1f} with standard messages: "
             f"{with_[0] / without[0]:.2f} times; {without[1]:.3f} and {with_[1]:.3f} ms a cycle"
         )
         sizes = {"bytes_per_second": without[0], "with_standard_messages": with_[0]}
         times = {"ms_per_cycle": without[1], "ms_with_standard_messages": with_[1]}
-        rows.add({"robot": robot, **sizes, **times}, said)
+        rows.add({"robot": robot, **sizes, **times}, printed)
 
 
 if __name__ == "__main__":

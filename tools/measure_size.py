@@ -163,8 +163,8 @@ def write_arm(folder: Path, joints: int, seed: int, seconds: float) -> tuple[Pla
     for number, (name, length_s) in enumerate(lengths.items()):
         text = record(robot, number, round(length_s * RATE_HZ) / RATE_HZ)
         (folder / f"{name}.csv").write_text(text, encoding="utf-8")
-    told = "--model robot.xml --parameters params.yaml --data fit1.csv fit2.csv --holdout held-out.csv"
-    return robot, ["calibrate", *told.split(), "--heldout-window", "2", "--out", "out"]
+    reported = "--model robot.xml --parameters params.yaml --data fit1.csv fit2.csv --holdout held-out.csv"
+    return robot, ["calibrate", *reported.split(), "--heldout-window", "2", "--out", "out"]
 
 
 def measure(
@@ -199,7 +199,7 @@ def measure(
             program = ["-m", "cProfile", "-o", str(profile.resolve()), *program]
         row |= _run([sys.executable, *program, *arguments, *more], folder, limit_s)
         if row["exit_code"] not in (0, 130):
-            row["error"] = f"deal-hw calibrate ended with {row['exit_code']}: {row['said'][-1:]}"
+            row["error"] = f"deal-hw calibrate ended with {row['exit_code']}: {row['printed'][-1:]}"
         found = folder / "out/calibration/result.json"
         row["stopped"] = not row["error"] and not found.exists()
         if row["stopped"]:
@@ -212,7 +212,7 @@ def measure(
 
 def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]:
     """Run a calibration; return seconds, memory, and its output with times."""
-    began, said = time.monotonic(), []
+    began, printed = time.monotonic(), []
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with subprocess.Popen(
         command,
@@ -226,7 +226,7 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
         limit.start()
         try:
             for line in process.stderr or ():
-                said.append(f"{time.monotonic() - began:.1f} s: {line.rstrip()}")
+                printed.append(f"{time.monotonic() - began:.1f} s: {line.rstrip()}")
         finally:
             limit.cancel()
             if sys.exc_info()[0] is not None:
@@ -238,27 +238,27 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
         "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
         # Peak of the largest child so far, which is this one, in KiB on Linux.
         "peak_mib": after.ru_maxrss / 1024,
-        "said": said,
+        "said": printed,
     }
 
 
 def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
     """Return held-out errors, and errors of estimates and intervals."""
     rows = {name: result["parameters"][name] for name in robot.truth}
-    told = {name: row for name, row in rows.items() if row["verdict"] != "not identifiable"}
+    reported = {name: row for name, row in rows.items() if row["verdict"] != "not identifiable"}
     ratios = [
         abs(math.log(row["estimate"] / robot.truth[name]))
-        for name, row in told.items()
+        for name, row in reported.items()
         if not name.endswith(".encoder_bias")
     ]
-    held = [row["low"] <= robot.truth[name] <= row["high"] for name, row in told.items()]
+    held = [row["low"] <= robot.truth[name] <= row["high"] for name, row in reported.items()]
     rmse = result["provenance"].get("heldout_rmse", {}).get("mean", {})
     return {
         "method": result["method"],
         "search": result["provenance"].get("search", ""),
         "chi2": result["chi2"],
         "steps": result["steps"],
-        "told": len(told),
+        "told": len(reported),
         "log_error_x100": 100 * float(np.mean(ratios)) if ratios else None,
         "coverage90": float(np.mean(held)) if held else None,
         "latency_true": robot.delay_s,
@@ -290,7 +290,7 @@ def words(row: dict[str, Any]) -> str:
         text += "; held-out error over the range " + ", ".join(shares)
     if row.get("told"):
         text += (
-            f"; {row['told']} parameters have a value, 100 mean |ln| {row['log_error_x100']:.1f}, "
+            f"; {row['reported']} parameters have a value, 100 mean |ln| {row['log_error_x100']:.1f}, "
             f"90 % intervals hold {100 * row['coverage90']:.0f} %"
         )
     return "\n".join([text, *(f"  {line}" for line in row["said"])])

@@ -65,17 +65,17 @@ class Rows:
         """Return whether a row with these values of the names is there, without an error."""
         return any(key == tuple(row[name] for name in self._names) for row in self.rows if not row["error"])
 
-    def add(self, row: Row, said: str | None = None, *, table: bool = False) -> None:
+    def add(self, row: Row, printed: str | None = None, *, table: bool = False) -> None:
         """Keep a row and print it.
 
         Args:
             row: The row.
-            said: What is printed; by default the row as JSON; "" prints nothing.
+            printed: What is printed; by default the row as JSON; "" prints nothing.
             table: The script ends with a table on its output, so this goes to stderr.
         """
         self.rows.append(row)
-        if said != "":
-            print(said or json.dumps(row), file=sys.stderr if table else None, flush=True)
+        if printed != "":
+            print(printed or json.dumps(row), file=sys.stderr if table else None, flush=True)
         self._write()
 
     def keep(self, rows: Sequence[Row]) -> None:

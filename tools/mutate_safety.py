@@ -34,7 +34,7 @@ SETS = {
         ("-k", "not go2"),
     ),
     "processes": (
-        tuple(f"deal_hw/control/process/{name}.py" for name in ("supervisor", "vigil", "claim")),
+        tuple(f"deal_hw/control/process/{name}.py" for name in ("supervisor", "watchdog", "claim")),
         ("tests/control/test_control_exit_[sv]*.py", "tests/control/test_control_words.py"),
     ),
 }

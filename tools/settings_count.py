@@ -79,17 +79,29 @@ def settings_classes(
     return list(found.values())
 
 
-def replaced_by_tests(root: Path) -> list[str]:
-    """Return ``file:line name`` of each constant or settings class that a test replaces."""
+def replaced_by_tests(sources: Mapping[str, SourceFile], root: Path) -> list[str]:
+    """Return ``file:line name`` of each constant or settings class of ours that a test replaces."""
+    trees = [*(file.tree for file in sources.values()), *_trees_below(root / "tools", root).values()]
+    ours = {name for tree in trees for name in _names(tree)}
     rows = []
     for path, tree in _trees_below(root / "tests", root).items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("monkeypatch.setattr"):
                 name = _replaced_name(node)
                 last = name.rpartition(".")[2].strip("'\"")
-                if last.isupper() or last.endswith(ENDINGS):
+                if last in ours and (last.isupper() or last.endswith(ENDINGS)):
                     rows.append(f"{path}:{node.lineno} {name}")
     return sorted(rows)
+
+
+def _names(tree: ast.Module) -> Iterator[str]:
+    """Yield the names that a module defines by a class or an assignment."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (part.id for one in targets for part in ast.walk(one) if isinstance(part, ast.Name))
 
 
 def _replaced_name(call: ast.Call) -> str:

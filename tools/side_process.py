@@ -63,7 +63,7 @@ class SideProcess:
         """Wait for the result, and pass the elapsed seconds to ``update``.
 
         Raises:
-            TransportError: The process failed, or said nothing in time.
+            TransportError: The process failed, or printed nothing in time.
         """
         values: dict[str, Any] = json.loads(self._line(timeout_s, update) or "null") or {"error": "no result"}
         if "error" in values:
@@ -83,7 +83,7 @@ class SideProcess:
         while b"\n" not in self._out:
             passed = time.monotonic() - begun
             if passed > timeout_s:
-                raise TransportError(f"the {self._name}'s process said nothing for {timeout_s:g} s")
+                raise TransportError(f"the {self._name}'s process printed nothing for {timeout_s:g} s")
             if update is not None:
                 update(passed)
             if select.select([out], [], [], 0.2)[0]:
@@ -94,12 +94,14 @@ class SideProcess:
         line, _, self._out = self._out.partition(b"\n")
         return line.decode()
 
-    def _failed(self, said: str) -> TransportError:
+    def _failed(self, printed: str) -> TransportError:
         self._process.kill()
         _, errors = self._process.communicate()
         with contextlib.suppress(ValueError, TypeError, KeyError):
-            said = json.loads(said)["error"]
-        return TransportError(f"the {self._name}'s process failed: {said} {errors.decode().strip()[-2000:]}")
+            printed = json.loads(printed)["error"]
+        return TransportError(
+            f"the {self._name}'s process failed: {printed} {errors.decode().strip()[-2000:]}"
+        )
 
 
 def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:

@@ -126,8 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         print_comparison(before, counted)
     if given.json:
-        said = counted | describe_call("tools/structure.py")
-        given.json.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+        described = counted | describe_call("tools/structure.py")
+        given.json.write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
@@ -160,7 +160,7 @@ def count(root: Path, folder: str = "calib", verb: str = "calibrate") -> dict[st
     constants = numeric_constants(inside, sources)
     candidates = solve_loops(inside, sources)
     settings = settings_classes(inside, sources, root)
-    replaced = replaced_by_tests(root)
+    replaced = replaced_by_tests(sources, root)
     return {
         "format": FORMAT,
         "folder": folder,

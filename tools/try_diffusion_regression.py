@@ -16,19 +16,24 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 import numpy as np
-import torch
 from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
 from deal_hw.bench.settings import FixedRange
-from deal_hw.calib.search.critic import PenaltyCritic, Samples
-from deal_hw.calib.search.diffusion_evolution import Schedule, alpha_schedule
+from deal_hw.calib.paper.critic import PenaltyCritic, Samples
+from deal_hw.calib.paper.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
+from deal_hw.on_use import OnUse
 from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = OnUse("torch", "torch", "calib")
 
 GENERATIONS = 50
 
@@ -141,7 +146,7 @@ def measure(name: str, seed: int, ratio: float) -> dict[str, Any]:
         ensembles.append(Diffusion(logit(unit), stepper.rng, stepper.settings.step_clip, step, outputs))
         return ensembles[-1]
 
-    def heard(critic: PenaltyCritic, samples: Samples) -> FloatArray:
+    def received(critic: PenaltyCritic, samples: Samples) -> FloatArray:
         found = statistics(critic, samples)
         if len(samples) > 1:  # members, not the recording
             outputs.append(float(np.nanmean(found[:, -1])))
@@ -152,7 +157,7 @@ def measure(name: str, seed: int, ratio: float) -> dict[str, Any]:
     start_s = time.process_time()
     with (
         mock.patch.object(KalmanStepper, "new_ensemble", draw),
-        mock.patch.object(PenaltyCritic, "statistics", heard),
+        mock.patch.object(PenaltyCritic, "statistics", received),
     ):
         row = run_cell(cell, population=100, generations=GENERATIONS, threads=1)
     kept = ("error", "log_error_x100", "heldout_nrmse_nominal", "heldout_nrmse_calibrated")

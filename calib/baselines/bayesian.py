@@ -29,14 +29,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.special import ndtri
-from scipy.stats import rankdata
-from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
-from deal_hw.calib.search.resume import Stateful
+from deal_hw.calib.data.resume import Stateful
+from deal_hw.calib.data.search import RangedSearch, Search, SearchLog
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
@@ -194,7 +193,7 @@ class GaussianProcessSearch(Stateful):
         seed = np.random.default_rng([self._seed, self._generation])
         # A power of two of points is balanced; a part of it is nearly so.
         power = max(int(np.ceil(np.log2(count))), 0)
-        return np.asarray(Sobol(self._count, rng=seed).random_base2(power)[:count])
+        return np.asarray(scipy.stats.qmc.Sobol(self._count, rng=seed).random_base2(power)[:count])
 
     def _kept(self, count: int) -> IntArray:
         """Return the indices of ``count`` points: the better half by rank, then the newest of the others."""
@@ -222,7 +221,7 @@ def _ranked(fitness: FloatArray) -> FloatArray:
 
 def _quantiles(fitness: FloatArray) -> FloatArray:
     """Return the normal quantiles of the ranks of scores, (n,); equal scores are equal."""
-    return np.asarray(ndtri((rankdata(_ranked(fitness)) - 0.5) / len(fitness)))
+    return np.asarray(ndtri((scipy.stats.rankdata(_ranked(fitness)) - 0.5) / len(fitness)))
 
 
 def _largest_improvement(
@@ -244,7 +243,7 @@ def _largest_improvement(
     from gpytorch.mlls import ExactMarginalLogLikelihood
     from linear_operator.utils.errors import NanError, NotPSDError
 
-    from deal_hw.calib.search.critic import torch_threads
+    from deal_hw.calib.paper.critic import torch_threads
 
     x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
     # From 20 coordinates on BoTorch moves a part of them, and leaves the others where a good point has them,

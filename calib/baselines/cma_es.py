@@ -14,8 +14,8 @@ import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.resume import State, Stateful
+from deal_hw.calib.data.resume import State, Stateful
+from deal_hw.calib.data.search import Search, SearchLog
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
-from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.fitness import FitnessSettings
-from deal_hw.calib.search.resume import Stateful
+from deal_hw.calib.data.resume import Stateful
+from deal_hw.calib.data.search import RangedSearch, Search, SearchLog
+from deal_hw.calib.paper.critic import CriticSettings
+from deal_hw.calib.paper.fitness import FitnessSettings
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 

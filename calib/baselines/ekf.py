@@ -17,6 +17,7 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import WindowData, taken
+from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.residual import (
     LATENCY_STEP_S,
@@ -25,7 +26,6 @@ from deal_hw.calib.fit.residual import (
     VELOCITY_STEP,
     value_bounds,
 )
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import Z90, CalibrationResult
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray

@@ -22,10 +22,10 @@ from deal_hw.calib.data.innovations import (
     whitened_residual,
 )
 from deal_hw.calib.data.problem import Problem, measurements
+from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calib.fit.intervals import kinks_of, uncertainty
 from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, Normal, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

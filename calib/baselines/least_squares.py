@@ -24,11 +24,11 @@ from scipy.optimize import least_squares
 
 from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.resume import State
+from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
 from deal_hw.calib.fit.residual import PARAMETER_STEP
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.resume import State
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.findings import Finding

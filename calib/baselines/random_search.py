@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members, cut, explained, whitened_residual
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.no_data import NoSettings
+from deal_hw.calib.data.search import NoSettings, Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 
 TICKS = 10

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members, explained
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.fitness import FitnessSettings, make_fitness
+from deal_hw.calib.data.search import Search, SearchLog, Stepper
+from deal_hw.calib.paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calibration import CalibrationResult
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray

@@ -15,7 +15,7 @@ import numpy as np
 from deal_hw.calib.baselines.least_squares import FittedStart, OneShotSearch, textbook_covariance
 from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.base import SearchLog
+from deal_hw.calib.data.search import SearchLog
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.recordings.sysid_adapter import SysidRecording, check_space, identify, require_sysid
 

@@ -9,9 +9,8 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import maximum_filter1d
-from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -149,7 +148,7 @@ def _differences(
 
 def _moves(values: FloatArray) -> Mask:
     """Return which steps from a sample to the next are no part of a rest, (T - 1, J)."""
-    return np.asarray(maximum_filter1d(np.diff(values, axis=0) != 0, REST + 1, axis=0))
+    return np.asarray(scipy.ndimage.maximum_filter1d(np.diff(values, axis=0) != 0, REST + 1, axis=0))
 
 
 def _spread(difference: FloatArray, order: int) -> float:
@@ -324,7 +323,9 @@ def _local_polynomials(
     at = np.arange(T) - first
 
     def filtered(deriv: int, delta: float) -> tuple[FloatArray, FloatArray]:
-        weights = [savgol_coeffs(length, order, deriv, delta, p, use="dot") for p in range(length)]
+        weights = [
+            scipy.signal.savgol_coeffs(length, order, deriv, delta, p, use="dot") for p in range(length)
+        ]
         found = [weights[a] @ values[f : f + length] for a, f in zip(at, first, strict=True)]
         return np.stack(found), np.array([np.linalg.norm(w) for w in weights])[at]
 

@@ -36,7 +36,7 @@ EARLIER_COMMANDS = 8
 """Commands before a window whose delays still count [-]: a slewing set-point is behind until it arrives."""
 
 MOST_COMMANDS = 120
-"""Most commands in a window; with more, delays of single commands cannot be told from noise."""
+"""Most commands in a window; with more, delays of single commands cannot be separated from noise."""
 
 DELAY_STD_S = (1e-5, 0.1)
 """Least and largest standard deviation of delays that is looked for [s]."""

@@ -24,9 +24,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2 as chi2_law
-from scipy.stats import norm, truncnorm
-from scipy.stats import t as t_law
+import scipy
 
 from deal_hw.calib.data.noise import autocorrelations
 from deal_hw.calib.data.problem import Problem
@@ -199,7 +197,7 @@ def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = N
     """
     worst = 1.0
     channels = list(zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True))
-    below = 0.0 if chance is None else float(norm.ppf(1 - chance / len(channels)))
+    below = 0.0 if chance is None else float(scipy.stats.norm.ppf(1 - chance / len(channels)))
     for channel in channels:
         total, used = 1.0, 0
         for rho, pairs in autocorrelations(channel, LAGS):
@@ -312,7 +310,7 @@ def _bound_std(
     curvature = 1.0 / _covariance(precision, others)[k, k]
     std, width = curvature**-0.5, float(np.sqrt(12.0 * flat[k]))
     mean = -abs(slope) / curvature
-    reach = float(truncnorm.ppf(0.9, -mean / std, (width - mean) / std, loc=mean, scale=std))
+    reach = float(scipy.stats.truncnorm.ppf(0.9, -mean / std, (width - mean) / std, loc=mean, scale=std))
     # Far out in the tail the law is exponential in the slope, and its numerical quantile not finite.
     exponential = np.log(10.0) / max(abs(slope), 1e-300)
     return (reach if 0 < reach <= width else min(exponential, width)) / Z90
@@ -331,8 +329,8 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
     degrees = cluster.degrees
     ratio = cluster.ratio * inflation / uniform
     drawn = (PRIOR_BLOCKS * inflation + degrees * ratio) / (PRIOR_BLOCKS + degrees)
-    quantile = t_law.ppf(0.95, PRIOR_BLOCKS + degrees) / Z90
-    used = cluster.ratio / uniform > chi2_law.ppf(0.95, degrees) / degrees
+    quantile = scipy.stats.t.ppf(0.95, PRIOR_BLOCKS + degrees) / Z90
+    used = cluster.ratio / uniform > scipy.stats.chi2.ppf(0.95, degrees) / degrees
     factor = np.where(used, np.sqrt(drawn / inflation) * quantile, 1.0)
     return np.asarray(np.maximum(factor, 1.0))
 

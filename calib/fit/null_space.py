@@ -137,7 +137,7 @@ def _describe(space: ParameterSpace, direction: FloatArray, parts: list[int]) ->
     down = [space.names[k] for k in parts if np.sign(direction[k]) != lead]
     if not down:
         return (
-            f"{', '.join(up)} can only be told up to a common factor: measure one of them "
+            f"{', '.join(up)} can only be determined up to a common factor: measure one of them "
             "(a scale will do for a mass)"
         )
     return (

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.contacts import START_ITERATIONS, settle, solve_contacts
+from deal_hw.calib.fit.contacts import START_ITERATIONS, fit_starts, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, restarted, solve
 from deal_hw.errors import InsufficientDataError
@@ -105,7 +105,7 @@ def refine(
     iterations: int = 12,
     notify: Callable[[Refined], None] | None = None,
     states: States | None = None,
-    shake: bool = True,
+    perturb: bool = True,
     hopeless: float = np.inf,
     notify_step: Callable[[Refined], None] | None = None,
 ) -> Refined:
@@ -119,8 +119,8 @@ def refine(
         iterations: Most iterations of each run of the solver.
         notify: Called with the fit after each window length that is kept.
         states: Start states of the first stage's windows; the smoothed states by default.
-        shake: With contacts, draw other start states where the solver stops early. With exact states, reduce
-            the weight of windows that no small step explains.
+        perturb: With contacts, draw other start states where the solver stops early. With exact states,
+            reduce the weight of windows that no small step explains.
         hopeless: Chi2 above which a fit that has used its iterations does not continue, without contacts.
         notify_step: Called with the fit after each step of the solver, without contacts.
 
@@ -130,7 +130,7 @@ def refine(
     space = problem.space
     theta = np.clip(theta, space.low, space.high)
     stages_s = stages_s or window_stages(problem)
-    if problem.noise_free and shake and problem.fixed_latency_s is None:
+    if problem.noise_free and perturb and problem.fixed_latency_s is None:
         theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
     result: Refined | None = None
     # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
@@ -147,16 +147,16 @@ def refine(
             break
         point = shooting.start(theta, latency_s, states)
         if shooting.contacts:
-            point, normal, used = _with_contacts(shooting, point, iterations, shake, rng)
+            point, normal, used = _with_contacts(shooting, point, iterations, perturb, rng)
         elif shooting.given:
             point, normal, used = _from_known_states(
-                shooting, point, iterations, WEIGHT_ROUNDS if shake else 0
+                shooting, point, iterations, WEIGHT_ROUNDS if perturb else 0
             )
         else:
-            told = None
+            on_step = None
             if notify_step is not None:
-                told = partial(_tell, notify_step, shooting, done)
-            point, normal, used = _solved(shooting, point, iterations, hopeless, told)
+                on_step = partial(_report, notify_step, shooting, done)
+            point, normal, used = _solved(shooting, point, iterations, hopeless, on_step)
         done += used
         found = _refined(shooting, point, normal, done)
         if result is not None and not shooting.given and found.chi2 > WORSE * max(result.chi2, 1.0):
@@ -166,7 +166,7 @@ def refine(
         if not shooting.given:
             states = shooting.states(point)
         if notify is not None:
-            _tell(notify, shooting, done, point, normal)
+            _report(notify, shooting, done, point, normal)
         if not found.chi2 < hopeless:
             break
     if result is None:
@@ -192,17 +192,17 @@ def _clear_gains(notify: Callable[[Refined], None]) -> Callable[[Refined], None]
 
     Whoever is notified may simulate held-out recordings, which takes as long as a step.
     """
-    told: dict[int, float] = {}
+    least: dict[int, float] = {}
 
-    def tell(fit: Refined) -> None:
-        if fit.chi2 < 0.5 * told.get(fit.shooting.length, np.inf):
-            told[fit.shooting.length] = fit.chi2
+    def report(fit: Refined) -> None:
+        if fit.chi2 < 0.5 * least.get(fit.shooting.length, np.inf):
+            least[fit.shooting.length] = fit.chi2
             notify(fit)
 
-    return tell
+    return report
 
 
-def _tell(
+def _report(
     notify: Callable[[Refined], None], shooting: Shooting, done: int, point: Point, normal: Normal
 ) -> None:
     """Report an intermediate fit; a diverged one is none."""
@@ -248,7 +248,7 @@ def at_parameters(
     shooting = Shooting(problem, length)
     point = shooting.start(theta, latency_s, states)
     if shooting.contacts:
-        point = settle(shooting, point, START_ITERATIONS)[0]
+        point = fit_starts(shooting, point, START_ITERATIONS)[0]
         normal = shooting.normal(point)
     else:
         point, normal = converged(shooting, point, shooting.normal(point), START_ITERATIONS)
@@ -311,15 +311,15 @@ def _from_known_states(
 
 
 def _with_contacts(
-    shooting: Shooting, point: Point, iterations: int, shake: bool, rng: np.random.Generator
+    shooting: Shooting, point: Point, iterations: int, perturb: bool, rng: np.random.Generator
 ) -> tuple[Point, Normal, int]:
     """Solve; while the residual is unexplained, draw other start states and solve again."""
     point, normal, used = _solved(shooting, point, iterations)
-    for spread in PERTURBATIONS if shake else ():
+    for spread in PERTURBATIONS if perturb else ():
         if normal.cost / _degrees(shooting, normal) < EXPLAINED:
             break
         before = normal.cost
-        point = shooting.shaken(point, spread, PERTURBED_STARTS, rng)
+        point = shooting.perturbed(point, spread, PERTURBED_STARTS, rng)
         point, normal, more = _solved(shooting, point, iterations)
         used += more
         if normal.cost > LAST_PERTURBATION * before:
@@ -339,7 +339,7 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     fit = partial(
         refine,
         notify=notify,
-        shake=problem.noise_free,
+        perturb=problem.noise_free,
         hopeless=hopeless,
         notify_step=_clear_gains(notify) if notify is not None else None,
     )

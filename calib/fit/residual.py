@@ -420,7 +420,7 @@ class Shooting:
             self._known = point, found
         return self._known[1]
 
-    def shaken(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
+    def perturbed(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
         """Return the point with, window by window, the best of ``count`` drawn start states.
 
         Given the parameters, windows are independent, so one batch searches them all. It frees windows whose

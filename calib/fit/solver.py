@@ -26,8 +26,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy
 from scipy.optimize import lsq_linear
-from scipy.stats import chi2 as chi2_law
 
 from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
 from deal_hw.calib.data.problem import WindowData, taken
@@ -249,7 +249,7 @@ def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
     size = max(float(np.median(np.concatenate([c / f for c, f in zip(costs, freedom, strict=True)]))), 1.0)
     # A window's cost over its size is chi-square with its degrees of freedom; Bonferroni over the windows.
     chance = FALSE_RESTARTS / sum(map(len, costs))
-    return [c > size * chi2_law.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
+    return [c > size * scipy.stats.chi2.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
 
 
 class _Following:

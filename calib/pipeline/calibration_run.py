@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
@@ -48,7 +48,7 @@ class FitOutcome:
     known: Uncertainty
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def but(
+    def with_alarms(
         self, *first: Finding, last: Sequence[Finding] = (), chi2: float | None = None, **facts: Any
     ) -> FitOutcome:
         """Return it with more alarms, before and after its own, and with more facts."""

@@ -22,6 +22,7 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
@@ -47,7 +48,6 @@ from deal_hw.calib.pipeline.calibration_run import (
     CalibrationRun,
     FitOutcome,
 )
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
 from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play
@@ -448,7 +448,7 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         f"(multiples of their noise): {words}",
     )
     found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit, wrong=True)
-    return found.but(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
+    return found.with_alarms(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
 
 
 def with_play(run: CalibrationRun) -> FitOutcome | None:
@@ -470,7 +470,7 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
     do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
     alarm = dataclasses.replace(play.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    return conclude_fit(wide, None, fit).but(alarm, diagnosis=[play.diagnosis.to_json()])
+    return conclude_fit(wide, None, fit).with_alarms(alarm, diagnosis=[play.diagnosis.to_json()])
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
@@ -500,7 +500,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     unchecked = Validation(split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
     if suspect.confirmed(found.theta, found.latency_s):
-        return found.but(suspect.alarm, shared_error=suspect.to_json())
+        return found.with_alarms(suspect.alarm, shared_error=suspect.to_json())
     run.say(BEFORE_SEARCH, suspect.withdrawn)
     return fits.best(run)
 

@@ -33,10 +33,10 @@ from deal_hw.calib.data.innovations import (
     samples_per_tick,
 )
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic, Samples
+from deal_hw.calib.data.resume import Stateful
+from deal_hw.calib.data.search import Search, SearchLog
+from deal_hw.calib.paper.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import NEAR_SPREAD, KalmanStepper, spread_of
-from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray

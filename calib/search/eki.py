@@ -6,6 +6,14 @@ observations and the tempered update follow Iglesias, Law and Stuart (2013). The
 Iglesias and Yang (2021), the discrepancy rule for the regularisation from Iglesias (2016). For a linear model
 with a Gaussian prior and large N, the ensemble samples the exact posterior once the tempering reaches 1.
 
+Symbols, for N members:
+    Z: members minus their mean, over (N - 1)^(1/2), (N, C) [logits].
+    d_n: residual of member n, observed minus predicted, whitened, (M,) [-].
+    G: mean residual minus residuals, over (N - 1)^(1/2), (N, M).
+    C_zg = Z^T G, (C, M), and C_gg = G^T G, (M, M): covariances of the ensemble.
+    a: inflation of the noise's variance in one step, >= 1 [-]; the tempering is the sum of 1 / a so far.
+Update: z_n += C_zg (C_gg + a 1)^-1 (d_n + a^(1/2) xi_n), with standard normal xi_n, (M,).
+
 `eki` regresses on the vector of all window innovations, whitened for noise and start-state error; there is no
 critic. Short windows come first, because an unstable pole makes long predictions of a wrong simulator
 meaningless. Long windows then hold the information.
@@ -19,8 +27,8 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.innovations import Members, cut, explained, is_noisy, whitened_residual
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.resume import State, Stateful
+from deal_hw.calib.data.resume import State, Stateful
+from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -84,7 +92,8 @@ class EnsembleKalman(Stateful):
         residual = self._replace_diverged(residual)
         N, M = residual.shape
         misfit = 0.5 * np.sum(residual**2, axis=1)
-        # Rows of `left` span members, rows of `right` span observations.
+        # G = left diag(scale) right: columns of `left` span members, rows of `right` span observations. A
+        # prediction is a constant minus the residual, hence the sign.
         centred = (residual.mean(axis=0) - residual) / np.sqrt(N - 1)
         left, scale, right = np.linalg.svd(centred, full_matrices=False)
         # Members with equal predictions leave no rank, and nothing moves.
@@ -96,8 +105,9 @@ class EnsembleKalman(Stateful):
         else:
             mean = residual.mean(axis=0)
             inflation = _discrepancy(scale, right @ mean, mean, keep)
-        # z + C_zg (C_gg + a I)^-1 (y + sqrt(a) xi - g): the singular vectors make it N x N. The perturbations
-        # are drawn in the span of the ensemble, the only part of them with an effect.
+        # (C_gg + a 1)^-1 on the span of `right` is 1 / (scale^2 + a), so C_zg (C_gg + a 1)^-1 v is
+        # Z^T left diag(scale / (scale^2 + a)) right v: nothing of size M x M. The perturbations are drawn in
+        # the span of the ensemble, the only part of them with an effect.
         projected = residual @ right.T + np.sqrt(inflation) * self._rng.standard_normal((N, len(scale)))
         deviation = (self._members - self._members.mean(axis=0)) / np.sqrt(N - 1)
         gain = (scale / (scale**2 + inflation))[:, None] * (left.T @ deviation)
@@ -115,6 +125,8 @@ class EnsembleKalman(Stateful):
         self.tempering = 0.0
 
     def _misfit_step(self, misfit: FloatArray, observations: int) -> float:
+        # 1 / a = min(max(M / (2 mean), (M / (2 var))^(1/2)), 1 - tempering), with mean and variance over
+        # members of the misfits |d|^2 / 2: Iglesias and Yang (2021).
         mean, variance = float(misfit.mean()), float(misfit.var())
         step = max(
             observations / (2 * max(mean, 1e-300)), np.sqrt(observations / (2 * max(variance, 1e-300)))

@@ -11,15 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.search.base import Search, SearchLog, Stepper
+from deal_hw.calib.data.search import NoSettings, Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NoSettings:
-    """Settings of a method that has none."""
 
 
 class _Draw(Stepper):

@@ -26,11 +26,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic
+from deal_hw.calib.data.resume import Stateful
+from deal_hw.calib.data.search import Search, SearchLog
+from deal_hw.calib.paper.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic
+from deal_hw.calib.paper.fitness import FitnessSettings, RolloutView, Samples
 from deal_hw.calib.search.eki import LogitStepper, spread_of
-from deal_hw.calib.search.fitness import FitnessSettings, RolloutView, Samples
-from deal_hw.calib.search.resume import Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2 as chi2_law
-from scipy.stats import norm
+import scipy
 
 from deal_hw.calib.data.problem import Member, Problem, taken
 from deal_hw.calib.fit.intervals import (
@@ -395,12 +394,12 @@ def agreement(
         reach_s = [h.latency_reach_s(late) for late, h in zip(each, halves, strict=True)]
         expected = np.append(expected, np.linalg.norm(reach_s) / Z90)
         reach[-1] = max(abs(late - latency_s) for late in each)
-    least = norm.ppf(1 - SPLIT_FALSE_ALARMS / (2 * max(int(identified.sum()), 1)))
+    least = scipy.stats.norm.ppf(1 - SPLIT_FALSE_ALARMS / (2 * max(int(identified.sum()), 1)))
     z = np.abs(scaled[0] - scaled[1]) / np.maximum(expected, 1e-300)
     flagged = tuple(r.name for k, r in enumerate(rows) if z[k] > least and identified[k] and r.agree is False)
     compared = z[identified & [r.agree is not None for r in rows]]
     power, count = float(np.sum(compared**2)), len(compared)
-    by_chance = not count or power <= chi2_law.ppf(1 - SPLIT_FALSE_ALARMS, count)
+    by_chance = not count or power <= scipy.stats.chi2.ppf(1 - SPLIT_FALSE_ALARMS, count)
     scale = 1.0 if by_chance else float(np.sqrt(power / count))
     return SplitHalf(tuple(rows), flagged, reach, scale, steps)
 

@@ -27,8 +27,8 @@ from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.prepare import prepare, usual_method
-from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
+from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
+from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 KEY = ("task", "seed")
@@ -143,7 +143,7 @@ def _stiffness(mjcf: str) -> dict[str, float]:
 
 
 def _so101(ask: _Ask) -> CalibrateSettings:
-    from deal_hw.drivers.so101.description import DESCRIPTION
+    from deal_hw.robots.so101.description import DESCRIPTION
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
     held_out = ("step_response", "slow_precision")
@@ -235,7 +235,7 @@ def run_cell(
         except ConfigurationError as err:
             return row | {"skipped": str(err)}
         try:
-            work = prepare(config)
+            work = calibration_input(config)
             return row | _compared(work, config, seed, budget, threads, settings)
         except DealHwError as err:
             return row | {"error": f"{type(err).__name__}: {err}"}
@@ -269,7 +269,7 @@ class _Shown:
 
 
 def _compared(
-    work: CalibrationInputs,
+    work: CalibrationInput,
     config: CalibrateSettings,
     seed: int,
     budget: Budget,

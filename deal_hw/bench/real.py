@@ -25,11 +25,10 @@ from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import HELDOUT_PART
-from deal_hw.workflows.calibration.prepare import prepare as prepare_recordings
-from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings
-from deal_hw.workflows.say import aloud, silent
+from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.settings import HELDOUT_PART, CalibrateSettings
+from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
 UNTOLD = frozenset({"nominal", "output-error"})
@@ -64,7 +63,7 @@ def calibrate_settings(settings: Real) -> CalibrateSettings:
     )
 
 
-def prepare(source: CalibrateSettings, *, quiet: bool = False) -> CalibrationInputs:
+def prepare(source: CalibrateSettings, *, quiet: bool = False) -> CalibrationInput:
     """Read and check recordings and parameters once for all cells.
 
     Args:
@@ -76,7 +75,7 @@ def prepare(source: CalibrateSettings, *, quiet: bool = False) -> CalibrationInp
         DatasetError: A recording cannot be used.
     """
     source.check()
-    return prepare_recordings(source, say=silent if quiet else aloud)
+    return calibration_input(source, say=silent if quiet else to_stderr)
 
 
 def split_name(source: CalibrateSettings) -> str:
@@ -89,7 +88,7 @@ def split_name(source: CalibrateSettings) -> str:
 
 
 def expected_std(
-    work: CalibrationInputs, given: FloatArray | None, threads: int | None
+    work: CalibrationInput, given: FloatArray | None, threads: int | None
 ) -> Callable[[str], FloatArray | None]:
     """Return a method's expected prediction error, (2 C,): the given one, or a first fit's."""
     from deal_hw.calib.data.problem import Problem
@@ -140,7 +139,7 @@ def table(settings: Real) -> Table:
 
 
 def run_cell(
-    work: CalibrationInputs,
+    work: CalibrationInput,
     task: str,
     split: str,
     method: str,

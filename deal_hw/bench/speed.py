@@ -150,8 +150,8 @@ def bare_step_s(problem: Problem, population: int) -> tuple[float, float]:
     that the policy gives each member, the second under the first of them, held.
     """
     from deal_hw.calib.data.innovations import Members
-    from deal_hw.calib.search.fitness import FitnessSettings
-    from deal_hw.calib.search.rollouts import control_ticks, policy_of, rollout_population
+    from deal_hw.calib.paper.fitness import FitnessSettings
+    from deal_hw.calib.paper.rollouts import control_ticks, policy_of, rollout_population
     from deal_hw.sim.engine.closed_loop import on_physics_steps
     from deal_hw.sim.engine.servo import slew
 

@@ -116,7 +116,7 @@ def table(settings: Transfer) -> Table:
 
     Raises:
         UnknownNameError: There is no such task or method.
-        ConfigurationError: There are too few steps, or a base policy does not fit; said before long work.
+        ConfigurationError: There are too few steps, or a base policy does not fit; raised before long work.
     """
     check_tasks(settings.task)
     for method in settings.methods:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -91,23 +92,31 @@ def judged(task: str, truth: ParameterDistribution, policy: BatchPolicy, seed: i
     }
 
 
-def commands() -> FloatArray:
+def commands(ahead_m_s: Sequence[float] = AHEAD_M_S, aside_m_s: Sequence[float] = ASIDE_M_S) -> FloatArray:
     """Return the commands of the speed profile, (P, 3): x, y [m/s], yaw rate [rad/s]."""
-    ahead = [(speed, 0.0, 0.0) for speed in AHEAD_M_S]
-    return np.array([*ahead, *((0.0, speed, 0.0) for speed in ASIDE_M_S)])
+    ahead = [(speed, 0.0, 0.0) for speed in ahead_m_s]
+    return np.array([*ahead, *((0.0, speed, 0.0) for speed in aside_m_s)])
 
 
-def speed_profile(truth: ParameterDistribution, policy: BatchPolicy, seed: int, count: int = 8) -> Row:
+def speed_profile(
+    truth: ParameterDistribution,
+    policy: BatchPolicy,
+    seed: int,
+    count: int = 8,
+    profile: FloatArray | None = None,
+) -> Row:
     """Let N robots follow increasing speeds, as in the right half of DEAL's Figure 4.
 
-    A robot that has fallen has speed 0 from then on.
+    A robot that has fallen has speed 0 from then on. The profile, (P, 3), is :func:`commands` by default: one
+    half ahead, one half aside.
 
     Returns:
         Under ``speed``: times [s], commanded and mean speeds in x and y [m/s]; beside it the mean errors of
         the speeds and the number of falls.
     """
     rate_hz = described("go2").control_rate_hz
-    wanted = np.repeat(commands(), round(STEP_S * rate_hz), axis=0)
+    asked_for = commands() if profile is None else profile
+    wanted = np.repeat(asked_for, round(STEP_S * rate_hz), axis=0)
     # One tick more: the environment restarts a robot in the tick in which its time is over.
     env = target_env("go2", truth, count, ticks=len(wanted) + 1)
     observation, _ = env.reset(seed=seed + JUDGED)
@@ -119,7 +128,7 @@ def speed_profile(truth: ParameterDistribution, policy: BatchPolicy, seed: int, 
         going &= ~terminated
         speeds[tick, going] = base_speed(env)[going]
     found, asked = speeds.mean(axis=1), wanted[:, :2]
-    every = len(wanted) // (len(commands()) * SAMPLES)
+    every = len(wanted) // (len(asked_for) * SAMPLES)
     parts = found.reshape(-1, every, 2).mean(axis=1)
     ahead, aside = np.split(np.abs(found - asked), [len(wanted) // 2])
     return {

@@ -39,7 +39,7 @@ from deal_hw.testing.plain_robots import (
     shared_words,
     write,
 )
-from deal_hw.workflows.calibration.prepare import prepare, usual_method
+from deal_hw.workflows.calibration.intake import calibration_input, usual_method
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -101,13 +101,13 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         threads: Simulation threads.
     """
     robot = make_robot(kind, seed, _fault(fault) or _shared(fault) or _right(fault))
-    said: list[str] = []
+    messages: list[str] = []
     row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as name:
         model, fit, held_out = write(robot, Path(name))
         config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
         try:
-            work = prepare(config, say=said.append)
+            work = calibration_input(config, say=messages.append)
             if why := outside_range(work.space, robot.truth):
                 return row | {"error": f"ConfigurationError: {why}"}
             method = usual_method(config, work)
@@ -123,8 +123,8 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
                 progress=_ends_when_named if _shared(fault) else None,
             )
         except _NamedError as end:
-            said.append(str(end))
-            row |= {"colour": "said", "named": names(kind, fault, [], said), "said": said}
+            messages.append(str(end))
+            row |= {"colour": "said", "named": names(kind, fault, [], messages), "said": messages}
             return row
         except DealHwError as err:
             # Refused before any work: counts as red, and as named if the message names the fault.
@@ -134,8 +134,8 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
     return row | {
         "causes": causes,
         "colour": trust(result).colour,
-        "named": names(kind, fault, causes, [*map(str, result.alarms), *work.telemetry, *said]),
-        "said": said,
+        "named": names(kind, fault, causes, [*map(str, result.alarms), *work.telemetry, *messages]),
+        "said": messages,
         "alarms": [str(alarm) for alarm in result.alarms],
         "search": result.provenance.get("search", ""),
         "chi2": result.chi2,
@@ -190,19 +190,19 @@ def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]
 
 def against_truth(robot: PlainRobot, result: CalibrationResult) -> dict[str, Any]:
     """Return the errors of identified parameters, and the share of intervals that hold the truth."""
-    told = [
+    valued = [
         k
         for k, name in enumerate(result.space.names)
         if name in robot.truth and not (result.verdicts and result.verdicts[k] == "not identifiable")
     ]
-    truth = np.array([robot.truth[result.space.names[k]] for k in told])
-    estimate, interval = result.estimate[told], result.interval[told]
+    truth = np.array([robot.truth[result.space.names[k]] for k in valued])
+    estimate, interval = result.estimate[valued], result.interval[valued]
     inside = (interval[:, 0] <= truth) & (truth <= interval[:, 1])
     return {
         "parameters": len(result.space),
-        "told": len(told),
-        "error_percent": float(100 * np.mean(np.abs(estimate - truth) / truth)) if told else None,
-        "coverage90": float(np.mean(inside)) if told else None,
+        "told": len(valued),
+        "error_percent": float(100 * np.mean(np.abs(estimate - truth) / truth)) if valued else None,
+        "coverage90": float(np.mean(inside)) if valued else None,
         "latency_true": robot.delay_s,
         "latency_found": result.latency_s,
     }

@@ -21,12 +21,12 @@ from deal_hw.workflows.calibration.best_so_far import (
     saying_how_to_resume,
     watching,
 )
-from deal_hw.workflows.calibration.model import write_parameters
-from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
-from deal_hw.workflows.calibration.run import CalibrateReport, finish
+from deal_hw.workflows.calibration.intake import calibration_input, usual_method
+from deal_hw.workflows.calibration.run import CalibrateReport, calibrate_input, finish
 from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.space import write_parameters
 from deal_hw.workflows.options import refuse
-from deal_hw.workflows.say import aloud, silent
+from deal_hw.workflows.say import silent, to_stderr
 
 __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_parameters"]
 
@@ -120,11 +120,11 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         DealHwError: A setting or a recording is unusable; raised before any long work.
     """
     config.check()
-    say = silent if config.quiet else aloud
+    say = silent if config.quiet else to_stderr
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
-    work = prepare(config, say=say)
+    work = calibration_input(config, say=say)
     method = usual_method(config, work, say)
     with (
         saying_how_to_resume(checkpoint),
@@ -139,7 +139,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             if watch is not None:
                 watch(found)
 
-        result = calibrate_inputs(
+        result = calibrate_input(
             config,
             work,
             method,

@@ -11,7 +11,7 @@ from pathlib import Path
 from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.findings import Finding
-from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
+from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
 ALARM_LINES = 20

@@ -23,7 +23,7 @@ from deal_hw.workflows.import_export import (
 )
 from deal_hw.workflows.kinds import sub_verbs
 from deal_hw.workflows.robot import carried_problems, carries_robot
-from deal_hw.workflows.say import aloud
+from deal_hw.workflows.say import to_stderr
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -98,13 +98,13 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
     if isinstance(config, InfoSettings):
         return _info(replace(config, path=dataset_of(config.path)))
     if isinstance(config, Import):
-        dataset = import_recordings(config, aloud)
+        dataset = import_recordings(config, to_stderr)
         if dataset is not None:
             count = len(dataset.episodes)
             print(f"{dataset.folder}: {count} episode{'s' * (count != 1)} of {dataset.description['name']}")
         return EXIT_OK
     if isinstance(config, Export):
-        count, robot = export_recordings(config, aloud)
+        count, robot = export_recordings(config, to_stderr)
         layout = {"lerobot": "LeRobot", "foxglove": "Foxglove"}[config.format]
         print(f"{config.out}: {count} {layout} episode{'s' * (count != 1)} of {robot}")
         return EXIT_OK

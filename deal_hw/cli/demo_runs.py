@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Final
 
 from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.data.checks.suite import check as check_recording
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.errors import SafetyError, TransportError
 from deal_hw.findings import Severity
 from deal_hw.workflows.causes import LATE, Load, late_advice
@@ -62,7 +62,7 @@ def deployed(deploy: Callable[[int], RunReport], count: int, what: str) -> RunRe
     A deployment that trips for another reason is a result, and the last one, as in `deal-hw deploy`.
 
     Args:
-        deploy: Deploys as often as told.
+        deploy: Deploys as often as requested.
         count: Deployments.
         what: A deployment, in messages.
 

@@ -6,6 +6,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import TracebackType
 
 from deal_hw.clock import Clock, MonotonicClock
@@ -61,12 +62,12 @@ class PipedProgress:
 
     def tell(self) -> None:
         """Print the current step every ten seconds, once each, until the verb has ended."""
-        told = None
+        printed = None
         while not self._wait(EVERY_S):
             text = self._text
-            if text == told:
+            if text == printed:
                 continue
-            told = text
+            printed = text
             passed_s = (self._clock.now_ns() - self._began_ns) * 1e-9
             self.say(f"{passed_s:.0f} s" + (f", {text}" if text else ""))
 
@@ -79,3 +80,16 @@ class PipedProgress:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._ended.set()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quiet:
+    """What only the command line has."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def is_quiet(settings: object) -> bool:
+    """Return whether only errors are printed."""
+    return isinstance(settings, Quiet) and settings.quiet

@@ -13,7 +13,7 @@ from deal_hw.control.process.channel import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.workflows.design_excitation import ExcitationReport
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.view import OnBeat, RunView, ignore
-from deal_hw.workflows.say import aloud
+from deal_hw.workflows.say import to_stderr
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Terminal(RunView):
     """
 
     def __init__(self, quiet: bool = False) -> None:
-        super().__init__(aloud)
+        super().__init__(to_stderr)
         self._quiet = quiet
 
     def note(self, text: str) -> None:

@@ -1,13 +1,15 @@
-"""The only module that imports rerun; if rerun is missing, its error names the extra to install."""
+"""The only module that names rerun. It is loaded on use; if it is missing, the error names the extra."""
 
 from __future__ import annotations
 
-from deal_hw.errors import MissingExtraError
+from typing import TYPE_CHECKING
 
-try:
-    import rerun as rr
-    import rerun.blueprint as rrb
-except ImportError as err:
-    raise MissingExtraError("rerun-sdk", "viz") from err
+from deal_hw.on_use import OnUse
 
 __all__ = ["rr", "rrb"]
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+else:
+    rr, rrb = OnUse("rerun", "rerun-sdk", "viz"), OnUse("rerun.blueprint", "rerun-sdk", "viz")

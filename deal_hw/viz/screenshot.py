@@ -149,7 +149,7 @@ def _explain(viewer: Viewer, err: Exception) -> str:
             "Ubuntu: "
             f"{RENDERER_INSTALL} - or look at the recording with --web"
         )
-    return f"no picture: {err}\nrerun said: {output.strip()[-400:] or '(nothing)'}"
+    return f"no picture: {err}\nrerun printed: {output.strip()[-400:] or '(nothing)'}"
 
 
 def _write(png: bytes, picture: Path) -> None:

@@ -15,10 +15,15 @@ from typing import Any, Literal
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
-from deal_hw.workflows.calibration.prepare import calibrate_inputs, prepare, usual_method
-from deal_hw.workflows.calibration.recordings import Source
-from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S, CalibrationInputs, judged
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings, check_source
+from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
+from deal_hw.workflows.calibration.recordings import Recorded
+from deal_hw.workflows.calibration.run import calibrate_input, judged
+from deal_hw.workflows.calibration.settings import (
+    HELDOUT_WINDOW_S,
+    CalibrateSettings,
+    Recordings,
+    check_source,
+)
 from deal_hw.workflows.say import Say, html_table, silent, text_table
 
 _HEAD = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
@@ -35,7 +40,7 @@ class Calibration:
     """
 
     result: CalibrationResult
-    inputs: CalibrationInputs
+    inputs: CalibrationInput
     threads: int | None = None
 
     @property
@@ -122,9 +127,9 @@ class Calibration:
         from deal_hw.calib.report.verdict import trust
 
         found = trust(self.result)
-        told = [f"the data do not determine: {words}" for words in self.result.null_directions]
+        unknown = [f"the data do not determine: {words}" for words in self.result.null_directions]
         alarms = [f"alarm: {alarm}" for alarm in self.result.alarms]
-        return [f"{found.colour}: {found.sentence}", *told, *alarms]
+        return [f"{found.colour}: {found.sentence}", *unknown, *alarms]
 
     def __repr__(self) -> str:
         return f"<Calibration of {len(self.result.space)} parameters, {self.colour}; table() shows them>"
@@ -148,10 +153,10 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def calibrate(
     model: Any = None,
-    data: Source | Sequence[Source] = (),
+    data: Recorded | Sequence[Recorded] = (),
     *,
     dataset: Path | str | None = None,
-    holdout: Source | int | Sequence[Source | int] = (),
+    holdout: Recorded | int | Sequence[Recorded | int] = (),
     episodes: Sequence[int] = (),
     columns: Path | str | None = None,
     parameters: Path | str | None = None,
@@ -213,7 +218,7 @@ def calibrate(
         fit_seconds: Most seconds to fit, spread evenly over the recordings [s].
         window_s: Length of the longest prediction windows of the search [s].
         physics_step_s: Requested physics step [s]; the MJCF's timestep by default.
-        force: Use recordings although a plausibility check failed.
+        force: Use recordings although a check of them failed.
         sample_hz: Rate of the fitted states of a dataset [Hz]; by default four per control period.
         spike_ratio: A sample is left out if it jumps away and back by more than this multiple of the joint's
             fastest motion.
@@ -295,10 +300,9 @@ def calibrate(
             seed=seed,
             threads=threads,
         )
-        settings.check(fit)
-        inputs = prepare(settings, data=fit, holdout=judges, say=say)
+        inputs = calibration_input(settings, data=fit, holdout=judges, say=say)
         chosen = usual_method(settings, inputs, say)
-        result = calibrate_inputs(settings, inputs, chosen, progress=progress, say=say)
+        result = calibrate_input(settings, inputs, chosen, progress=progress, say=say)
         result, _ = judged(inputs, result, settings.provenance, page=False, advise=False, threads=threads)
         found = Calibration(result=result, inputs=inputs, threads=threads)
         # Writing the calibrated model reads the model's file again.

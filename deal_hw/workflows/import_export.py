@@ -19,9 +19,9 @@ from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.data.recording.reader import Episode
+    from deal_hw.data.table import Table
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
@@ -87,8 +87,8 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.importing.grid import common_period, to_trajectories
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
-    from deal_hw.data.importing.table import table_of
     from deal_hw.data.recording.episode_info import verdict_json
+    from deal_hw.data.table import table_of
 
     _refuse_ignored(config)
     columns = None if config.columns is None else read_column_map(config.columns)
@@ -100,11 +100,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         joints = robot.joint_names
     elif described is not None:
         joints = described["joint_names"]
-    told = columns is not None or described is not None or facts is not None
-    episodes, foreign = ([], list(config.paths)) if told else _as_recorded(config, say)
-    said: dict[str, str] = {}
+    mapped = columns is not None or described is not None or facts is not None
+    episodes, foreign = ([], list(config.paths)) if mapped else _as_recorded(config, say)
+    printed: dict[str, str] = {}
     kinds = None if facts is None else kinds_of(facts)
-    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, said, kinds)]
+    tables = [table for path in foreign for table in load_tables(path, columns, joints, say, printed, kinds)]
     if facts is not None:
         tables = at_rest_without_commands(tables, facts, say)
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
@@ -156,10 +156,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     )
     if robot is not None:
         from deal_hw.data.recording.dataset import Dataset
-        from deal_hw.sim.robots.carried import carry
+        from deal_hw.sim.robots.dataset_robot import store_robot
 
         with Dataset.create_or_open(config.out, values, say):
-            carry(robot, config.out)
+            store_robot(robot, config.out)
     noted = [{"plausibility": problems, "source": source} for source in sources]
     return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
 

@@ -12,7 +12,7 @@ from deal_hw.workflows.calibration.recordings import common_rates
 from deal_hw.workflows.robot import is_ours
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.describe import Sampling
     from deal_hw.sim.robots.user_robot import UserRobot

@@ -15,7 +15,7 @@ def silent(text: str) -> None:
     """Drop the sentence."""
 
 
-def aloud(text: str) -> None:
+def to_stderr(text: str) -> None:
     """Print the sentence on standard error."""
     print(text, file=sys.stderr)
 

@@ -36,7 +36,7 @@ _FEW_REFUSED: Final = 0.01
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Received:
     """Messages received while listening."""
 
     stamps: list[int] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Go2Doctor:
         )
         with self._link:
             yield Finding("link", Severity.OK, "the transport is open")
-            heard = self._listen()
+            received = self._listen()
             yield from self._discovery()
             if self._simulated:
                 yield Finding("states", Severity.NOTE, NOTICE.removeprefix("note: "))
@@ -94,27 +94,27 @@ class Go2Doctor:
                     "head and checksum of the states are not checked",
                     "leave --state-check out if the robot's head and checksum are as deal-hw expects",
                 )
-            yield from _judge_states(heard, self._seconds)
+            yield from _judge_states(received, self._seconds)
             mode = "" if self._simulated else (yield from self._ask_mode())
-            yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode)
-            if heard.last is not None:
+            yield from _judge_commands(received, self._link.writers(topics.LOW_COMMAND), mode)
+            if received.last is not None:
                 if not self._simulated:
-                    yield from _judge_supply(heard.last)
-                yield from _judge_robot(heard.last)
+                    yield from _judge_supply(received.last)
+                yield from _judge_robot(received.last)
 
-    def _listen(self) -> _Heard:
-        heard = _Heard()
+    def _listen(self) -> _Received:
+        received = _Received()
         end_ns = self._clock.now_ns() + round(self._seconds * 1e9)
         while (left_ns := end_ns - self._clock.now_ns()) > 0:
             try:
-                self._take(heard, self._link.receive(left_ns * 1e-9))
+                self._take(received, self._link.receive(left_ns * 1e-9))
             except TransportTimeoutError:
                 break
-        return heard
+        return received
 
-    def _take(self, heard: _Heard, message: Message) -> None:
+    def _take(self, received: _Received, message: Message) -> None:
         if message.channel == topics.LOW_COMMAND:
-            heard.commands += 1
+            received.commands += 1
         if message.channel != topics.LOW_STATE:
             return
         try:
@@ -123,15 +123,15 @@ class Go2Doctor:
             else:
                 frame = decode_low_state(message.payload, self._strict)
         except FrameError as error:
-            heard.refused.add(message.payload, error)
+            received.refused.add(message.payload, error)
             return
-        if self._simulated and heard.last is not None and heard.last.payload == frame.payload:
-            heard.repeated += 1
+        if self._simulated and received.last is not None and received.last.payload == frame.payload:
+            received.repeated += 1
             return
-        heard.stamps.append(message.stamp_ns)
+        received.stamps.append(message.stamp_ns)
         if not self._simulated:
-            heard.ticks.append(frame.tick_ms)
-        heard.last = frame
+            received.ticks.append(frame.tick_ms)
+        received.last = frame
 
     def _discovery(self) -> Iterator[Finding]:
         survey = getattr(self._link, "survey", None)
@@ -195,20 +195,20 @@ class Go2Doctor:
         self._link.send(Message(topic, payload, self._clock.now_ns()))
 
 
-def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
-    if heard.refused.count:
-        yield _judge_refused(heard.refused, len(heard.stamps))
-        if not heard.stamps:
+def _judge_states(received: _Received, seconds: float) -> Iterator[Finding]:
+    if received.refused.count:
+        yield _judge_refused(received.refused, len(received.stamps))
+        if not received.stamps:
             return
-    if len(heard.stamps) < 2 and heard.repeated:
+    if len(received.stamps) < 2 and received.repeated:
         yield Finding(
             "states",
             Severity.FAIL,
-            f"states arrive, but do not change: {heard.repeated} times the same",
+            f"states arrive, but do not change: {received.repeated} times the same",
             "let the simulation run: it is paused",
         )
         return
-    if len(heard.stamps) < 2:
+    if len(received.stamps) < 2:
         yield Finding(
             "states",
             Severity.FAIL,
@@ -217,8 +217,8 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
             "the firewall",
         )
         return
-    gaps = np.diff(heard.stamps) * 1e-9
-    rate = (len(heard.stamps) - 1) / ((heard.stamps[-1] - heard.stamps[0]) * 1e-9)
+    gaps = np.diff(received.stamps) * 1e-9
+    rate = (len(received.stamps) - 1) / ((received.stamps[-1] - received.stamps[0]) * 1e-9)
     text = (
         f"{rate:.0f} states a second; time between two: {np.median(gaps) * 1e3:.2f} ms median, "
         f"{np.percentile(gaps, 99) * 1e3:.2f} ms p99, {gaps.max() * 1e3:.2f} ms longest"
@@ -226,9 +226,9 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
     remedy = "use a cable instead of wireless, or a faster or less busy computer"
     yield Finding.judged("states", sparse or late, text, remedy)
-    if not heard.ticks:
+    if not received.ticks:
         return
-    ticks = np.diff(np.array(heard.ticks, dtype=np.int64).astype(np.uint32))
+    ticks = np.diff(np.array(received.ticks, dtype=np.int64).astype(np.uint32))
     steps = ticks.astype(np.int32)
     if (steps == 0).all():
         yield Finding("states", Severity.FAIL, "the robot's clock (tick) stands still", "restart the robot")
@@ -239,10 +239,10 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
         yield Finding(
             "states",
             Severity.NOTE,
-            f"{missing} states lost and {back} repeated or out of order of {len(heard.ticks)}",
+            f"{missing} states lost and {back} repeated or out of order of {len(received.ticks)}",
         )
     device_ms = np.concatenate(((0,), np.cumsum(steps.astype(np.int64))))
-    yield judge_clock(np.array(heard.stamps), 1_000_000 * device_ms)
+    yield judge_clock(np.array(received.stamps), 1_000_000 * device_ms)
 
 
 def _judge_refused(refused: Refusals, sound: int) -> Finding:
@@ -262,28 +262,29 @@ def _judge_refused(refused: Refusals, sound: int) -> Finding:
     return Finding("states", Severity.FAIL if share > _FEW_REFUSED else Severity.WARN, text, remedy)
 
 
-def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str | None) -> Iterator[Finding]:
-    if heard.commands and mode is None:
+def _judge_commands(received: _Received, writers: tuple[str, ...], mode: str | None) -> Iterator[Finding]:
+    if received.commands and mode is None:
         yield Finding(
             "commands",
             Severity.WARN,
-            f"{heard.commands} motor commands came; the robot did not say whether its sport mode sends them",
+            f"{received.commands} motor commands came; the robot did not report whether its sport mode "
+            "sends them",
             "look for other programs that command the motors; an observer's certificate may not ask the "
             "robot: run doctor with a controller's",
         )
-    elif heard.commands and mode:
+    elif received.commands and mode:
         yield Finding(
             "commands",
             Severity.NOTE,
-            f"{heard.commands} motor commands came while sport mode {mode!r} is active, probably its own",
+            f"{received.commands} motor commands came while sport mode {mode!r} is active, probably its own",
             "run doctor again after the release: then no program may command the motors",
         )
-    elif heard.commands:
+    elif received.commands:
         who = f" ({'; '.join(writers)})" if writers else ""
         yield Finding(
             "commands",
             Severity.FAIL,
-            f"another program commands the motors: {heard.commands} messages{who}",
+            f"another program commands the motors: {received.commands} messages{who}",
             "stop that program",
         )
     elif writers:

@@ -48,7 +48,7 @@ _ASK_S: Final = 0.5
 _PATIENCE_S: Final = 3.0
 """A switcher that is silent for this long does not exist, as in older firmware [s]."""
 _UNREACHED_S: Final = 1.5
-"""After three requests a bridge has said whether they reach it: it does so five times a second [s]."""
+"""After three requests a bridge has reported whether they reach it: it does so five times a second [s]."""
 _ACT_S: Final = 5.0
 """Longest wait for an answer, as in the vendor's SDK [s]."""
 

@@ -138,7 +138,7 @@ class Go2Robot(Robot):
         self._armed = self._homed = self._in_charge = False
         self._passive_ns: int | None = None
         self._armed_ns, self._bridged = 0, False
-        # Streams that the bridge has heard, and when it said so [ns].
+        # Streams that the bridge has received, and when it reported so [ns].
         self._bridge_heard, self._bridge_heard_ns = "", 0
         self._fault = self._operator_stop = ""
 
@@ -356,8 +356,8 @@ class Go2Robot(Robot):
         if status is None:
             return
         self._bridged = True
-        if (heard := read_note(message.payload, HEARD_TEXTS)) is not None:
-            self._bridge_heard, self._bridge_heard_ns = heard["heard"], message.stamp_ns
+        if (received := read_note(message.payload, HEARD_TEXTS)) is not None:
+            self._bridge_heard, self._bridge_heard_ns = received["heard"], message.stamp_ns
         controlled = status["control"] == "controlled"
         ours = bool(self._sender.in_force or self._armed_ns)
         if controlled and self._in_charge and not ours:

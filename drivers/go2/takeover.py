@@ -20,8 +20,8 @@ LISTEN_S: Final = 0.5
 RELEASE_PAUSE_S: Final = 1.0
 """Wait between releasing a mode and checking again, as in the vendor's example [s]."""
 LIE_DOWN_S: Final = 4.0
-"""Longest wait for a robot that was told to lie down to come to rest, by its own clock [s]: a simulator on a
-busy computer is slower than real time."""
+"""Longest wait for a robot to come to rest after a request to lie down, by its own clock [s]: a simulator on
+a busy computer is slower than real time."""
 STILL_S: Final = 0.5
 _STILL_RAD_S: Final = 0.3
 _LYING_RAD: Final = 0.5
@@ -96,7 +96,7 @@ class Takeover:
         """Check that neither the robot's own controller nor another program commands the motors.
 
         Services that do not answer are no proof of a controller: an active one sends commands, which are
-        heard.
+        received.
 
         Raises:
             SafetyError: One of them does; the text names it.

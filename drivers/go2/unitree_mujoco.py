@@ -149,7 +149,8 @@ class UnitreeMujocoRobot(Go2Robot):
         if len(writers) > 1:
             raise WrongDeviceError(
                 f"go2: {len(writers)} programs write {topics.LOW_STATE}: {'; '.join(writers)}. Without clock "
-                "and checksum their states cannot be told apart; stop all but one, or choose another domain"
+                "and checksum their states cannot be distinguished; stop all but one, or choose another "
+                "domain"
             )
 
     def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:

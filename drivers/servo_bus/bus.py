@@ -75,7 +75,7 @@ class _Port:
         self.wire: deque[Message] = deque(maxlen=_QUEUE)
         self.buffer = bytearray()
         self.written = bytearray()
-        self.heard = self.stamp_ns = 0
+        self.received_bytes = self.stamp_ns = 0
         self._transport, self._clock = transport, clock
         self._deadline_ns = 0
 
@@ -141,7 +141,7 @@ class _Port:
         except TransportTimeoutError:
             return False
         self.buffer += message.payload
-        self.heard += len(message.payload)
+        self.received_bytes += len(message.payload)
         self.stamp_ns = message.stamp_ns
         self.wire.append(Message("rx", message.payload, message.stamp_ns))
         return True
@@ -167,7 +167,7 @@ class Bus:
 
     Attributes:
         errors: Corrupt or missing answers so far.
-        heard: Received bytes so far, valid or not.
+        received_bytes: Received bytes so far, valid or not.
 
     Args:
         transport: A byte stream, open.
@@ -184,9 +184,9 @@ class Bus:
         self._wanted: deque[_Wanted] = deque()
 
     @property
-    def heard(self) -> int:
+    def received_bytes(self) -> int:
         """Received bytes so far, valid or not."""
-        return self._port.heard
+        return self._port.received_bytes
 
     @property
     def stamp_ns(self) -> int:
@@ -262,9 +262,9 @@ class Bus:
             result, error = self._sdk.writeTxRx(self._port, servo, register.address, register.size, data)
         self._check(servo, result)
         if error & ~_ALERT:
-            said = self._sdk.getRxPacketError(error & ~_ALERT).removeprefix("[RxPacketError] ")
+            text = self._sdk.getRxPacketError(error & ~_ALERT).removeprefix("[RxPacketError] ")
             raise ProtocolError(
-                f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {said}"
+                f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {text}"
             )
 
     def post(self, writes: Writes) -> int:
@@ -391,10 +391,10 @@ class Bus:
         if result == COMM_SUCCESS and whole:
             return
         self.errors += 1
-        said = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ")
-        if "no status packet" in said:
+        text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ")
+        if "no status packet" in text:
             raise TransportTimeoutError(f"servo {servo} does not answer")
-        raise FrameError(f"servo {servo}: {said or 'a short answer'}")
+        raise FrameError(f"servo {servo}: {text or 'a short answer'}")
 
 
 def _sized(found: dict[int, bytes], size: int) -> dict[int, bytes]:

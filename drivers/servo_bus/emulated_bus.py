@@ -138,7 +138,7 @@ class EmulatedBus:
         error = Error.DATA_RANGE if unknown else Error.NONE
         self._reply(packet, packet.servo, lambda s: (error, b""), read=False)
         if unknown or (resets and params[0] == RESET_ALL and packet.servo == BROADCAST):
-            # All servos of a bus with one id and one rate could not be told apart any more.
+            # All servos of a bus with one id and one rate could not be distinguished any more.
             return
         for s in listeners:
             if clears:

@@ -204,12 +204,12 @@ def _news(reader: Any, condition: Any) -> Iterable[Any]:
 
 
 def _peer(sample: Any) -> DdsPeer:
-    told = sample.qos.asdict()
+    settings = sample.qos.asdict()
 
     def word(key: str) -> str:
-        return str(told.get(f"Property<{key}>", {}).get("value", ""))
+        return str(settings.get(f"Property<{key}>", {}).get("value", ""))
 
-    note = base64.b64decode(told.get("Userdata", {}).get("data", ""))
+    note = base64.b64decode(settings.get("Userdata", {}).get("data", ""))
     pid = word("__Pid")
     return DdsPeer(
         key=sample.key,

@@ -78,7 +78,7 @@ class DdsTransport(TopicTransport):
                 raise
 
     def close(self) -> None:
-        """Leave the domain; peers are told at once."""
+        """Leave the domain; peers are informed at once."""
         live, self._live = self._live, None
         if live is not None:
             live.close()

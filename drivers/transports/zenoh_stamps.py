@@ -47,17 +47,17 @@ class Echo:
     Attributes:
         stream: Random number of its session; a new one after each opening.
         sequence: Number of the message in the stream, rising; numbers may be left out.
-        heard: The newest received stamp; zeros before the first.
+        received: The newest received stamp; zeros before the first.
     """
 
     stream: int
     sequence: int
-    heard: Stamp
+    received: Stamp
 
     def encode(self) -> bytes:
         """Return the attachment, 40 bytes."""
         return _ECHO_BYTES.pack(
-            VERSION, _ECHO, 0, self.stream, self.sequence, self.heard.session, self.heard.time_ns
+            VERSION, _ECHO, 0, self.stream, self.sequence, self.received.session, self.received.time_ns
         )
 
 

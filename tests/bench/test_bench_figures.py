@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from matplotlib.container import ErrorbarContainer
-from matplotlib.figure import Figure
 
 from deal_hw.bench.figures import POLICIES, draw
 from deal_hw.bench.rows import load_rows
 from deal_hw.bench.tables import method_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MEASURED = Path(__file__).resolve().parents[2] / "docs" / "measured"
 
@@ -38,7 +39,7 @@ def row(method: str, seed: int, error: float, **more: Any) -> dict[str, Any]:
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """The figures that were saved."""
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, dpi: figures.append(figure))
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, dpi: figures.append(figure))
     return figures
 
 
@@ -59,6 +60,8 @@ def legend(figure: Figure) -> list[str]:
 
 def marks(axes: Axes) -> tuple[float, list[float]]:
     """Return where the one mark of a panel is, and the ends of its bar."""
+    from matplotlib.container import ErrorbarContainer
+
     (container,) = axes.containers
     assert isinstance(container, ErrorbarContainer)
     mark, _, (bar,) = container.lines
@@ -86,7 +89,7 @@ def test_methods_ratios_and_no_data_are_named(drawn: list[Figure], tmp_path: Pat
 
 
 def test_the_bar_reaches_from_the_smallest_to_the_largest(drawn: list[Figure], tmp_path: Path) -> None:
-    """1, 2 and 7: the mark is at 2, the bar from 1 to 7; less than the floor is drawn there, and said."""
+    """1, 2 and 7: the mark is at 2, the bar from 1 to 7; less than the floor is drawn there, and reported."""
     draw(tmp_path / "a.png", [row("eki", seed, value) for seed, value in enumerate((1.0, 7.0, 2.0))])
     middle, bar = marks(drawn[0].axes[0])
     assert middle == 2.0 and bar == [1.0, 7.0]

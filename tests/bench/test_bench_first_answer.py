@@ -66,9 +66,9 @@ def test_real_robots_are_skipped_with_a_reason(tmp_path: Path, capsys: pytest.Ca
     out = tmp_path / "first.json"
     settings = FirstAnswer(problems=("so101", "go2-suspended"), seeds=(0, 1), out=out)
     assert bench(settings) == 0
-    said = capsys.readouterr().out
-    assert "so101 seed 0: skipped: no real recordings: give --real DIR" in said and "seed 1" not in said
-    assert "go2-suspended: not run" in said
+    printed = capsys.readouterr().out
+    assert "so101 seed 0: skipped: no real recordings: give --real DIR" in printed and "seed 1" not in printed
+    assert "go2-suspended: not run" in printed
     row = run_cell("so101", 0, real=tmp_path, budget=Budget(), threads=1)
     assert "chirp_sweep.npz" in row["skipped"] and "docs/results/example-so101.md" in row["skipped"]
 

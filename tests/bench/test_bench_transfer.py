@@ -6,11 +6,10 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from deal_hw.bench import transfer, transfer_target
 from deal_hw.bench.rows import load_rows
@@ -25,7 +24,11 @@ from deal_hw.training import TrainingFiles
 from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import nominal_distribution, train_policy, udr_distribution
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 MEASURED = Path(__file__).resolve().parents[2] / "docs" / "measured"
+SAVE = "matplotlib.figure.Figure.savefig"
 STEPS = 1_500
 FIELDS = {
     "task",
@@ -90,8 +93,8 @@ def test_every_row_is_a_fine_tune_of_one_policy_and_none_is_run_twice(
     assert {(record["seed"], record["training"]["config"]["steps"]) for record in records} == {(0, STEPS)}
     assert len({record["distribution_digest"] for record in records}) == 3
     assert out.with_suffix(".png").stat().st_size > 1000
-    said = capsys.readouterr().out
-    assert "cartpole seed 0 midpoint: estimating" in said and "share of oracle" in said
+    printed = capsys.readouterr().out
+    assert "cartpole seed 0 midpoint: estimating" in printed and "share of oracle" in printed
     kept = {path: path.read_bytes() for path in (tmp_path / "transfer_policies").glob("*oracle*.onnx")}
 
     trained: list[Path] = []
@@ -124,11 +127,11 @@ def test_a_base_policy_is_trained_once_and_a_stopped_training_goes_on(
 
     monkeypatch.setattr(transfer, "train_policy", short)
     one = transfer.Setting(task="cartpole", steps=STEPS, seconds=1.0, base=None, folder=tmp_path)
-    said: list[str] = []
-    path = transfer.base_policy(one, said.append)
+    printed: list[str] = []
+    path = transfer.base_policy(one, printed.append)
     assert path == tmp_path / "cartpole_udr.onnx" and path.with_suffix(".safetensors").exists()
-    assert not made[0].resume and "once" in said[0]
-    assert transfer.base_policy(one, said.append) == path and len(made) == 1
+    assert not made[0].resume and "once" in printed[0]
+    assert transfer.base_policy(one, printed.append) == path and len(made) == 1
 
     def resumed(*args: Any, **more: Any) -> OnnxPolicy:
         made.append(more["files"])
@@ -209,13 +212,13 @@ def test_a_return_is_the_time_upright_near_the_middle(base: Path) -> None:
     assert shipped["return"] > row["return"]
 
 
-def test_the_walk_follows_growing_speeds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_walk_follows_growing_speeds() -> None:
     """The shipped policy on the nominal Go2: ahead while it shall go ahead, aside while aside; no push."""
-    monkeypatch.setattr(transfer_target, "AHEAD_M_S", (0.5,))
-    monkeypatch.setattr(transfer_target, "ASIDE_M_S", (0.3,))
     distribution = nominal_distribution("go2")
     truth = ParameterDistribution.point(distribution.space, distribution.mean, 0.0)
-    row = transfer_target.speed_profile(truth, OnnxPolicy(required_policy("go2")), 0, count=2)
+    profile = transfer_target.commands(ahead_m_s=(0.5,), aside_m_s=(0.3,))
+    policy = OnnxPolicy(required_policy("go2"))
+    row = transfer_target.speed_profile(truth, policy, 0, count=2, profile=profile)
     speed = row["speed"]
     assert row["falls"] == 0
     assert speed["wanted_x_m_s"] == [0.5] * 5 + [0.0] * 5
@@ -245,7 +248,9 @@ def test_the_figure_has_a_panel_for_each_task_and_the_speeds_of_the_go2(
 ) -> None:
     """Methods from top to bottom, the base policy as a line, speeds in x and y of the first seed."""
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: figures.append(figure))
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig", lambda figure, path, **more: figures.append(figure)
+    )
     speed = {name: [0.1, 0.2] for name in ("time_s", "wanted_x_m_s", "wanted_y_m_s", "x_m_s", "y_m_s")}
     rows = [drawn_row("ant", seed, method, 9.0 + seed) for seed in (0, 1) for method in ("udr", "oracle")]
     rows += [drawn_row("go2", seed, "udr", 7.0, speed=speed) for seed in (0, 1)]
@@ -264,7 +269,9 @@ def test_the_figure_has_a_panel_for_each_task_and_the_speeds_of_the_go2(
 def test_published_figures_name_every_method(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the rows beside each: every axis has a name and a title, every method of its rows is at one."""
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: figures.append(figure))
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig", lambda figure, path, **more: figures.append(figure)
+    )
     rows = [one for one in load_rows(path.with_suffix(".json")) if not one["error"]]
     draw_transfer(path, rows)
     for axes in figures[0].axes:

@@ -121,7 +121,7 @@ def test_robots_and_faults_are_chosen_by_name() -> None:
 
 @pytest.mark.slow
 def test_a_right_pendulum_ends_green(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibrated from CSV and MJCF as a user would: truths in the intervals, no search, said in one line."""
+    """Calibrated from CSV and MJCF as a user would: truths in the intervals, no search, one line."""
 
     def short(robot: PlainRobot, folder: Path) -> tuple[Path, list[Path], Path]:
         return write(robot, folder, seconds=3.0)

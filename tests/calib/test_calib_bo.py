@@ -16,7 +16,7 @@ from deal_hw.calib.baselines.bayesian import (
     critic_return,
 )
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
@@ -135,10 +135,10 @@ def test_what_is_forgotten_would_never_be_seen_again() -> None:
     for _ in range(30):
         asked = np.asarray(rng.uniform(size=(8 if not len(points) else 3, 2)))
         # Rounded scores, so that some are equal; some are of members that diverged.
-        told = np.where(rng.uniform(size=len(asked)) < 0.2, np.nan, rng.normal(size=len(asked)).round(1))
+        reported = np.where(rng.uniform(size=len(asked)) < 0.2, np.nan, rng.normal(size=len(asked)).round(1))
         search._asked = asked
-        search.tell(told)
-        points, fitness = np.concatenate([points, asked]), np.concatenate([fitness, told])
+        search.tell(reported)
+        points, fitness = np.concatenate([points, asked]), np.concatenate([fitness, reported])
         ranked = np.where(np.isfinite(fitness), fitness, -np.inf)
         best = np.argsort(-ranked, kind="stable")[:4]
         newest = [i for i in range(len(points)) if i not in best][::-1][:4]

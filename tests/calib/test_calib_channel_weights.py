@@ -45,7 +45,7 @@ def test_a_channel_finer_than_the_model_is_weighted_by_what_the_model_leaves(
     # 60 um / sqrt(2) over 25 um / sqrt(12), less what start states take.
     assert 4.0 < cart < 6.5
     assert pole == 1.0
-    # What is told of the residual stays in units of the sensors' noise.
+    # What is reported of the residual stays in units of the sensors' noise.
     assert weighted.chi2 == pytest.approx((cart**2 + 1) / 2, rel=0.2)
     assert weighted.fit.chi2 == pytest.approx(1.0, abs=0.3)
     assert weighted.fit.shooting.length > fit.shooting.length

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from deal_hw.calib.search.resume import SearchCheckpoint, digest, pack, restore_generator, unpack
+from deal_hw.calib.data.resume import SearchCheckpoint, digest, pack, restore_generator, unpack
 from deal_hw.errors import ConfigurationError, DatasetError
 
 KEYS = st.text(max_size=8).filter(lambda key: key != "__array__")

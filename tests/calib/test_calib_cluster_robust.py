@@ -145,7 +145,7 @@ def _coverage(wild: float, windows: int, draws: int) -> tuple[float, float, floa
         left = design[..., :K] @ theta - y
         chi2 = float(np.sum(left**2) / (left.size - K))
         nothing = np.zeros(K + 1)
-        told = [
+        reported = [
             uncertainty(
                 space,
                 theta,
@@ -158,8 +158,8 @@ def _coverage(wild: float, windows: int, draws: int) -> tuple[float, float, floa
             ).interval
             for rows in ((), (_rows(left, design),))
         ]
-        held.append([bool(interval[0, 0] <= 0 <= interval[0, 1]) for interval in told])
-        widths.append(np.ptp(told[1], axis=1) / np.ptp(told[0], axis=1))
+        held.append([bool(interval[0, 0] <= 0 <= interval[0, 1]) for interval in reported])
+        widths.append(np.ptp(reported[1], axis=1) / np.ptp(reported[0], axis=1))
     plain, with_clusters = np.mean(held, axis=0)
     return float(plain), float(with_clusters), float(np.median(widths))
 

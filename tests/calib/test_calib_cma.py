@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.calib.baselines.cma_es import Cma, CmaSettings, RestartedCma
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import ParameterSpace
@@ -84,7 +84,7 @@ def test_resumes_to_the_last_bit_through_a_restart() -> None:
 
 
 def test_another_generator_state_is_not_touched() -> None:
-    """Pycma seeds and draws from NumPy's global generator unless told otherwise."""
+    """Pycma seeds and draws from NumPy's global generator by default."""
     np.random.seed(5)
     before = np.random.get_state(legacy=False)
     search = RestartedCma(2, 6, CmaSettings(), seed=3)

@@ -10,6 +10,7 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import CommandDelays, Problem, WindowData
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.command_delays import (
     FreeRows,
     _numbers,
@@ -26,7 +27,6 @@ from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.random_delay import fit_delays
 from deal_hw.calib.validation.signatures import signatures
@@ -259,5 +259,5 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     low, high = found.known.latency_interval_s
     assert low <= case.latency_s <= high and "latency_scan" not in found.facts
     json.dumps(found.facts)
-    # It is wide, and is said to be.
+    # It is wide, and is reported to be.
     assert high - low < 20e-3 and found.facts["split_half"]["scale"] > 1.5

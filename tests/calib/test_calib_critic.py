@@ -6,9 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 
-from deal_hw.calib.search.critic import (
+from deal_hw.calib.paper.critic import (
     ClippedCritic,
     Critic,
     CriticSettings,
@@ -50,6 +49,8 @@ def test_clipped_weights_stay_in_the_box() -> None:
 
 def test_penalised_slope_is_near_one() -> None:
     """Between the clouds the gradient by the input has about unit length."""
+    import torch
+
     critic = PenaltyCritic(2, SMALL, np.random.default_rng(0))
     for _ in range(3):
         critic.train(cloud(1, 0.7), cloud(2, -0.7))
@@ -61,6 +62,8 @@ def test_penalised_slope_is_near_one() -> None:
 
 def test_same_seed_same_critic() -> None:
     """Weights and training draw from the generator that is passed in, not from torch's global one."""
+    import torch
+
     scores = []
     for number in range(2):
         torch.manual_seed(number)
@@ -84,6 +87,8 @@ def test_threads_change_no_result(kind: type[Critic]) -> None:
 
 def test_clipped_update_follows_the_gradient_of_eq_5() -> None:
     """One plain step moves each weight by the rate times the difference of the two sides' mean gradients."""
+    import torch
+
     critic = ClippedCritic(2, dataclasses.replace(SMALL, updates=1, clip=10.0), np.random.default_rng(7))
     critic.optimiser = torch.optim.SGD(critic._parameters, lr=0.5)
     before = [p.detach().clone() for p in critic._parameters]
@@ -107,6 +112,8 @@ def test_blocks_are_as_good_as_one_array() -> None:
 
 def test_statistics_are_the_means_of_activations() -> None:
     """A group's statistics are the means over its samples: both hidden layers, then the output."""
+    import torch
+
     critic = PenaltyCritic(2, SMALL, np.random.default_rng(0))
     groups = np.stack([cloud(1, 0.5, 30), cloud(2, -0.5, 30)])
     statistics = critic.statistics(groups)
@@ -119,6 +126,8 @@ def test_statistics_are_the_means_of_activations() -> None:
 
 def test_thread_count_is_restored() -> None:
     """The number of torch's threads is borrowed, not changed."""
+    import torch
+
     before = torch.get_num_threads()
     with torch_threads(1):
         assert torch.get_num_threads() == 1

@@ -34,7 +34,7 @@ from deal_hw.calib.validation.wider_models import zero_parameters
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -407,7 +407,7 @@ def problem_of(robot: PlainRobot, folder: Path) -> Problem:
     """Return the problem of two recordings of 3 s of a robot."""
     model, paths, held_out = write(robot, folder, seconds=3.0)
     recordings = Recordings(model=model, data=tuple(paths))
-    work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    work = calibration_input(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.search.diffusion_evolution import (
+from deal_hw.calib.paper.diffusion_evolution import (
     DiffusionEvolution,
     DiffusionSettings,
     alpha_schedule,

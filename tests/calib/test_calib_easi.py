@@ -9,8 +9,8 @@ import pytest
 
 from deal_hw.calib.baselines.easi import Easi, EasiSettings, EliteGaussian, elite_weights, logarithmic
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.fitness import FITNESSES
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
+from deal_hw.calib.paper.fitness import FITNESSES
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace

@@ -11,7 +11,7 @@ import pytest
 
 from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman, one_pass
 from deal_hw.calib.data.problem import Problem, taken
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.parameters import ParameterSpace

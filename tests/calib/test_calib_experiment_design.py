@@ -346,8 +346,8 @@ def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:
     (advice,) = advise(servo, found, seen(0.02, 0.05, 2.0), seconds=1.6, threads=1)
     assert advice.parameter == "slide.effort_limit"
     assert advice.after < 0.1 * advice.before
-    said = f"record {advice.excitation}: slide.effort_limit goes from 60 % to {100 * advice.after:.2g} %"
-    assert advice.sentence == said
+    printed = f"record {advice.excitation}: slide.effort_limit goes from 60 % to {100 * advice.after:.2g} %"
+    assert advice.sentence == printed
 
 
 def test_an_interval_that_model_error_widened_shrinks_as_if_it_were_noise(servo: RobotModel) -> None:
@@ -372,7 +372,7 @@ def test_an_interval_that_model_error_widened_shrinks_as_if_it_were_noise(servo:
 
 
 def test_advice_says_where_no_excitation_helps(servo: RobotModel) -> None:
-    """Mass and armature of one slide cannot be told apart by any motion; a calibrated robot needs nothing."""
+    """No motion separates mass and armature of one slide; a calibrated robot needs nothing."""
     parameters = space("mass", "armature")
     open_ = result(parameters, np.array([0.6, 0.7]))
     advice = {a.parameter: a for a in advise(servo, open_, seen(9.0, 9.0), seconds=1.6, threads=1)}

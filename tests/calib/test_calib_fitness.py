@@ -12,9 +12,9 @@ from fakes.simulated_episode import simulated_episode
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings
-from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.fitness import (
+from deal_hw.calib.paper.algorithm1 import DealPaper, PaperSettings
+from deal_hw.calib.paper.critic import CriticSettings
+from deal_hw.calib.paper.fitness import (
     FITNESSES,
     FitnessSettings,
     RolloutView,
@@ -105,7 +105,7 @@ def test_flat_sees_nothing(problem: Problem) -> None:
 @pytest.mark.parametrize("name", FITNESSES)
 def test_saved_fitness_goes_on_exactly(problem: Problem, name: str) -> None:
     """After save and load into a new one, later scores are the same to the last bit."""
-    from deal_hw.calib.search.resume import pack, unpack
+    from deal_hw.calib.data.resume import pack, unpack
 
     settings = dataclasses.replace(SETTINGS, replay_generations=3)
     first = make_fitness(name, problem, np.random.default_rng(1), settings)

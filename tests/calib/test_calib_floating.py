@@ -91,7 +91,7 @@ def test_other_start_states_never_cost_more(sensed: Case, three_unknown: Known) 
     space, truth = three_unknown(sensed.space, sensed.theta)
     shooting = Shooting(Problem(sensed.robot, space, [sensed.fit]), 10)
     before = shooting.start(truth, sensed.latency_s)
-    after = shooting.shaken(before, 0.5, 20, np.random.default_rng(1))
+    after = shooting.perturbed(before, 0.5, 20, np.random.default_rng(1))
     assert shooting.cost(after) < shooting.cost(before)
     np.testing.assert_array_equal(after.value, before.value)
 

@@ -17,8 +17,7 @@ from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.workflows.calibration.prepare import usual_method
-from deal_hw.workflows.calibration.run import CalibrationInputs
+from deal_hw.workflows.calibration.intake import CalibrationInput, usual_method
 from deal_hw.workflows.calibration.settings import CalibrateSettings
 
 SHARE = 0.04
@@ -97,7 +96,7 @@ def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
     robot = load_model(DRIVER)
 
     def method(*, walks: bool, **settings: str) -> str:
-        work = cast("CalibrationInputs", SimpleNamespace(robot=robot, walks=walks))
+        work = cast("CalibrationInput", SimpleNamespace(robot=robot, walks=walks))
         return usual_method(CalibrateSettings(**settings), work)  # type: ignore[arg-type]
 
     assert method(walks=True) == "gait"

@@ -10,7 +10,7 @@ from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings, Innovations
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace

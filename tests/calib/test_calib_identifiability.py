@@ -67,10 +67,10 @@ def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
 
 @pytest.mark.parametrize(("jitter_s", "seen"), [(4e-5, []), (4e-4, ["jitter by 0.4 ms"])])
 def test_a_jitter_too_small_to_matter_is_no_alarm(jitter_s: float, seen: list[str]) -> None:
-    """Fast motion without noise looks like 0.04 ms of it, and the alarm said 0.0 ms."""
-    told = _told(_space("a", "b"), [1.0, 2.0], 1e4 * np.eye(2), jitter_s=jitter_s)
-    assert len(told.alarms) == len(seen)
-    assert all(words in alarm.seen for words, alarm in zip(seen, told.alarms, strict=True))
+    """Fast motion without noise looks like 0.04 ms of it, and the alarm had 0.0 ms."""
+    reported = _told(_space("a", "b"), [1.0, 2.0], 1e4 * np.eye(2), jitter_s=jitter_s)
+    assert len(reported.alarms) == len(seen)
+    assert all(words in alarm.seen for words, alarm in zip(seen, reported.alarms, strict=True))
 
 
 @pytest.mark.parametrize(("kind", "alarms"), [("servo_play", False), ("encoder_bias", True)])
@@ -90,9 +90,9 @@ def test_the_least_value_that_a_parameter_can_have_is_an_answer(kind: str, alarm
             )
         ]
     )
-    told = _told(space, [0.0], np.array([[1e8]]), gradient=np.array([50.0, 0.0]))
-    assert told.interval[0, 0] == 0.0
-    assert any("bound of the search range" in alarm.seen for alarm in told.alarms) == alarms
+    reported = _told(space, [0.0], np.array([[1e8]]), gradient=np.array([50.0, 0.0]))
+    assert reported.interval[0, 0] == 0.0
+    assert any("bound of the search range" in alarm.seen for alarm in reported.alarms) == alarms
 
 
 def test_the_interval_at_a_bound_lies_on_one_side() -> None:
@@ -108,9 +108,9 @@ def test_the_interval_at_a_bound_lies_on_one_side() -> None:
 
 def test_a_bound_that_the_data_do_not_press_is_none() -> None:
     """At the bound, but the cost falls inwards: the parameter stays free."""
-    told = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]), gradient=np.array([0.0, 5.0, 0.0]))
-    assert list(told.bound) == [0, 0]
-    (alarm,) = [alarm for alarm in told.alarms if "bound" in alarm.seen]
+    reported = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]), gradient=np.array([0.0, 5.0, 0.0]))
+    assert list(reported.bound) == [0, 0]
+    (alarm,) = [alarm for alarm in reported.alarms if "bound" in alarm.seen]
     assert "b (5 kg)" in alarm.seen and "the data do not press" in alarm.means
 
 
@@ -118,13 +118,13 @@ def test_what_ended_at_a_bound_is_what_the_alarms_name() -> None:
     """Pressed, not pressed, and not seen at all: whoever lies at an end is named, nobody else."""
     space, theta = _space("a", "b", "c", "d"), [5.0, 0.2, 5.0, 4.99]
     hessian, gradient = np.diag([1e4, 1e4, 1e-9, 1e4]), np.array([-50.0, -50.0, 0.0, -50.0, 0.0])
-    told = _told(space, theta, hessian, gradient=gradient)
-    pressed, other = [alarm for alarm in told.alarms if "bound" in alarm.seen]
+    reported = _told(space, theta, hessian, gradient=gradient)
+    pressed, other = [alarm for alarm in reported.alarms if "bound" in alarm.seen]
     assert "a (5 kg)" in pressed.seen and "do not press" not in pressed.means
     assert "b (0.2 kg), c (5 kg)" in other.seen and "do not press" in other.means
     ended = ended_at_bound(space, np.array(theta))
     assert ended.tolist() == [True, True, True, False]
-    assert list(told.bound) == [1, 0, 0, 0]
+    assert list(reported.bound) == [1, 0, 0, 0]
 
 
 def test_a_prior_resolves_a_common_factor() -> None:
@@ -149,22 +149,22 @@ def test_what_a_null_direction_hardly_moves_keeps_its_value() -> None:
     """C moves by a hundredth of a and b along the direction that nobody sees: it is identified to 1 %."""
     v = np.array([1.0, 1.0, 0.01])
     projector = np.eye(3) - np.outer(v, v) / (v @ v)
-    told = _told(_space("a", "b", "c"), [1.0, 1.0, 1.0], 1e8 * projector)
-    assert told.verdicts == ("not identifiable", "not identifiable", "identifiable")
+    reported = _told(_space("a", "b", "c"), [1.0, 1.0, 1.0], 1e8 * projector)
+    assert reported.verdicts == ("not identifiable", "not identifiable", "identifiable")
 
 
 def test_plausible_latencies_that_disagree_cost_a_verdict() -> None:
     """At two ticks that explain the data alike one parameter differs by half: it is weak."""
     space = _space("a", "b")
-    told = _told(space, [1.0, 1.0], np.diag([1e4, 1e4]))
-    assert told.verdicts == ("identifiable", "identifiable")
+    reported = _told(space, [1.0, 1.0], np.diag([1e4, 1e4]))
+    assert reported.verdicts == ("identifiable", "identifiable")
     fits = [
         SimpleNamespace(theta=np.array([a, 1.0]), latency_s=0.003, chi2=1.0, normal=SimpleNamespace(cost=9.0))
         for a in (1.0, 1.65)
     ]
     problem = SimpleNamespace(episodes=[SimpleNamespace(step_s=1e-3)], latency_range_s=(0.0, 0.04))
     scan = LatencyScan((3, 4), cast("tuple[Refined, ...]", tuple(fits)))
-    found = averaged(cast("Problem", problem), scan, told)
+    found = averaged(cast("Problem", problem), scan, reported)
     assert found.verdicts == ("weak", "identifiable")
     assert found.covariance[0, 0] == pytest.approx(1.44e-4 + np.log(1.65) ** 2 / 2, rel=1e-3)
 

@@ -14,7 +14,7 @@ from deal_hw.calib.baselines.least_squares import (
     textbook_covariance,
 )
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -69,11 +69,11 @@ def test_takes_no_latency_but_a_given_one(
     theta = recorded(latency_ticks=8)[1]
     rng = np.random.default_rng(0)
     ignorant = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=None), Budget(), rng)
-    told = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=8e-3), Budget(), rng)
+    reported = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=8e-3), Budget(), rng)
     assert ignorant.latency_s == 0.0
     assert ignorant.provenance["assumed_latency_s"] == 0.0
-    assert told.latency_s == 8e-3
-    assert np.mean(np.abs(np.log(told.estimate / theta))) < 1e-3
+    assert reported.latency_s == 8e-3
+    assert np.mean(np.abs(np.log(reported.estimate / theta))) < 1e-3
     assert np.mean(np.abs(np.log(ignorant.estimate / theta))) > 0.02
 
 

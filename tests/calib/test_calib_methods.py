@@ -1,4 +1,4 @@
-"""Every method in the table keeps the contract, and the searches find what they are said to find."""
+"""Every method in the table keeps the contract, and the searches find the true parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from fakes.recorded_commands import RecordedCommands
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.paper.algorithm1 import DealPaper, PaperSettings, _Box
+from deal_hw.calib.paper.critic import CriticSettings
 from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
     DEFAULT_SEARCH,
@@ -27,11 +30,8 @@ from deal_hw.calib.pipeline.methods import (
     with_search,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
-from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings, _Box
-from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import NEAR_SPREAD, Eki
-from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calibration import EXPLAINED_CHI2, Budget, Progress
@@ -432,9 +432,9 @@ def test_a_critic_that_diverges_is_said_and_the_search_goes_on() -> None:
     wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
     problem, truth = small_problem(), two_parameters()[1]
     budget = Budget(population=30, generations=20)
-    told: list[Progress] = []
-    result = Deal(DealSettings(critic=wild)).run(problem, budget, np.random.default_rng(0), told.append)
-    assert all("the critic diverged, its last weights go on" in one.message for one in told)
+    reported: list[Progress] = []
+    result = Deal(DealSettings(critic=wild)).run(problem, budget, np.random.default_rng(0), reported.append)
+    assert all("the critic diverged, its last weights go on" in one.message for one in reported)
     generations = len(result.trace)
     assert f"diverged in {generations} of {generations} generations" in result.alarms[0].seen
     assert "--search eki" in result.alarms[0].do
@@ -457,12 +457,12 @@ def test_a_diverged_critic_is_an_alarm_of_the_refined_result_where_noise_explain
 def test_a_diverged_critic_of_distributions_is_in_the_result() -> None:
     """The alarm counts the generations; the search ends with finite values all the same."""
     wild = CriticSettings(hidden=(8, 8), learning_rate=1e38, updates=2, batch=32)
-    told: list[Progress] = []
+    reported: list[Progress] = []
     search = Unaligned(UnalignedSettings(critic=wild))
     result = search.run(
-        small_problem(), Budget(population=10, generations=3), np.random.default_rng(0), told.append
+        small_problem(), Budget(population=10, generations=3), np.random.default_rng(0), reported.append
     )
-    assert all(one.message.startswith("the critic diverged, its last weights go on") for one in told)
+    assert all(one.message.startswith("the critic diverged, its last weights go on") for one in reported)
     assert "diverged in 3 of 3 generations" in result.alarms[0].seen
     assert np.isfinite(result.estimate).all() and result.provenance["compares"] == "distributions"
 

@@ -144,10 +144,10 @@ def test_what_is_printed_names_the_robot(capsys: pytest.CaptureFixture[str]) -> 
         provenance={"dataset": "runs/mine/dataset"},
     )
     print_result(found, "record another motion", "cartpole")
-    said = capsys.readouterr().out
-    assert "deal-hw collect cartpole --excite next.json --port PORT --dataset runs/mine/dataset" in said
-    assert "    deal-hw calibrate runs/mine/dataset" in said
-    assert "collect verdict" not in said
-    assert "next: record steps" in said
+    printed = capsys.readouterr().out
+    assert "deal-hw collect cartpole --excite next.json --port PORT --dataset runs/mine/dataset" in printed
+    assert "    deal-hw calibrate runs/mine/dataset" in printed
+    assert "collect verdict" not in printed
+    assert "next: record steps" in printed
     print_result(dataclasses.replace(found, chi2=9.0), "record another motion", "cartpole")
     assert "next, after the causes that alarms name: record steps" in capsys.readouterr().out

@@ -13,6 +13,7 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts, SearchCheckpoint
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.null_space import confounded
 from deal_hw.calib.fit.output_error import (
@@ -30,13 +31,12 @@ from deal_hw.calib.pipeline.output_error_fits import (
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts, SearchCheckpoint
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 HINGE = """
@@ -94,7 +94,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    work = prepare(CalibrateSettings(recordings=source, threads=1))
+    work = calibration_input(CalibrateSettings(recordings=source, threads=1))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 
@@ -131,7 +131,7 @@ def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem
 
 
 def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
-    """What a search is told is the residual of a first fit; of what was not measured nothing is said."""
+    """A search gets the residual of a first fit; channels that were not measured have none."""
     std = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT).expected_std
     assert problem.noise_std[0] <= std[0] < 5e-3
 
@@ -244,7 +244,7 @@ def test_a_walks_search_runs_only_where_its_fits_explain_nothing(problem: Proble
         turned = [dataclasses.replace(e, position=-e.position) for e in problem.episodes]
         problem = dataclasses.replace(problem, episodes=turned)
     fit = fit_output_error(problem, TRUTH, LATE_S, Recipe(seconds=0.4, iterations=0))
-    told: list[str] = []
+    reported: list[str] = []
     rng = np.random.default_rng(0)
     run = CalibrationRun(
         problem=problem,
@@ -252,12 +252,12 @@ def test_a_walks_search_runs_only_where_its_fits_explain_nothing(problem: Proble
         rng=rng,
         attempts=Restarts(Eki(), rng, None),
         settings=Validation(local_first=False, cross_validation=False),
-        progress=lambda p: told.append(p.message) if p.stage == BEFORE_SEARCH else None,
+        progress=lambda p: reported.append(p.message) if p.stage == BEFORE_SEARCH else None,
     )
     found = OutputErrorFits(settings, (fit, fit)).best(run)
     assert found.searched.method == ("nominal" if explains else "eki")
     assert (
-        any("no better than a robot that stands still, so a search follows" in text for text in told)
+        any("no better than a robot that stands still, so a search follows" in text for text in reported)
         != explains
     )
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import with_finer_step
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.time_steps import (
     CLEARLY,
@@ -28,7 +28,7 @@ from deal_hw.calib.validation.time_steps import (
 )
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import make_robot, write
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 HINGE = """
@@ -79,7 +79,7 @@ def checked(
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    work = prepare(CalibrateSettings(recordings=source, threads=1))
+    work = calibration_input(CalibrateSettings(recordings=source, threads=1))
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = local_fit(problem, None)
     assert fit is not None
@@ -112,7 +112,7 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
 
 
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
-    """The finer step explains them worse: nothing is said, no interval is widened."""
+    """The finer step explains them worse: nothing is reported, no interval is widened."""
     problem, known, found = checked(tmp_path, STEP_S)
     assert found.gain < -CLEARLY and step_alarm(known, found) == ()
     assert counted(problem, known, found) is known
@@ -142,7 +142,7 @@ def test_a_step_that_fine_encoders_show_is_halved_before_a_search(tmp_path: Path
     """
     model, paths, held_out = write(make_robot("cart-pole", 0, "encoders"), tmp_path, seconds=3.0)
     recordings = Recordings(model=model, data=tuple(paths))
-    work = prepare(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    work = calibration_input(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
     local = local_fit(problem)
     assert local is not None and local.chi2 > 1.1

@@ -1,4 +1,4 @@
-"""The refinement and what is said of its result, on recordings of the real device core with hidden truths."""
+"""The refinement and the verdicts on its result, on recordings of the real device core with hidden truths."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy
 from fakes.fixed_search import FixedSearch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from deal_hw.bench.scores import error_percent, interval_score, log_error_x100
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import HELD_STD, noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
     FALSE_ALARMS,
@@ -42,7 +43,6 @@ from deal_hw.calib.pipeline.stages import (
     conclusive,
     lower_minimum,
 )
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calib.validation.time_steps import LatencyScan
@@ -63,7 +63,7 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
     found = refine(problem, problem.space.nominal, 0.0)
     white = np.random.default_rng(0).normal(size=(8, 400, 2))
     # The same power with a memory, x[t] = 0.2 x[t - 1] + sqrt(1 - 0.2 ** 2) w[t]: autocorrelation time 1.5.
-    pattern = lfilter([np.sqrt(1 - 0.2**2)], [1, -0.2], white, axis=1)
+    pattern = scipy.signal.lfilter([np.sqrt(1 - 0.2**2)], [1, -0.2], white, axis=1)
 
     def leaving(residual: FloatArray) -> Refined:
         normal = dataclasses.replace(found.normal, residual=(residual,))
@@ -80,15 +80,15 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
 def test_a_local_fit_is_reported_step_by_step(small_problem: Callable[..., Problem]) -> None:
     """Costs are halved within a window length, nothing nominal is reported, and the last is the result."""
     problem = small_problem()
-    told: list[Refined] = []
-    found = local_fit(problem, told.append)
-    assert found is not None and np.array_equal(told[-1].theta, found.theta)
-    lengths = [fit.shooting.length for fit in told]
+    noted: list[Refined] = []
+    found = local_fit(problem, noted.append)
+    assert found is not None and np.array_equal(noted[-1].theta, found.theta)
+    lengths = [fit.shooting.length for fit in noted]
     assert lengths == sorted(lengths) and lengths.count(lengths[0]) > 3
     for length in set(lengths):
-        *steps, _ = [fit.chi2 for fit in told if fit.shooting.length == length]
+        *steps, _ = [fit.chi2 for fit in noted if fit.shooting.length == length]
         assert all(later < 0.5 * before for before, later in itertools.pairwise(steps))
-    assert not any(np.array_equal(fit.theta, problem.space.nominal) for fit in told)
+    assert not any(np.array_equal(fit.theta, problem.space.nominal) for fit in noted)
 
 
 def test_a_hopeless_fit_does_not_begin_again(small_problem: Callable[..., Problem]) -> None:
@@ -475,7 +475,7 @@ def test_a_parameter_at_its_bound_is_reported() -> None:
     """The alarm names the parameter and says to widen the range."""
     space = _two()
     residual = (np.random.default_rng(0).normal(size=(4, 50, 2)),)
-    told = uncertainty(
+    noted = uncertainty(
         space,
         np.array([1.0, 5.0]),
         0.01,
@@ -484,8 +484,8 @@ def test_a_parameter_at_its_bound_is_reported() -> None:
         (0.0, 0.04),
         kinks=1.2,
     )
-    assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
-    assert told.verdicts == ("identifiable", "identifiable")
+    assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in noted.alarms)
+    assert noted.verdicts == ("identifiable", "identifiable")
 
 
 def test_scores_by_hand() -> None:

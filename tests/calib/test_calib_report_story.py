@@ -78,7 +78,7 @@ def test_a_model_that_diverges_has_no_number() -> None:
 
 
 def test_without_held_out_recordings_nothing_is_claimed() -> None:
-    """No gain and no bars; what is known of the fit is said. chi2 of 4 is twice the noise."""
+    """No gain and no bars; what is known of the fit is reported. chi2 of 4 is twice the noise."""
     story = make_story(result({}, chi2=4.0))
     assert (
         story.sentence.startswith("It is not known how well")
@@ -88,7 +88,7 @@ def test_without_held_out_recordings_nothing_is_claimed() -> None:
 
 
 def test_units_and_noise_stand_beside_the_gain() -> None:
-    """Noise of 0.5 % on a bar of 26.4 % is at 1.89 %; rad is said where all joints have it, else nothing."""
+    """Noise of 0.5 % on a bar of 26.4 % is at 1.89 %; the unit is rad where all joints have it, else none."""
     rmse: dict[str, Any] = {
         "mean": {"nominal": 0.0266, "calibrated": 0.0011},
         "unit": {"hip": "rad", "knee": "rad"},

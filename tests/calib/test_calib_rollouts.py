@@ -11,15 +11,15 @@ from fakes.recorded_commands import RecordedCommands
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.innovations import Members, explained, linearise, predict
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.base import Coordinates
-from deal_hw.calib.search.eki import logistic, logit
-from deal_hw.calib.search.rollouts import (
+from deal_hw.calib.data.search import Coordinates
+from deal_hw.calib.paper.rollouts import (
     TransitionScale,
     control_ticks,
     demonstration,
     rollout_population,
     transitions,
 )
+from deal_hw.calib.search.eki import logistic, logit
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 

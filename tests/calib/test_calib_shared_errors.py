@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.pipeline import stages
@@ -19,7 +20,6 @@ from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun
 from deal_hw.calib.pipeline.stages import Fits, Refinement, with_shared_error
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.shared_errors import (
@@ -32,7 +32,7 @@ from deal_hw.calib.validation.shared_errors import (
 from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
@@ -107,7 +107,7 @@ def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds:
     """Return the problem of a simulated robot's recordings."""
     robot = make_robot(kind, 3, fault)
     model, paths, held_out = write(robot, folder, seconds=seconds)
-    work = prepare(
+    work = calibration_input(
         CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
     )
     return Problem(work.robot, work.space, work.episodes, threads=1)
@@ -132,7 +132,7 @@ def test_candidates_are_few_and_each_mends_what_it_says(tmp_path: Path) -> None:
 def test_a_correction_that_leaves_more_than_noise_is_no_cause(
     before: float, after: float, decides: bool
 ) -> None:
-    """A poor fit that becomes less poor names nothing: a real cart was said to be halved that way."""
+    """A poor fit that becomes less poor names nothing: a real cart got a wrong factor of a half that way."""
     assert shared_errors_module._decides(before, after, 4000) is decides
 
 
@@ -189,9 +189,9 @@ def test_a_shared_error_is_named(fault: SharedFault, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
-    """A pendulum whose clock ran twice as fast: said before the search, the first alarm, the verdict."""
+    """A pendulum whose clock ran twice as fast: reported before the search, the first alarm, the verdict."""
     wrong = problem("pendulum", "fast-clock", tmp_path, 2.0)
-    said: list[Progress] = []
+    printed: list[Progress] = []
     result = calibrate_episodes(
         wrong.robot,
         wrong.space,
@@ -203,9 +203,9 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
         threads=1,
         # So brief a search would leave this check no steps.
         thorough=True,
-        progress=said.append,
+        progress=printed.append,
     )
-    assert any("the clock were 2 times too fast" in p.message for p in said)
+    assert any("the clock were 2 times too fast" in p.message for p in printed)
     verdict = trust(result)
     assert verdict.colour == "red" and "Multiply all times by 0.5" in verdict.do
     assert result.provenance["shared_error"]["errors"][0]["kind"] == "clock"
@@ -215,7 +215,7 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
 def suspected(tmp_path: Path) -> tuple[CalibrationRun, FoundError, list[Progress]]:
     """Return a run on right recordings, a suspicion that they are wrong, and what the run reports."""
     right = problem("pendulum", None, tmp_path)
-    said: list[Progress] = []
+    printed: list[Progress] = []
     rng = np.random.default_rng(0)
     run = CalibrationRun(
         problem=right,
@@ -223,9 +223,9 @@ def suspected(tmp_path: Path) -> tuple[CalibrationRun, FoundError, list[Progress
         rng=rng,
         attempts=Restarts(Eki(), rng, None),
         settings=Validation(),
-        progress=said.append,
+        progress=printed.append,
     )
-    return run, FoundError(tuple(shared_errors(right))[:1], 1.0, 100.0, 500.0, right, 10), said
+    return run, FoundError(tuple(shared_errors(right))[:1], 1.0, 100.0, 500.0, right, 10), printed
 
 
 @pytest.mark.slow
@@ -233,16 +233,16 @@ def test_a_search_that_predicts_as_well_withdraws_it(
     suspected: tuple[CalibrationRun, FoundError, list[Progress]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Right recordings that were suspected: printed, tried by a brief search, and taken back in print."""
-    run, suspicion, said = suspected
+    run, suspicion, printed = suspected
     monkeypatch.setattr(stages, "find_shared_error", lambda *_: SharedErrorCheck(found=suspicion))
     found = with_shared_error(Refinement(), run)
-    words = [p.message for p in said]
+    words = [p.message for p in printed]
     assert words.index(str(suspicion.alarm)) < words.index(suspicion.withdrawn)
     assert suspicion.withdrawn.startswith("withdrawn: ")
     assert "shared_error" not in found.facts and suspicion.alarm not in found.known.alarms
     # The brief run checks nothing. The second takes its search.
     assert "split_half" in found.facts
-    generations = [p.done for p in said if p.stage == "search" and p.total > 1]
+    generations = [p.done for p in printed if p.stage == "search" and p.total > 1]
     assert generations and generations == sorted(set(generations))
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Member, Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.checks import (
     HALVES,
@@ -77,15 +77,15 @@ def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
     tight = dataclasses.replace(known, interval=np.stack([low, 1.01 * low], axis=1))
     split = agreement(known, [(low, 0.0), (noisy_refined.theta, 0.0)], [tight, known], None, 0)
     assert all(row.agree is False for row in split.rows)
-    told = np.array(problem.space.names)[~known.blind]
-    assert set(split.flagged) <= set(told) and "servo.stiffness" in split.flagged
+    reported = np.array(problem.space.names)[~known.blind]
+    assert set(split.flagged) <= set(reported) and "servo.stiffness" in split.flagged
     assert "(" in split.alarms(problem.space)[0].seen
 
 
 def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
     noisy: Case, noisy_problem: Problem, noisy_refined: Refined
 ) -> None:
-    """A half whose stiffness lies ten standard deviations off: its interval is widened to it, and said."""
+    """A half whose stiffness lies ten standard deviations off: its interval reaches it, with an alarm."""
     known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
     k = noisy_problem.space.names.index("servo.stiffness")
     std = np.sqrt(known.covariance[k, k])
@@ -106,10 +106,10 @@ def test_halves_that_differ_more_than_intervals_expect_widen_all_of_them(
     problem, theta = noisy_problem, noisy_refined.theta
     known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
     std, at = np.sqrt(np.diag(known.covariance)), problem.space.to_scale(theta)
-    told = ~known.blind
+    reported = ~known.blind
 
     def halves(off: float) -> list[Member]:
-        return [(problem.space.from_scale(at + side * off * std * told), 0.01) for side in (-1, 1)]
+        return [(problem.space.from_scale(at + side * off * std * reported), 0.01) for side in (-1, 1)]
 
     wide = dataclasses.replace(known, interval=np.stack([problem.space.low, problem.space.high], axis=1))
     split = agreement(known, halves(2.1), [wide, wide], None, 0)
@@ -192,16 +192,16 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4)))
     known, _ = judge(problem, found, uncertainty_at(problem, found, fixed_latency=True), Validation())
     assert len(known.null_directions) == 2
-    # The same is said before a search begins.
-    said: list[Progress] = []
-    report_unidentifiable(problem, found, said.append)
-    assert [p.stage for p in said] == [BEFORE_SEARCH]
-    assert said[0].message.count("measure one of them") == 2
+    # The same is reported before a search begins.
+    printed: list[Progress] = []
+    report_unidentifiable(problem, found, printed.append)
+    assert [p.stage for p in printed] == [BEFORE_SEARCH]
+    assert printed[0].message.count("measure one of them") == 2
     named = [n for n in space.names if any(n in words for words in known.null_directions)]
     without = [n for n, v in zip(space.names, known.verdicts, strict=True) if v == "not identifiable"]
     assert {"cart.mass", "pole.mass", "pole.length", "servo.stiffness"} <= set(without)
     assert set(without) <= set(named)
-    # Ratios of rates are told whatever the scale of forces is.
+    # Ratios of rates are reported whatever the scale of forces is.
     assert known.verdicts[space.names.index("servo.speed_limit")] == "identifiable"
     for n in without:
         k = space.names.index(n)

@@ -14,7 +14,7 @@ from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calib.baselines.sysid import MujocoSysid, SysidSettings, with_delay
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import SearchCheckpoint
+from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -29,12 +29,16 @@ from deal_hw.types import FloatArray
 TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5, "servo.speed_limit": 0.5}
 """Factors of the nominal values."""
 
-try:
-    require_sysid()
-except MissingExtraError as error:
-    needs_sysid = pytest.mark.skip(reason=str(error))
-else:
-    needs_sysid = pytest.mark.filterwarnings("error")
+needs_sysid = pytest.mark.usefixtures("sysid")
+
+
+@pytest.fixture(scope="module")
+def sysid() -> None:
+    """Skip what needs `mujoco.sysid` where that is not installed."""
+    try:
+        require_sysid()
+    except MissingExtraError as error:
+        pytest.skip(str(error))
 
 
 @functools.cache
@@ -73,15 +77,15 @@ class TestMujocoSysid(MethodSuite):
 
 @needs_sysid
 def test_latency_is_zero_unless_given() -> None:
-    """Its user knows of none; told what was found by other means it finds the parameters, and says so."""
+    """Its user knows of none; with what was found by other means it finds the parameters, and says so."""
     theta, rng = recorded(8)[1], np.random.default_rng(0)
     ignorant = MujocoSysid().run(problem(8, None), Budget(generations=12), rng)
-    told = MujocoSysid(SysidSettings(latency_s=8e-3)).run(problem(8, None), Budget(generations=12), rng)
+    noted = MujocoSysid(SysidSettings(latency_s=8e-3)).run(problem(8, None), Budget(generations=12), rng)
     assert ignorant.latency_s == 0.0
     assert "0 ms of latency (none" in ignorant.provenance["interval"]
-    assert told.latency_s == 8e-3
-    assert "8 ms of latency (given)" in told.provenance["interval"]
-    errors = [np.mean(np.abs(np.log(r.estimate / theta))) for r in (ignorant, told)]
+    assert noted.latency_s == 8e-3
+    assert "8 ms of latency (given)" in noted.provenance["interval"]
+    errors = [np.mean(np.abs(np.log(r.estimate / theta))) for r in (ignorant, noted)]
     assert errors[1] < 5e-3 < 0.02 < errors[0]
 
 

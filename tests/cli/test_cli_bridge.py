@@ -96,11 +96,11 @@ def test_it_loads_neither_simulator_nor_learning(tmp_path: Path) -> None:
         timeout=120,
         check=True,
     )
-    port, told = done.stdout.splitlines()
+    port, reported = done.stdout.splitlines()
     assert port.startswith("port tcp/127.0.0.1:")
     assert "the robot's active controller is unknown, so it is not damped yet" in done.stderr
     assert "0 commands passed" in done.stderr
-    found = json.loads(told)
+    found = json.loads(reported)
     assert found["code"] == 0
     assert not HEAVY & set(found["loaded"])
     assert {"zenoh", "cyclonedds"} <= set(found["loaded"])

@@ -20,9 +20,10 @@ from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
-from deal_hw.workflows.calibration.dataset import choose_episodes, without_speed_limits
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.dataset import choose_episodes
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import Recordings
+from deal_hw.workflows.calibration.space import without_speed_limits
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 
@@ -45,11 +46,11 @@ def test_a_drive_whose_set_points_the_host_moves_has_no_speed_limit(sent: float,
     recorded = dataclasses.replace(
         made, speed_limit=np.full_like(made.speed_limit, sent), position_target=steps
     )
-    said: list[str] = []
-    space = without_speed_limits(k9_space(), DESCRIPTION, [recorded], said.append)
+    output: list[str] = []
+    space = without_speed_limits(k9_space(), DESCRIPTION, [recorded], output.append)
     assert ("servo.speed_limit" in space.names) == searched
     assert space["servo.speed_limit"].nominal == pytest.approx(1.0 if searched else 20.0)
-    assert len(said) == (not searched)
+    assert len(output) == (not searched)
 
 
 @pytest.fixture(scope="module")
@@ -84,13 +85,15 @@ def test_a_file_adds_parameters_to_a_robots_own_set(dataset: Path, tmp_path: Pat
     extra = tmp_path / "extra.yaml"
     extra.write_text("parameters:\n  - {kind: encoder_bias, elements: cart}\n")
     chosen = Recordings(parameters=extra)
-    space = prepare(settings(dataset, free=(), recordings=chosen)).space
+    space = calibration_input(settings(dataset, free=(), recordings=chosen)).space
     assert space.names == (*k9_space().names, "cart.encoder_bias")
-    freed = prepare(settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)).space
+    freed = calibration_input(
+        settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)
+    ).space
     assert freed.names == ("cart.mass", "cart.encoder_bias")
     extra.write_text("parameters:\n  - {kind: dof_damping, elements: pole, name: twice}\n")
     with pytest.raises(ConfigurationError, match="both set dof_damping of 'pole'"):
-        prepare(settings(dataset, free=(), recordings=chosen))
+        calibration_input(settings(dataset, free=(), recordings=chosen))
 
 
 def test_writes_everything_a_user_needs(
@@ -132,9 +135,9 @@ def test_a_realistic_robot_is_searched_adversarially(
     """Friction, play and jitter that no parameter expresses: after the local fit the search is announced."""
     asked = {"free": (), "population": 10, "generations": 2, "quiet": False}
     report = calibrate(settings(realistic, **asked, search=search, out=tmp_path))
-    told = " ".join(capsys.readouterr().err.split())
+    reported = " ".join(capsys.readouterr().err.split())
     announced = f"before the search: the local fit leaves more than noise, so {words}"
-    assert told.index("local fit:") < told.index(announced)
+    assert reported.index("local fit:") < reported.index(announced)
     provenance = report.result.provenance
     assert provenance["search"] == (search or "deal")
     assert provenance["settings"].get("trained", False) == (search is None)
@@ -152,8 +155,8 @@ def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[s
     folder = Path("runs/arm/calibration")
     files = {name: folder / name for name in ("result.json", "report.html")}
     print_files(files)
-    told = capsys.readouterr().out.splitlines()
-    assert told == [
+    reported = capsys.readouterr().out.splitlines()
+    assert reported == [
         f"written to {folder}: result.json, report.html",
         f"see all results: open {folder / 'report.html'} in a browser",
     ]
@@ -235,8 +238,8 @@ def test_dataset_of_held_out_episodes_only_is_refused(tmp_path: Path) -> None:
 
 def test_parameter_sets_and_known_values(dataset: Path) -> None:
     """k11 frees everything; a weighed cart is known; an unknown set lists the sets."""
-    assert len(prepare(settings(dataset, free=(), space="k11")).space) == 11
-    space = prepare(settings(dataset, free=(), known=(("cart.mass", 0.41),))).space
+    assert len(calibration_input(settings(dataset, free=(), space="k11")).space) == 11
+    space = calibration_input(settings(dataset, free=(), known=(("cart.mass", 0.41),))).space
     assert space.known["cart.mass"] == 0.41 and len(space) == 8
     with pytest.raises(UnknownNameError, match=r"k7.*k9, k11"):
-        prepare(settings(dataset, free=(), space="k7"))
+        calibration_input(settings(dataset, free=(), space="k7"))

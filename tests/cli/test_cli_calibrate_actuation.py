@@ -61,8 +61,8 @@ def test_the_other_kind_is_refused(
     words = ["calibrate", *files, "--data", str(folder / f"{data}.csv"), "--generations", "1", "--no-refine"]
     words += ["--out", str(tmp_path / "out")]
     assert main(words) == EXIT_ERROR
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert message in told and "in a copy of the MJCF" in told
+    reported = capsys.readouterr().err.splitlines()[-1]
+    assert message in reported and "in a copy of the MJCF" in reported
     words = [
         "data",
         "import",
@@ -109,5 +109,5 @@ def test_commands_that_the_actuator_would_clip_are_refused(
         str(tmp_path / "out"),
     ]
     assert main(words) == EXIT_ERROR
-    told = capsys.readouterr().err
-    assert "outside the actuators' ctrlrange" in told and "takes -0.02..0.02" in told
+    reported = capsys.readouterr().err
+    assert "outside the actuators' ctrlrange" in reported and "takes -0.02..0.02" in reported

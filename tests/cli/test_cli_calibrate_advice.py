@@ -75,14 +75,14 @@ def test_open_parameters_come_with_advice(
         "0",
     ]
     assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
-    told = " ".join(capsys.readouterr().out.split())
+    reported = " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "calibration" / "result.json").read_text())
     advice = {row["parameter"]: row for row in found["advice"]}
     assert found["parameters"]["hinge.armature"]["verdict"] != "identifiable"
     row = advice["hinge.armature"]
     assert row["std_after"] < 0.7 * row["std"]
     assert row["sentence"].startswith("record 4 s of ")
-    assert f"next: {row['sentence']}" in told
+    assert f"next: {row['sentence']}" in reported
     page = (tmp_path / "calibration" / "report.html").read_text()
     assert "What to record next" in page and row["sentence"] in page
     assert (

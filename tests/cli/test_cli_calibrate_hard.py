@@ -1,4 +1,4 @@
-"""``deal-hw calibrate --model`` where a stage fails: what happened is said, and no traceback ends the run."""
+"""``deal-hw calibrate --model`` where a stage fails: the reason is printed, and no traceback ends the run."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Calibrated
         line += ["--parameters", str(tmp_path / "params.yaml"), "--population", "16", "--generations", "6"]
         line += ["--threads", "1", "--no-report", "--no-advise", "--out", str(tmp_path / "out"), *more]
         code = main(line)
-        said = capsys.readouterr()
-        return code, " ".join((said.err + said.out).split()), tmp_path / "out" / "calibration"
+        printed = capsys.readouterr()
+        return code, " ".join((printed.err + printed.out).split()), tmp_path / "out" / "calibration"
 
     return run
 
@@ -68,10 +68,12 @@ UNSTABLE = "parameters: [{kind: servo_stiffness, elements: servo, nominal: 3.0e+
 def test_a_local_fit_that_diverges_is_said_and_leaves_it_to_the_search(
     calibrated: Calibrated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, search: str
 ) -> None:
-    """The nominal gain is unstable at this step. What was seen is said, and the search finds real numbers."""
+    """The nominal gain is unstable at this step. That is printed, and the search finds real numbers."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its own there.
-    code, said, folder = calibrated(UNSTABLE, "--method", "default", "--search", search, integrator="Euler")
-    assert code == EXIT_OK and "diverge" in said
+    code, printed, folder = calibrated(
+        UNSTABLE, "--method", "default", "--search", search, integrator="Euler"
+    )
+    assert code == EXIT_OK and "diverge" in printed
     result = json.loads((folder / "result.json").read_text())
     estimate = result["parameters"]["servo.servo_stiffness"]["estimate"]
     assert math.isfinite(result["chi2"]) and estimate == pytest.approx(8.0, rel=0.5)
@@ -81,6 +83,6 @@ def test_a_held_out_recording_worse_than_nominal_is_red(calibrated: Calibrated, 
     """The held-out robot is the nominal one, the fitted one another: the verdict says not to use it."""
     (tmp_path / "rec.csv").write_text(recording(4.0, 0.3, 1))
     (tmp_path / "other.csv").write_text(recording(3.0, 0.1, 2))
-    code, said, _ = calibrated(DAMPING, "--holdout", str(tmp_path / "other.csv"))
-    assert code == EXIT_OK and "Traceback" not in said
-    assert "red: " in said and "is worse. Do not use it. Check units" in said
+    code, printed, _ = calibrated(DAMPING, "--holdout", str(tmp_path / "other.csv"))
+    assert code == EXIT_OK and "Traceback" not in printed
+    assert "red: " in printed and "is worse. Do not use it. Check units" in printed

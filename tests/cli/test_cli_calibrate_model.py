@@ -106,8 +106,8 @@ def test_mjcf_and_csv_give_a_report(folder: Path, tmp_path: Path, capsys: pytest
     """Hidden damping and friction are found within 10 %, the latency within 2 ms; held-out error falls."""
     words = command(folder, "--holdout", str(folder / "other.csv"), "--heldout-window", "1")
     assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
-    told = capsys.readouterr()
-    assert "held-out RMSE" in told.out and "guessed" in told.err
+    reported = capsys.readouterr()
+    assert "held-out RMSE" in reported.out and "guessed" in reported.err
     calibration = tmp_path / "calibration"
     page = (calibration / "report.html").read_text(encoding="utf-8")
     # The window of the held-out error is that of what is drawn; recordings are called by their files.
@@ -116,7 +116,7 @@ def test_mjcf_and_csv_give_a_report(folder: Path, tmp_path: Path, capsys: pytest
     )
     assert page.index("<h3>other.csv <span") < page.index("<h3>rec.csv <span")
     found = json.loads((calibration / "result.json").read_text())
-    assert found["method"] == "output-error" and "method: output-error" in told.err
+    assert found["method"] == "output-error" and "method: output-error" in reported.err
     assert found["parameters"]["shoulder.damping"]["estimate"] == pytest.approx(0.35, rel=0.1)
     assert found["parameters"]["shoulder.frictionloss"]["estimate"] == pytest.approx(0.06, rel=0.1)
     assert found["latency_s"] == pytest.approx(0.006, abs=0.002)
@@ -183,10 +183,11 @@ def test_spikes_do_not_move_the_estimate(
         )
         assert main([*words, "--holdout", str(folder / "other.csv")]) == EXIT_OK
         found[name] = json.loads((tmp_path / name / "calibration" / "result.json").read_text())
-    told = capsys.readouterr().err
-    assert told.count("spikes") == 1 and "spiked.csv: warn spikes: 4 samples" in told
+    reported = capsys.readouterr().err
+    assert reported.count("spikes") == 1 and "spiked.csv: warn spikes: 4 samples" in reported
     assert (
-        "shoulder +3 rad at 1.400 s, shoulder -2.49 rad at 3.000 s (2 samples), elbow +4 rad at 4.0" in told
+        "shoulder +3 rad at 1.400 s, shoulder -2.49 rad at 3.000 s (2 samples), elbow +4 rad at 4.0"
+        in reported
     )
     for parameter, clean in found["rec"]["parameters"].items():
         assert found["spiked"]["parameters"][parameter]["estimate"] == pytest.approx(

@@ -46,15 +46,15 @@ def test_the_first_alarm_is_the_last_thing_printed(capsys: pytest.CaptureFixture
     print_verdict(doubtful(CAUSE, *others))
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= ALARM_LINES
-    said = " ".join(" ".join(lines).split())
-    assert said.endswith(CAUSE.do)
+    printed = " ".join(" ".join(lines).split())
+    assert printed.endswith(CAUSE.do)
     assert (
-        said.index("more alarm")
-        < said.index("0: Residuals")
-        < said.index("amber:")
-        < said.index("first alarm")
+        printed.index("more alarm")
+        < printed.index("0: Residuals")
+        < printed.index("amber:")
+        < printed.index("first alarm")
     )
-    assert f"first alarm: {CAUSE.seen} {CAUSE.means}" in said
+    assert f"first alarm: {CAUSE.seen} {CAUSE.means}" in printed
 
 
 def test_a_physics_step_that_was_not_compared_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,8 +62,8 @@ def test_a_physics_step_that_was_not_compared_has_a_line(capsys: pytest.CaptureF
     check = StepCheck(0.002, note="not compared: it would take 4e+08 physics steps")
     step = {"physics_step": check.to_json()}
     print_result(dataclasses.replace(doubtful(), provenance=step), "record one")
-    said = " ".join(capsys.readouterr().out.split())
-    assert "check of the physics step, 2 ms: not compared: it would take 4e+08 physics steps" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "check of the physics step, 2 ms: not compared: it would take 4e+08 physics steps" in printed
 
 
 def test_alarms_with_one_remedy_are_one_entry() -> None:
@@ -82,13 +82,15 @@ def test_alarms_with_one_remedy_are_one_entry() -> None:
 def test_a_biased_value_is_marked_in_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     """The cause stands beside the verdict of each value that it moved, the latency's too."""
     print_result(doubtful(CAUSE), "record another motion")
-    said = capsys.readouterr().out
-    assert "weak, biased by mass" in said and said.count("biased by mass") == 2
+    printed = capsys.readouterr().out
+    assert "weak, biased by mass" in printed and printed.count("biased by mass") == 2
 
 
 def test_a_check_that_was_not_run_is_named_with_its_option(capsys: pytest.CaptureFixture[str]) -> None:
     """Parts of recordings that the user left out are something else."""
     notes = {"left_out": [["a.csv", 1.0, 2.0]], "checks_left_out": {"shared errors": "3 of 5 were not tried"}}
     print_result(dataclasses.replace(doubtful(CAUSE), provenance=notes), "record another motion")
-    said = " ".join(capsys.readouterr().out.split())
-    assert "check of shared errors: 3 of 5 were not tried (--checks all)" in said and "a.csv" not in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (
+        "check of shared errors: 3 of 5 were not tried (--checks all)" in printed and "a.csv" not in printed
+    )

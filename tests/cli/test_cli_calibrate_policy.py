@@ -93,7 +93,7 @@ def test_the_datasets_own_policy_is_run(dataset: Path, tmp_path: Path) -> None:
 def test_recordings_that_one_policy_did_not_make_are_refused(
     tmp_path: Path, changes: list[dict[str, Any]], words: str
 ) -> None:
-    """Each is said before anything is simulated, with what to do."""
+    """Each is reported before anything is simulated, with what to do."""
     folder = record(tmp_path / "dataset", *changes)
     with pytest.raises((InsufficientDataError, ConfigurationError), match=words):
         calibrate(settings(folder))

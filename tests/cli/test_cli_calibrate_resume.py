@@ -81,8 +81,8 @@ def test_stopped_calibration_says_how_to_go_on_and_does(
     with pytest.MonkeyPatch.context() as patch:
         stop_after(patch, 4)
         assert main(command(dataset, tmp_path / "parts", method=refined)) == EXIT_INTERRUPTED
-    told = capsys.readouterr().err
-    assert str(checkpoint) in told and "--resume" in told
+    reported = capsys.readouterr().err
+    assert str(checkpoint) in reported and "--resume" in reported
     assert checkpoint.exists()
     assert main(command(dataset, tmp_path / "parts", "--resume", method=refined)) == EXIT_OK
     assert not checkpoint.exists()
@@ -144,8 +144,8 @@ def test_the_best_fit_so_far_is_said_and_kept(
 
     @contextlib.contextmanager
     def watching(*_: Any) -> Iterator[ProgressCallback]:
-        def progress(told: Progress) -> None:
-            if told.stage == "latency":
+        def progress(reported: Progress) -> None:
+            if reported.stage == "latency":
                 raise KeyboardInterrupt
 
         yield progress
@@ -156,8 +156,8 @@ def test_the_best_fit_so_far_is_said_and_kept(
     with monkeypatch.context() as patch:
         patch.setattr(verb, "watching", watching)
         assert main(words) == EXIT_INTERRUPTED
-    told = capsys.readouterr().err
-    assert "s, local fit: residuals" in told and "best so far" in told
+    reported = capsys.readouterr().err
+    assert "s, local fit: residuals" in reported and "best so far" in reported
     kept = tmp_path / "calibration" / "so_far"
     found = CalibrationResult.from_json(json.loads((kept / "result.json").read_text()))
     assert found.method == "interrupted after local fit"
@@ -169,11 +169,13 @@ def test_the_best_fit_so_far_is_said_and_kept(
 
 
 def test_a_worse_fit_does_not_replace_the_best() -> None:
-    """The third fit is worse than the second; the fourth is kept, but too little better to be said."""
+    """The third fit is worse than the second; the fourth is kept, but too little better to be reported."""
     space = k9_space().with_free(("cart.mass", "servo.stiffness"))
     errors = iter((0.2, 0.1, 0.15, 0.098))
-    told: list[str] = []
-    best = BestSoFar(space, lambda *_: {"nominal": 0.5, "calibrated": next(errors), "null": 1.0}, told.append)
+    reported: list[str] = []
+    best = BestSoFar(
+        space, lambda *_: {"nominal": 0.5, "calibrated": next(errors), "null": 1.0}, reported.append
+    )
     best(Progress("search", 1, 9))
     assert best.result is None
     for stage in ("local fit", "search", "refinement", "latency"):
@@ -182,7 +184,10 @@ def test_a_worse_fit_does_not_replace_the_best() -> None:
         assert best.result.method == "interrupted after " + ("search" if stage == "refinement" else stage)
     assert best.result is not None
     assert best.result.heldout_nrmse == {"nominal": 0.5, "calibrated": 0.098, "null": 1.0}
-    assert len(told) == 2 and "held-out error 10 % of the signal's range (your own model: 50 %)" in told[1]
+    assert (
+        len(reported) == 2
+        and "held-out error 10 % of the signal's range (your own model: 50 %)" in reported[1]
+    )
 
 
 FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "report.html"}
@@ -201,7 +206,7 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     moment: str,
     number: signal.Signals,
 ) -> None:
-    """A real signal while a file is written: all files are there, that is said, and the status is 130."""
+    """A real signal while a file is written: all files are there, that is reported, and the status is 130."""
     hooks = {"report.html": (page, "write_report"), "moving": (shutil, "move")}
     where, name = hooks[moment]
     real = getattr(where, name)
@@ -216,8 +221,10 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     monkeypatch.setattr(where, name, interrupted)
     assert main(command(dataset, tmp_path)) == EXIT_INTERRUPTED
     assert pressed
-    told = capsys.readouterr().err
-    assert f"the results in {tmp_path / 'calibration'} are complete" in told and "--resume" not in told
+    reported = capsys.readouterr().err
+    assert (
+        f"the results in {tmp_path / 'calibration'} are complete" in reported and "--resume" not in reported
+    )
     assert {file.name for file in (tmp_path / "calibration").iterdir()} == FILES
     assert [file.name for file in tmp_path.iterdir()] == ["calibration"]
     assert calibration.read_result(tmp_path / "calibration").method == "eki"

@@ -14,7 +14,8 @@ from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Identifiability
-from deal_hw.cli.collect import Collect, collect
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -82,35 +83,35 @@ def test_a_stuck_robot_is_refused_without_any_noise_too() -> None:
 
 
 def test_collect_records_again_what_hardly_moved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In half a second no pole falls: the operator is told, and only the repetition is fitted."""
+    """In half a second no pole falls: the operator is informed, and only the repetition is fitted."""
     with EmulatorProcess("cartpole", "--nominal", "--profile", "sensor") as emulator:
-        asked = Collect(
+        asked = COLLECT.settings(
             robot="cartpole", port=emulator.port, out=tmp_path, seconds=0.4, attempts=2, quiet=True
         )
         report = collect(asked)
     assert [e.outcome for e in report.episodes] == [Outcome.FINISHED] * 2
-    told = capsys.readouterr().err
-    assert "pole moved" in told and "recording again, stronger (excitation level 1)" in told
-    assert "continue with --excitation-level 2" in told
+    reported = capsys.readouterr().err
+    assert "pole moved" in reported and "recording again, stronger (excitation level 1)" in reported
+    assert "continue with --excitation-level 2" in reported
     dataset = Dataset.open(tmp_path / "dataset")
     metadata = [dataset.read(i).metadata for i in range(2)]
     assert [(m["excitation_level"], m["attempt"], m["seed"]) for m in metadata] == [(0, 0, 0), (1, 1, 0)]
-    said: list[str] = []
-    assert choose_episodes(dataset, (), (), said.append) == ((1,), ())
-    assert "episodes [0] hardly moved" in said[0]
+    printed: list[str] = []
+    assert choose_episodes(dataset, (), (), printed.append) == ((1,), ())
+    assert "episodes [0] hardly moved" in printed[0]
     assert choose_episodes(dataset, (0, 1), ()) == ((0, 1), ())
 
 
 def test_a_row_is_flagged_where_a_parameter_is_given_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
     """No alarm, but a limit that the recording never reached: the row names it."""
 
-    def told(*args: Any, **kwargs: Any) -> CalibrationResult:
+    def reported(*args: Any, **kwargs: Any) -> CalibrationResult:
         verdicts: list[Identifiability] = ["identifiable"] * 9
         verdicts[7] = "not identifiable"
         return dataclasses.replace(calibrate_episodes(*args, **kwargs), verdicts=tuple(verdicts), alarms=())
 
     case = make_case("cartpole", "ideal", 3, 3.0)
-    monkeypatch.setattr(bench_loop, "calibrate_episodes", told)
+    monkeypatch.setattr(bench_loop, "calibrate_episodes", reported)
     row, _ = bench_loop.calibration_row(case, "midpoint", Budget(refine=False), 1)
     assert row["untold"] == ["servo.effort_limit"] and row["flagged"] and not row["alarms"]
     assert row["excitation_levels"] == list(case.excitation_levels)

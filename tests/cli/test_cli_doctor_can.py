@@ -9,7 +9,8 @@ import subprocess
 import can
 import pytest
 
-from deal_hw.cli.doctor import Doctor, doctor
+from deal_hw.cli.doctor import KINDS as DOCTOR
+from deal_hw.cli.doctor import doctor
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.cartpole.emulator.can_emulator import can_devices
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults
@@ -48,7 +49,7 @@ def test_foreign_nodes_and_a_wrong_number_are_told() -> None:
     # 5 frames of 111 bits in 50 ms are 11 100 bit/s, 2 % of 500 kbit/s.
     assert f"virtual:{channel}: 100 frames a second at 500000 bit/s, at least 2% of 500000 bit/s" in findings
     assert "other nodes on the bus: 3 (100 frames a second)" in findings
-    missing = findings["no frame from node 1; heard: 3"]
+    missing = findings["no frame from node 1; received: 3"]
     assert missing.do.endswith(f"virtual:{channel}?node=NUMBER")
 
 
@@ -87,10 +88,10 @@ def test_links_are_judged_by_what_ip_tells(
     assert ("500000 bit/s" in finding.seen) == ("bittiming" in details)
 
 
-@pytest.mark.parametrize("said", ["", "not JSON", "[1]", '{"a": 1}'])
-def test_whatever_ip_says_is_survived(monkeypatch: pytest.MonkeyPatch, said: str) -> None:
+@pytest.mark.parametrize("printed", ["", "not JSON", "[1]", '{"a": 1}'])
+def test_whatever_ip_says_is_survived(monkeypatch: pytest.MonkeyPatch, printed: str) -> None:
     """Another version of it, or none."""
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: subprocess.CompletedProcess([], 0, stdout=said))
+    monkeypatch.setattr(subprocess, "run", lambda *a, **k: subprocess.CompletedProcess([], 0, stdout=printed))
     monkeypatch.setattr(doctor_can, "can_links", lambda: ["can0"])
     assert next(iter(doctor_can.list_adapters())).severity is Severity.OK
 
@@ -98,8 +99,8 @@ def test_whatever_ip_says_is_survived(monkeypatch: pytest.MonkeyPatch, said: str
 def test_the_emulated_cart_pole_on_can_is_well() -> None:
     """Bus, robot, states and link, as a user runs it."""
     with EmulatorProcess("cartpole", "--transport", "can", "--profile", "ideal", "--nominal") as emulator:
-        report = doctor(Doctor(robot="cartpole", transport="can", port=emulator.port, seconds=0.5))
-    told = {f.code: f for f in report.findings if f.code in ("can", "link", "states")}
-    assert set(told) == {"can", "link", "states"}
-    assert all(f.severity is Severity.OK for f in told.values())
-    assert "frames a second at 500000 bit/s" in told["can"].seen
+        report = doctor(DOCTOR.settings(robot="cartpole", transport="can", port=emulator.port, seconds=0.5))
+    reported = {f.code: f for f in report.findings if f.code in ("can", "link", "states")}
+    assert set(reported) == {"can", "link", "states"}
+    assert all(f.severity is Severity.OK for f in reported.values())
+    assert "frames a second at 500000 bit/s" in reported["can"].seen

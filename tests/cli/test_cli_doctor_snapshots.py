@@ -224,8 +224,8 @@ def test_what_the_doctor_prints(
     set_up = SET_UPS[name]
     computer(set_up)
     code = main(set_up.line.split())
-    told = capsys.readouterr()
-    text = f"$ deal-hw {set_up.line}\n{told.out}{told.err}exit code {code}\n"
+    reported = capsys.readouterr()
+    text = f"$ deal-hw {set_up.line}\n{reported.out}{reported.err}exit code {code}\n"
     file = FOLDER / f"{name}.txt"
     if os.environ.get("DEAL_HW_WRITE_SNAPSHOTS"):
         file.write_text(text, encoding="utf-8")

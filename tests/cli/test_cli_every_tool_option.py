@@ -186,30 +186,30 @@ def contents(path: Path) -> str:
     return re.sub(r"\d{4}-\d\d-\d\dT[\d:.]+", "", path.read_text(encoding="utf-8"))
 
 
-def told(value: Any) -> str:
+def reported(value: Any) -> str:
     """Return a value as text that is the same for the same value."""
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]
     if isinstance(value, np.random.Generator):
         return str(value.bit_generator.state)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        inner = {entry.name: told(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
+        inner = {entry.name: reported(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
         return f"{type(value).__name__}{inner}"
     if isinstance(value, dict):
-        return str({key: told(one) for key, one in value.items()})
+        return str({key: reported(one) for key, one in value.items()})
     if isinstance(value, list | tuple):
-        return str([told(one) for one in value])
+        return str([reported(one) for one in value])
     if isinstance(value, mujoco.MjModel):
         return f"MjModel {value.opt.timestep} {value.nq}"
     if isinstance(value, functools.partial):
-        return f"{told(value.func)} {told(value.args)} {told(value.keywords)}"
+        return f"{reported(value.func)} {reported(value.args)} {reported(value.keywords)}"
     if closure := getattr(value, "__closure__", None):
-        return f"{value.__qualname__} {[told(cell.cell_contents) for cell in closure]}"
+        return f"{value.__qualname__} {[reported(cell.cell_contents) for cell in closure]}"
     if callable(value):
         return getattr(value, "__qualname__", type(value).__name__)
     if type(value).__module__.startswith("deal_hw"):
         inner = vars(value) if hasattr(value, "__dict__") else {}
-        return f"{type(value).__name__}{ {key: told(one) for key, one in inner.items()} }"
+        return f"{type(value).__name__}{ {key: reported(one) for key, one in inner.items()} }"
     return repr(value)
 
 
@@ -249,7 +249,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def note(name: str, answer: Any = None, *, ends: bool = False) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            did.append(f"{name} {told(args)} {told(kwargs)}")
+            did.append(f"{name} {reported(args)} {reported(kwargs)}")
             if ends:
                 raise SeenError
             return answer
@@ -262,7 +262,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def nothing(name: str) -> Callable[..., Any]:
         @contextlib.contextmanager
         def enter(*args: Any) -> Iterator[Callable[[], None]]:
-            did.append(f"{name} {told(args)}")
+            did.append(f"{name} {reported(args)}")
             yield lambda: None
 
         return enter
@@ -329,7 +329,7 @@ def _note_cells(did: list[str]) -> Callable[..., Any]:
     """Note what a bench would run, and its file; what is called after each row holds all settings."""
 
     def run_cells(cells: Any, out: Path, after: Any) -> None:
-        did.append(f"{told(cells)} {out}")
+        did.append(f"{reported(cells)} {out}")
         raise SeenError
 
     return run_cells
@@ -338,24 +338,24 @@ def _note_cells(did: list[str]) -> Callable[..., Any]:
 def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
     """Note all that a calibration is called with, and what its result goes into."""
     from deal_hw.cli import calibrate
-    from deal_hw.workflows.calibration import prepare
+    from deal_hw.workflows.calibration import run as run_calibration
 
     def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
         rest.pop("progress"), rest.pop("say")
         searched = (space.names, space.nominal, space.low, space.high)
-        did.append(told((robot.model, searched, episodes, holdout, rest)))
+        did.append(reported((robot.model, searched, episodes, holdout, rest)))
 
     def finish(work: Any, result: Any, folder: Path, *settings: Any, **rest: Any) -> None:
-        did.append(told((work.provenance, folder, settings, rest)))
+        did.append(reported((work.provenance, folder, settings, rest)))
         raise SeenError
 
     @contextlib.contextmanager
     def watching(*shown: Any) -> Iterator[None]:
-        did.append(told(shown[:2]))
+        did.append(reported(shown[:2]))
         yield None
 
     monkeypatch.setattr(calibrate, "watching", watching)
-    monkeypatch.setattr(prepare, "calibrate_episodes", search)
+    monkeypatch.setattr(run_calibration, "calibrate_episodes", search)
     monkeypatch.setattr(calibrate, "finish", finish)
 
 

@@ -1,4 +1,4 @@
-"""``deal-hw keys``: what is made, with which permissions, and what is said of it."""
+"""``deal-hw keys``: what is made, with which permissions, and what is reported of it."""
 
 from __future__ import annotations
 
@@ -87,9 +87,9 @@ def test_the_command_makes_adds_and_shows(tmp_path: Path, capsys: pytest.Capture
     """As typed; the lines to copy name the files that were made."""
     out = str(tmp_path / "k")
     assert main(["keys", "make", "--out", out, "--robot", "10.0.0.7", "--controllers", "desk", "lab"]) == 0
-    said = capsys.readouterr().out
-    assert "bridge go2 --port eth0 --listen tls/10.0.0.7:7447 --ca ca.pem --certificate robot.pem" in said
-    assert "--certificate desk.pem --key desk.key" in said
+    printed = capsys.readouterr().out
+    assert "bridge go2 --port eth0 --listen tls/10.0.0.7:7447 --ca ca.pem --certificate robot.pem" in printed
+    assert "--certificate desk.pem --key desk.key" in printed
     assert main(["keys", "add", out, "bench", "--days", "10"]) == 0
     assert "renew it soon" in capsys.readouterr().out
     assert (tmp_path / "k" / "bench.key").stat().st_mode & 0o777 == 0o600

@@ -21,13 +21,13 @@ class Lines:
     """A progress whose time passes by request: ten seconds a line."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.printed: list[str] = []
         self.made: list[PipedProgress] = []
         self.clock = VirtualClock()
 
     def make(self, title: str, quiet: bool = False) -> PipedProgress:
         """Return what a verb makes; its thread ends at once."""
-        made = PipedProgress(title, quiet, clock=self.clock, wait=lambda s: True, say=self.said.append)
+        made = PipedProgress(title, quiet, clock=self.clock, wait=lambda s: True, say=self.printed.append)
         self.made.append(made)
         return made
 
@@ -45,7 +45,7 @@ class Lines:
         made = self.made[-1]
         made._wait = wait
         made.tell()
-        return self.said[-1]
+        return self.printed[-1]
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Lines:
 def test_a_line_comes_every_ten_seconds_until_the_end() -> None:
     """With the time since the beginning and the newest of what was noted, unless the last line had it."""
     clock = VirtualClock()
-    said: list[str] = []
+    printed: list[str] = []
     notes = iter(("search 3/40", "search 3/40", "", "search 3/40", None))
 
     def wait(seconds: float) -> bool:
@@ -72,13 +72,13 @@ def test_a_line_comes_every_ten_seconds_until_the_end() -> None:
             progress.at(text)
         return text is None
 
-    progress = PipedProgress("calibrate", clock=clock, wait=wait, say=said.append)
+    progress = PipedProgress("calibrate", clock=clock, wait=wait, say=printed.append)
     progress.tell()
-    assert said == ["calibrate: 10 s, search 3/40", "calibrate: 30 s", "calibrate: 40 s, search 3/40"]
+    assert printed == ["calibrate: 10 s, search 3/40", "calibrate: 30 s", "calibrate: 40 s, search 3/40"]
 
 
 def test_the_thread_ends_with_the_block(capsys: pytest.CaptureFixture[str]) -> None:
-    """Before ten seconds nothing is said; quiet starts no thread."""
+    """Before ten seconds nothing is reported; quiet starts no thread."""
     with PipedProgress("train") as progress:
         thread = progress._thread
         assert thread is not None and thread.is_alive()
@@ -93,8 +93,8 @@ def test_the_default_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) 
     """Results in standard output stay whole."""
     turns = iter((False, True))
     PipedProgress("bench", wait=lambda seconds: next(turns)).tell()
-    told = capsys.readouterr()
-    assert told.err == "bench: 0 s\n" and not told.out
+    reported = capsys.readouterr()
+    assert reported.err == "bench: 0 s\n" and not reported.out
 
 
 def test_calibrate(lines: Lines) -> None:
@@ -106,7 +106,7 @@ def test_calibrate(lines: Lines) -> None:
         assert lines.after_ten_seconds() == "calibrate (deal): 20 s, intervals 1/2"
         for chi2 in ("chi2 2.1", "chi2 0.66"):
             tell(Progress("local fit", 1, 1, chi2))
-        assert lines.said[2:] == [f"calibrate (deal): {calibrate_output.CHI2}"]
+        assert lines.printed[2:] == [f"calibrate (deal): {calibrate_output.CHI2}"]
 
 
 @pytest.mark.parametrize("phase", [HOMING, RUNNING])
@@ -130,8 +130,8 @@ def test_a_robot_that_is_not_passive_is_said_once_for_each_reason(
                     f"{MAKING_PASSIVE}: {why}; passive command repeated for {second} s, {30 - second} s left"
                 )
                 on_beat(Beat(stamp_ns=10**9 * second, count=0, phase=text, silence_s=1.0))
-    said = capsys.readouterr().err.splitlines()
-    assert [line.partition(" passive: ")[2].partition(";")[0] for line in said] == [
+    printed = capsys.readouterr().err.splitlines()
+    assert [line.partition(" passive: ")[2].partition(";")[0] for line in printed] == [
         "no answer",
         "the link is lost (gone",
     ]
@@ -139,30 +139,30 @@ def test_a_robot_that_is_not_passive_is_said_once_for_each_reason(
 
 def test_train(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, return and the task's measures."""
-    told: list[str] = []
+    reported: list[str] = []
 
     def run(config: Any, follow: Callable[[TrainingStatus], None]) -> Any:
         follow(TrainingStatus(steps=500, total=2000, mean_return=12.3, measures={"velocity_error_m_s": 0.25}))
-        told.append(lines.after_ten_seconds())
+        reported.append(lines.after_ten_seconds())
 
     monkeypatch.setattr(train, "run", run)
     monkeypatch.setattr(train, "_print", lambda training: None)
-    train.train(train.Train())
-    assert told == ["train: 10 s, 500/2000 steps, return 12.3 velocity_error_m_s 0.25"]
+    train.train(train.KINDS.settings())
+    assert reported == ["train: 10 s, 500/2000 steps, return 12.3 velocity_error_m_s 0.25"]
 
 
 def test_design_excitation(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
     """Candidates tried."""
-    told: list[str] = []
+    reported: list[str] = []
 
     def run(config: Any, note: Callable[[int, int, str], None]) -> None:
         note(3, 60, "42.0 nats")
-        told.append(lines.after_ten_seconds())
+        reported.append(lines.after_ten_seconds())
 
     monkeypatch.setattr(design_excitation, "run", run)
     monkeypatch.setattr(design_excitation, "print_design", lambda robot, report: None)
-    design_excitation.design_excitation(design_excitation.DesignExcitation(robot="cartpole", out=Path("o")))
-    assert told == ["design-excitation: 10 s, 3/60 42.0 nats"]
+    design_excitation.design_excitation(design_excitation.KINDS.settings(robot="cartpole", out=Path("o")))
+    assert reported == ["design-excitation: 10 s, 3/60 42.0 nats"]
 
 
 def test_bench(lines: Lines, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -171,11 +171,11 @@ def test_bench(lines: Lines, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     from deal_hw.bench.rows import Cells, Table
     from deal_hw.bench.settings import Loop
 
-    told: list[str] = []
+    reported: list[str] = []
 
     def rows() -> Iterator[dict[str, Any]]:
         yield {"seed": 0, "error": ""}
-        told.append(lines.after_ten_seconds())
+        reported.append(lines.after_ten_seconds())
         yield {"seed": 1, "error": ""}
 
     made = rows()
@@ -183,7 +183,7 @@ def test_bench(lines: Lines, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     table = Table(cells=cells, line=str, summary=lambda rows: None)
     monkeypatch.setattr(loop, "table", lambda settings: table)
     assert bench.bench(Loop(out=tmp_path / "rows.json")) == 0
-    assert told == ["bench loop: 10 s, 1/2 rows done"]
+    assert reported == ["bench loop: 10 s, 1/2 rows done"]
 
 
 def test_on_a_terminal_there_is_a_bar_instead(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:

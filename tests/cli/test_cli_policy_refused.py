@@ -31,9 +31,9 @@ def deploy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., 
     def run(policy: Path, *arguments: str) -> str:
         verb = arguments or ("deploy", "cartpole")
         assert main([*verb, "--port", str(tmp_path / "no-port"), "--policy", str(policy)]) == REFUSED
-        said = capsys.readouterr().err.strip()
-        assert "Traceback" not in said and "\n" not in said
-        return said
+        printed = capsys.readouterr().err.strip()
+        assert "Traceback" not in printed and "\n" not in printed
+        return printed
 
     return run
 
@@ -60,9 +60,9 @@ def test_an_unknown_quantity_never_reaches_a_robot(
 ) -> None:
     """It was read as joint position and drove the robot."""
     path = edited(tmp_path / "p.onnx", lambda spec: spec["observation"][5].update(quantity=quantity))
-    said = deploy(path)
-    assert f"field observation[5].quantity is '{quantity}'" in said and "'velocity'" in said
-    assert "no-port" not in said
+    printed = deploy(path)
+    assert f"field observation[5].quantity is '{quantity}'" in printed and "'velocity'" in printed
+    assert "no-port" not in printed
 
 
 @pytest.mark.parametrize("name", ["stiffness", "damping", "action_scale", "default_position"])
@@ -71,8 +71,8 @@ def test_wrong_numbers_never_reach_a_robot(
     tmp_path: Path, deploy: Callable[..., str], name: str, value: object
 ) -> None:
     """Text, null, NaN, too many, none: they came as far as the armed robot, or ended in a traceback."""
-    said = deploy(edited(tmp_path / "p.onnx", lambda spec: spec.update({name: value})))
-    assert f"field {name}" in said and "no-port" not in said
+    printed = deploy(edited(tmp_path / "p.onnx", lambda spec: spec.update({name: value})))
+    assert f"field {name}" in printed and "no-port" not in printed
 
 
 @pytest.mark.parametrize("fault", ["nan", "fails"])
@@ -86,9 +86,9 @@ def test_a_faulty_network_never_reaches_a_robot(
     path = tmp_path / "faulty.onnx"
     write_policy(*faulty_policy(DESCRIPTION, fault), path)
     arguments = (*verb, "--out", str(tmp_path / "run"), "--motion", "rich") if verb[0] == "collect" else verb
-    said = deploy(path, *arguments)
-    assert "faulty.onnx: the network" in said and "seen with fastest command" in said
-    assert "no-port" not in said and not (tmp_path / "run").exists()
+    printed = deploy(path, *arguments)
+    assert "faulty.onnx: the network" in printed and "seen with fastest command" in printed
+    assert "no-port" not in printed and not (tmp_path / "run").exists()
 
 
 def test_a_policy_that_would_not_run_is_refused(tmp_path: Path, deploy: Callable[..., str]) -> None:
@@ -107,8 +107,8 @@ def test_a_policy_of_a_red_calibration_is_asked_about(
 ) -> None:
     """Without a terminal it is refused; with one the answer decides, and so does the option. Amber warns."""
     path = edited(tmp_path / "p.onnx", lambda spec: spec["training"].update({VERDICT: "red"}))
-    said = deploy(path)
-    assert "a red verdict" in said and "--trust-calibration" in said and "no-port" not in said
+    printed = deploy(path)
+    assert "a red verdict" in printed and "--trust-calibration" in printed and "no-port" not in printed
     assert "no-port" in deploy(path, "deploy", "cartpole", "--trust-calibration")
     amber = edited(tmp_path / "a.onnx", lambda spec: spec["training"].update({VERDICT: "amber"}))
     assert "no-port" in deploy(amber, "deploy", "cartpole", "--trust-calibration")

@@ -150,10 +150,10 @@ def refused(
 
     def check(line: str, words: str) -> None:
         assert main(shlex.split(line)) == EXIT_ERROR
-        said = capsys.readouterr().err
-        assert "Traceback" not in said
-        last = said.splitlines()[-1]
-        assert last.startswith("deal-hw: error: ") and words in last and len(last) < 2100, said
+        printed = capsys.readouterr().err
+        assert "Traceback" not in printed
+        last = printed.splitlines()[-1]
+        assert last.startswith("deal-hw: error: ") and words in last and len(last) < 2100, printed
 
     yield check
     assert sorted(place.rglob("*")) == before, "something was written"
@@ -315,9 +315,9 @@ def test_a_policy_of_another_robot_is_refused_in_short(
     monkeypatch.chdir(place)
     policy = shipped.shipped_policy("cartpole")
     assert main(["deploy", "go2", "--port", "lo", "--policy", str(policy)]) == EXIT_ERROR
-    said = capsys.readouterr().err
-    assert "policy has 'cartpole', robot has 'go2'" in said and "trained for 'go2'" in said
-    assert len(said) < 600 and len(said.splitlines()) == 1
+    printed = capsys.readouterr().err
+    assert "policy has 'cartpole', robot has 'go2'" in printed and "trained for 'go2'" in printed
+    assert len(printed) < 600 and len(printed.splitlines()) == 1
 
 
 def test_a_recording_too_short_to_calibrate_is_told_before_it_is_made(
@@ -326,8 +326,8 @@ def test_a_recording_too_short_to_calibrate_is_told_before_it_is_made(
     """`collect --seconds 1` says what calibrate needs."""
     monkeypatch.chdir(place)
     assert main(shlex.split("collect cartpole --port p --out o --seconds 1")) == EXIT_ERROR
-    said = capsys.readouterr().err
-    assert "are too short: `deal-hw calibrate`" in said and "(--seconds 4)" in said
+    printed = capsys.readouterr().err
+    assert "are too short: `deal-hw calibrate`" in printed and "(--seconds 4)" in printed
 
 
 def test_a_quiet_calibration_prints_nothing(
@@ -337,8 +337,8 @@ def test_a_quiet_calibration_prints_nothing(
     monkeypatch.chdir(place)
     line = f"calibrate --model arm.xml --data rec.csv --out {tmp_path} --method nominal --quiet --no-report"
     assert main([*shlex.split(line), "--no-advise", "--threads", "1"]) == 0
-    said = capsys.readouterr()
-    assert said.out == "" and said.err == ""
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err == ""
 
 
 @pytest.mark.parametrize(("entry", "words"), ENTRIES)
@@ -429,5 +429,5 @@ def mistyped() -> Iterator[tuple[str, str]]:
 def test_what_does_not_parse_is_one_line(line: str, word: str, capsys: pytest.CaptureFixture[str]) -> None:
     """An option that is not there, a value that is no number, one that lacks."""
     assert main(line.split()) == EXIT_ERROR
-    said = capsys.readouterr()
-    assert word in said.err.lower() and said.err.count("\n") == 1 and not said.out
+    printed = capsys.readouterr()
+    assert word in printed.err.lower() and printed.err.count("\n") == 1 and not printed.out

@@ -21,11 +21,11 @@ from deal_hw.data.export.lerobot import export_lerobot
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.store import minimal_description
-from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.run_folder import RunFolder
+from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.go2.emulator.sport_service import SportMode

@@ -16,7 +16,7 @@ S = 1_000_000_000
 def judged(
     drift: float, seconds: float = 3.0, *, seed: int = 0, tick_ns: int = 1_000_000
 ) -> tuple[Severity, str]:
-    """Return what is said of 500 states a second whose clock drifts, with delays of 0.2 to 20 ms."""
+    """Return what is reported of 500 states a second whose clock drifts, with delays of 0.2 to 20 ms."""
     rng = np.random.default_rng(seed)
     true_ns = (np.arange(0.0, seconds, 0.002) * S).astype(np.int64)
     host_ns = true_ns + (2e5 + rng.exponential(2e6, true_ns.size).clip(max=2e7)).astype(np.int64)

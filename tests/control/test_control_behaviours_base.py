@@ -32,14 +32,14 @@ class Ear:
 
     def __init__(self, *terms: ObservationTerm) -> None:
         self.spec: PolicySpec = dataclasses.replace(feedback_spec(DRIVER), observation=terms)
-        self.heard: list[Observation] = []
+        self.received: list[Observation] = []
 
     def reset(self) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> FloatArray:
         """Return nothing but zeros."""
-        self.heard.append(observation.copy())
+        self.received.append(observation.copy())
         return np.zeros(12)
 
 
@@ -75,19 +75,19 @@ def test_gravity_turning_and_command_by_hand() -> None:
     command = behaviour.command(state(wxyz(turn), np.array([0.1, 0.2, 0.3]), 0.05), 0.0)
     half = np.sqrt(3) / 2
     np.testing.assert_allclose(
-        ear.heard[0], [0, -0.5, -half, 0.1, 0.2, 0.3, 0.3, -0.1, 0.2, 0.05, 0.05], atol=1e-6
+        ear.received[0], [0, -0.5, -half, 0.1, 0.2, 0.3, 0.3, -0.1, 0.2, 0.05, 0.05], atol=1e-6
     )
     np.testing.assert_array_equal(command.position_target, DRIVER.default_position)
-    assert ear.heard[0].dtype == np.float32
+    assert ear.received[0].dtype == np.float32
 
 
 def test_a_command_beyond_the_training_is_clipped_to_it() -> None:
-    """Trained for -0.2 to 0.5 m/s ahead: asked for -1, it is told -0.2; what lies inside passes."""
+    """Trained for -0.2 to 0.5 m/s ahead: asked for -1, it gets -0.2; what lies inside passes."""
     ear = Ear(*SENSED)
     ear.spec = dataclasses.replace(ear.spec, command_range=((-0.2, 0.5), (-0.3, 0.3), (-1.0, 1.0)))
     behaviour = PolicyBehaviour(ear, DRIVER, FixedVelocity((-1.0, 0.1, 1.0)))
     behaviour.command(state(wxyz(Rotation.identity()), np.zeros(3)), 0.0)
-    np.testing.assert_allclose(ear.heard[0][-3:], [-0.2, 0.1, 1.0], atol=1e-6)
+    np.testing.assert_allclose(ear.received[0][-3:], [-0.2, 0.1, 1.0], atol=1e-6)
 
 
 @settings(max_examples=60, deadline=None)
@@ -102,7 +102,7 @@ def test_any_orientation_gives_gravity_as_scipy_has_it(values: list[float], nega
     turned = Rotation.from_rotvec([0, 0, 1.0]) * turn
     behaviour.command(state(wxyz(turned), gyro), 0.02)
     wanted = [*turn.inv().apply([0, 0, -1.0]), *gyro, 0, 0, 0]
-    np.testing.assert_allclose(ear.heard, [wanted, wanted], atol=2e-6)
+    np.testing.assert_allclose(ear.received, [wanted, wanted], atol=2e-6)
 
 
 def test_on_the_robot_as_in_training() -> None:
@@ -119,7 +119,7 @@ def test_on_the_robot_as_in_training() -> None:
         # A simulator also knows where the base is and how fast it moves along.
         x = np.concatenate([rng.normal(size=3), turn.as_rotvec(), np.array(DRIVER.default_position) + 0.1])
         v = np.concatenate([rng.normal(size=3), gyro, np.zeros(12)])
-        np.testing.assert_allclose(ear.heard[-1], trained.build(x, v), atol=1e-6)
+        np.testing.assert_allclose(ear.received[-1], trained.build(x, v), atol=1e-6)
         trained.record_action(np.zeros(12))
 
 
@@ -146,4 +146,4 @@ def test_states_without_a_body_are_an_error() -> None:
         PolicyBehaviour(Ear(*SENSED), DRIVER).command(bare, 0.0)
     blind = Ear(*JOINTS)
     PolicyBehaviour(blind, DRIVER).command(bare, 0.0)
-    np.testing.assert_array_equal(blind.heard, [[0.0, 0.0]])
+    np.testing.assert_array_equal(blind.received, [[0.0, 0.0]])

@@ -94,8 +94,8 @@ def test_no_step_leaves_the_safety_limits(excitation_level: float, seed: int) ->
 def test_a_still_robot_is_asked_for_more_until_the_limits() -> None:
     """0, 1, 2, 3, and then the words say that there is nothing more."""
     search = ExcitationLevelSearch()
-    told = [search.tell(STILL) for _ in range(4)]
-    assert told == [True, True, True, False]
+    reported = [search.tell(STILL) for _ in range(4)]
+    assert reported == [True, True, True, False]
     assert [a.level for a in search.attempts] == [0, 1, 2, 3]
     assert search.words == "it hardly moves: pole moved 0.01 rad; it is the strongest level"
     assert search.best == 3

@@ -62,8 +62,8 @@ class Wire(VirtualTransport):
     Attributes:
         sent: When which message left the host [ns, payload], lost ones included.
         opened: When it was opened [ns].
-        silent: Whether what is sent is lost and nothing is heard.
-        deaf: Whether nothing is heard.
+        silent: Whether what is sent is lost and nothing is received.
+        deaf: Whether nothing is received.
         error: Raised by reading, where there is one.
     """
 
@@ -99,10 +99,10 @@ class Wire(VirtualTransport):
 
 @dataclass
 class Armed:
-    """An armed cart-pole, and what its operator was told."""
+    """An armed cart-pole, and the messages to its operator."""
 
     clock: VirtualClock = field(default_factory=LimitedClock)
-    told: list[tuple[int, str, float]] = field(default_factory=list)
+    reported: list[tuple[int, str, float]] = field(default_factory=list)
     then: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ class Armed:
 
     def progress(self, text: str, silence_s: float) -> None:
         """Note what the operator reads, and let something happen."""
-        self.told.append((self.clock.now_ns() - self.begin_ns, text, silence_s))
+        self.reported.append((self.clock.now_ns() - self.begin_ns, text, silence_s))
         self.then()
 
     def make_passive(self, **settings: Any) -> bool:
@@ -146,18 +146,18 @@ class Armed:
 
 
 def test_a_robot_that_hears_is_passive_at_the_first_attempt() -> None:
-    """At once, and nobody is told of any trouble; states of every 5 ms confirm three commands in a row."""
+    """At once, and no trouble is reported; states of every 5 ms confirm three commands in a row."""
     armed = Armed()
     assert armed.make_passive()
     assert armed.motor_off()
     assert armed.stops() == [0, 5 * MS, 10 * MS]
-    assert armed.told == []
+    assert armed.reported == []
     assert armed.passed_s < 0.05
 
 
 @pytest.mark.parametrize("wanted", [1, 3])
 def test_one_state_that_looks_passive_is_no_proof(wanted: int) -> None:
-    """A stiff robot without load looks damped as the link returns, before it heard a command: told again."""
+    """A stiff robot without load looks damped as the link returns, before it got a command: asked again."""
     armed = Armed()
     state = armed.robot.read_state(1.0)
     shown = iter([Status(0), Status(0), Status.ARMED, Status(0), Status(0), Status(0), Status(0)])
@@ -172,7 +172,7 @@ def test_one_state_that_looks_passive_is_no_proof(wanted: int) -> None:
     assert armed.make_passive(confirmations=wanted)
     # Two of the first three commands were shown by chance; three in a row are wanted.
     assert armed.stops() == [n * 50 * MS for n in range(1 if wanted == 1 else 6)]
-    assert len(armed.told) == (0 if wanted == 1 else 1)
+    assert len(armed.reported) == (0 if wanted == 1 else 1)
 
 
 @pytest.mark.parametrize("count", [0, -1, 101])
@@ -216,10 +216,10 @@ def test_a_link_that_stays_away_is_given_up_after_the_stated_time() -> None:
     armed.wire.unplug()
     assert not armed.make_passive()
     assert armed.clock.now_ns() - armed.begin_ns == 30 * S
-    texts = list(dict.fromkeys(text for _, text, _ in armed.told))
+    texts = list(dict.fromkeys(text for _, text, _ in armed.reported))
     why = "the connection is lost (virtual wire: the device vanished)"
     assert texts == [f"{why}; passive command repeated for {s} s, {30 - s} s left" for s in range(30)]
-    assert [silence_s for _, _, silence_s in armed.told[:2]] == [10.0, 1.0]
+    assert [silence_s for _, _, silence_s in armed.reported[:2]] == [10.0, 1.0]
     opened = [(ns - armed.begin_ns) / S for ns in armed.wire.opened]
     assert len(opened) == 60
     assert {round(b - a, 9) for a, b in itertools.pairwise(opened)} == {0.5}
@@ -231,7 +231,9 @@ def test_a_silent_robot_is_told_apart_and_its_path_is_opened_every_three_seconds
     armed = Armed()
     armed.wire.silent = True
     assert not armed.make_passive(timeout_s=10.0)
-    assert armed.told[0][1] == "the robot does not confirm it; passive command repeated for 0 s, 10 s left"
+    assert (
+        armed.reported[0][1] == "the robot does not confirm it; passive command repeated for 0 s, 10 s left"
+    )
     assert [ns - armed.begin_ns for ns in armed.wire.opened] == [3 * S, 6 * S, 9 * S]
     assert len(armed.stops()) == 200
 
@@ -257,12 +259,12 @@ def test_opening_may_take_longer_than_the_time_that_is_left() -> None:
     armed.wire.unplug()
     armed.wire.open = lambda: armed.clock.advance_ns(3 * S)  # type: ignore[method-assign]
     assert not armed.make_passive(timeout_s=2.0)
-    told = [text.partition("repeated for ")[2] for _, text, _ in armed.told]
-    assert told == ["0 s, 2 s left", "3 s, 0 s left"]
+    reported = [text.partition("repeated for ")[2] for _, text, _ in armed.reported]
+    assert reported == ["0 s, 2 s left", "3 s, 0 s left"]
 
 
 def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
-    """The robot is heard and does not obey: a new path would not help, and would cost the old one."""
+    """The robot is received and does not obey: a new path would not help, and would cost the old one."""
     armed = Armed()
 
     class Deaf(CartpoleDevice):
@@ -273,7 +275,9 @@ def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
     armed.device.__class__ = Deaf
     assert not armed.make_passive(timeout_s=7.0)
     assert armed.wire.opened == []
-    assert armed.told[-1][1] == "the robot does not confirm it; passive command repeated for 6 s, 1 s left"
+    assert (
+        armed.reported[-1][1] == "the robot does not confirm it; passive command repeated for 6 s, 1 s left"
+    )
 
 
 @pytest.mark.parametrize("error", [TransportLostError("the read side is gone"), ZeroDivisionError("a bug")])
@@ -332,7 +336,7 @@ def test_a_robot_that_sends_faster_than_it_is_read_is_told_again() -> None:
     assert not armed.make_passive(timeout_s=5.0)
     assert armed.stops() == [n * 50 * MS for n in range(100)]
     assert armed.wire.opened == []
-    assert armed.told[0][1].startswith("the robot does not confirm it; passive")
+    assert armed.reported[0][1].startswith("the robot does not confirm it; passive")
 
 
 def test_a_display_that_fails_stops_nothing() -> None:
@@ -358,7 +362,7 @@ def test_a_driver_that_fails_in_every_way_is_survived() -> None:
 
     armed.wire.send = armed.wire.reopen = broken  # type: ignore[method-assign, assignment]
     assert not armed.make_passive(timeout_s=1.0)
-    assert armed.told[0][1].startswith(
+    assert armed.reported[0][1].startswith(
         "the connection is lost (a bug); passive command repeated for 0 s, 1 s left"
     )
 
@@ -414,7 +418,7 @@ class Hung:
 
     @property
     def kinds(self) -> list[str]:
-        """The kinds of command that the robot heard, each change once."""
+        """The kinds of command that the robot received, each change once."""
         return [kind for *_, kind in self.device.log.changes]
 
 
@@ -435,8 +439,8 @@ def test_a_go2_whose_link_drops_while_the_run_ends_is_damped_once_it_is_back() -
     report = rig.run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True)
     assert rig.kinds[-2:] == [STIFF, DAMPING]
-    told = [phase for phase, _ in rig.beats if phase.startswith("making passive: ")]
-    assert told[0].startswith(
+    reported = [phase for phase, _ in rig.beats if phase.startswith("making passive: ")]
+    assert reported[0].startswith(
         "making passive: the connection is lost (virtual wire: the device vanished); passive"
     )
 
@@ -467,11 +471,11 @@ def test_a_go2_whose_link_is_lost_in_the_run_trips_at_once_and_is_damped_once_it
 def test_a_go2_that_was_not_commanded_yet_is_left_alone(phase: str) -> None:
     """Stopped while its own controller may still have it: not one motor command."""
     rig = Hung()
-    heard: list[str] = []
+    received: list[str] = []
     receive = rig.device.receive
 
     def overheard(topic: str, payload: bytes, stamp_ns: int = 0) -> None:
-        heard.append(topic)
+        received.append(topic)
         receive(topic, payload, stamp_ns)
 
     rig.device.receive = overheard  # type: ignore[method-assign]
@@ -483,5 +487,5 @@ def test_a_go2_that_was_not_commanded_yet_is_left_alone(phase: str) -> None:
     rig.at = at
     report = rig.run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, True)
-    assert topics.LOW_COMMAND not in heard
+    assert topics.LOW_COMMAND not in received
     assert "making passive" not in dict(rig.beats)

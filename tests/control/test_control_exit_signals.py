@@ -169,8 +169,8 @@ def test_a_child_that_starts_is_not_ended_before_it_can_act() -> None:
     assert signal.SIGTERM not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGABRT):
         child.send_signal(number)
-    said, _ = child.communicate("go on")
-    assert said.split() == ["[1,", "6,", "15]"]
+    printed, _ = child.communicate("go on")
+    assert printed.split() == ["[1,", "6,", "15]"]
 
 
 # The last resort of an orphan.
@@ -295,7 +295,7 @@ class Controlled:
     def kinds(self) -> list[str]:
         """The kinds of command that the robot got, each change once."""
         found: list[str] = []
-        for _, command in self.bench.device.heard:
+        for _, command in self.bench.device.received:
             kind = "stiff" if command.stiffness.any() else "damping"
             if found[-1:] != [kind]:
                 found.append(kind)
@@ -444,12 +444,12 @@ class Child:
 
 def test_every_pair_of_signals_asks_once_and_kills_only_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGTERM and SIGHUP of an ending session are one request: the control process is damping then."""
-    monkeypatch.setattr("deal_hw.control.process.supervisor.hurry", lambda pid: None)
+    monkeypatch.setattr("deal_hw.control.process.supervisor.raise_priority", lambda pid: None)
     for first in SENT:
         for second in SENT:
             clock, child = VirtualClock(0), Child()
             supervisor = Supervisor(
-                module="m", plan={}, port_fd=None, passive=lambda phase, in_vain: True, clock=clock
+                module="m", plan={}, port_fd=None, passive=lambda phase, already_tried: True, clock=clock
             )
             supervisor._child = child  # type: ignore[assignment]
             with signals.taken(supervisor._signalled):
@@ -470,14 +470,14 @@ def test_no_signal_ends_the_supervisors_own_damping() -> None:
     """Hundreds, while the robot does not confirm for 2 s; no number of them ends the passive command."""
     bench = FakeBench(Go2OnStandRobot, mode="")
     robot = bench.armed()
-    supervisor = Supervisor(module="m", plan={}, port_fd=None, passive=lambda phase, in_vain: True)
+    supervisor = Supervisor(module="m", plan={}, port_fd=None, passive=lambda phase, already_tried: True)
     bench.device.command, bench.device.hears = decode_low_command(STIFF), False
     bench.device.pose += 0.1  # Without a load a stiff robot looks damped.
     begin_ns = bench.clock.now_ns()
-    told: list[str] = []
+    reported: list[str] = []
 
     def progress(text: str, silence_s: float) -> None:
-        told.append(text)
+        reported.append(text)
         for number in SENT:
             signal.raise_signal(number)
         bench.device.hears = bench.clock.now_ns() - begin_ns > 2 * 10**9
@@ -485,7 +485,7 @@ def test_no_signal_ends_the_supervisors_own_damping() -> None:
 
     with signals.taken(supervisor._signalled):
         assert make_passive(robot, bench.clock, PassiveConfig(), progress=progress)
-    assert len(told) > 10
+    assert len(reported) > 10
     assert bench.device.command is not None and not bench.device.command.stiffness.any()
     assert supervisor._signal == "SIGHUP"
 

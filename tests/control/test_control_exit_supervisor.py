@@ -25,7 +25,10 @@ from deal_hw.signals import OPERATOR, SUSPENDED
 
 pytestmark = pytest.mark.real_time
 
-GRACE_S = module._GRACE_S
+LONG_S = 300.0
+"""Time for the control process to end after its last message. It has an ordinary priority, and closing its
+channel wakes up a supervisor that has a higher one, in the middle of its end: on a busy machine it may get
+the processor back after more than the 3 s of a real run."""
 CHILD = """
 import json, os, signal, socket, struct, sys, time
 
@@ -59,10 +62,10 @@ exec(orders["do"])
 
 
 class Run:
-    """A supervisor over a control process that does as it is told.
+    """A supervisor over a control process that follows a script.
 
     Attributes:
-        passive: What the supervisor was asked for once the process was dead: phase, tried in vain.
+        passive: What the supervisor was asked for once the process was dead: phase, tried already.
     """
 
     def __init__(
@@ -77,13 +80,13 @@ class Run:
             port_fd=None,
             passive=self._passive,
             on_beat=self._on_beat,
-            **settings,
+            **{"grace_s": LONG_S, **settings},
         )
 
-    def _passive(self, phase: str, in_vain: bool) -> bool:
+    def _passive(self, phase: str, already_tried: bool) -> bool:
         child = self.supervisor._child
         assert child is None or child.returncode is not None, "the control process is dead first"
-        self.passive.append((phase, in_vain))
+        self.passive.append((phase, already_tried))
         return True
 
     def _on_beat(self, beat: Beat) -> None:
@@ -97,12 +100,7 @@ class Run:
 
 @pytest.fixture(autouse=True)
 def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The control process's module, which has minutes to end after its last word.
-
-    It has an ordinary priority, and closing its channel wakes up a supervisor that has a higher one, in the
-    middle of its end: on a busy machine it may get the processor back after more than the 3 s of a real run.
-    """
-    monkeypatch.setattr(module, "_GRACE_S", 300.0)
+    """The control process's module."""
     (tmp_path / "deal_hw_obedient_child.py").write_text(CHILD)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
@@ -117,7 +115,7 @@ def test_a_process_that_ends_well_leaves_nothing_to_do() -> None:
 
 
 @pytest.mark.parametrize(
-    ("do", "phase", "in_vain", "code"),
+    ("do", "phase", "already_tried", "code"),
     [
         ("sys.exit(7)", "starting", False, 7),
         ("beat('connecting'); os.kill(os.getpid(), 9)", "connecting", False, -9),
@@ -127,12 +125,12 @@ def test_a_process_that_ends_well_leaves_nothing_to_do() -> None:
     ],
 )
 def test_who_makes_passive_is_told_when_it_died_and_whether_it_tried(
-    do: str, phase: str, in_vain: bool, code: int
+    do: str, phase: str, already_tried: bool, code: int
 ) -> None:
-    """The last phase that was heard; a report without the word is a try in vain."""
+    """The last received phase; a report without the word means that the process tried without success."""
     run = Run(do)
     end = run.end()
-    assert run.passive == [(phase, in_vain)]
+    assert run.passive == [(phase, already_tried)]
     assert (end.passive_confirmed, end.exit_code, end.killed) == (True, code, "")
 
 
@@ -153,10 +151,9 @@ def test_a_process_that_falls_silent_is_killed() -> None:
     assert run.passive == [("homing", False)]
 
 
-def test_a_process_that_lingers_after_its_last_word_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_lingers_after_its_last_word_is_killed() -> None:
     """Its report counts, though it never read our heartbeats: the kernel then reports a reset first."""
-    monkeypatch.setattr(module, "_GRACE_S", 0.05)
-    run = Run("result(passive_confirmed=True); channel.close(); time.sleep(600)")
+    run = Run("result(passive_confirmed=True); channel.close(); time.sleep(600)", grace_s=0.05)
     end = run.end()
     assert (end.killed, end.exit_code) == ("it did not end after its last message", -9)
     assert end.result == {"passive_confirmed": True}
@@ -203,16 +200,14 @@ def test_the_operators_signals_ask_once_and_are_named(number: signal.Signals, ca
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP])
-def test_the_operators_late_second_wish_kills(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_operators_late_second_wish_kills(number: signal.Signals) -> None:
     """The process does not end by its passive route: the robot is the supervisor's then."""
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
 
     def twice(run: Run, beat: Beat) -> None:
         os.kill(os.getpid(), number)
 
-    run = Run("on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)", twice)
+    do = "on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)"
+    run = Run(do, twice, patience_s=0.0)
     end = run.end()
     assert (end.killed, end.exit_code) == ("it did not end when it was asked, and was asked again", -9)
     assert run.passive == [("running", False)]
@@ -229,14 +224,14 @@ def test_requests_at_once_are_one_request() -> None:
     assert (end.killed, end.exit_code, end.signal) == ("", 0, "SIGTERM")
 
 
-def test_the_first_signal_is_the_one_that_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_signal_is_the_one_that_is_named() -> None:
     """Ctrl-Z, then Ctrl-C."""
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
 
     def both(run: Run, beat: Beat) -> None:
         os.kill(os.getpid(), signal.SIGTSTP if len(run.beats) == 1 else signal.SIGINT)
 
-    run = Run("on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)", both)
+    do = "on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)"
+    run = Run(do, both, patience_s=0.0)
     end = run.end()
     assert (end.signal, end.stop_cause, end.killed != "") == ("SIGTSTP", SUSPENDED, True)
 
@@ -257,7 +252,7 @@ def test_words_reach_a_process_that_is_there_and_nobody_else() -> None:
     def speak(run: Run, beat: Beat) -> None:
         run.supervisor.tell("w")
 
-    do = "beat('running'); heard = [];\nwhile 'w' not in heard: heard.append(channel.recv(64).decode())\n"
+    do = "beat('running'); got = [];\nwhile 'w' not in got: got.append(channel.recv(64).decode())\n"
     run = Run(do + "result(passive_confirmed=True)", speak)
     run.supervisor.tell("too early")
     assert run.end().passive_confirmed
@@ -278,8 +273,8 @@ def test_in_another_thread_signals_are_left_alone() -> None:
 def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None:
     """Three heartbeats reach the process; what it inherits is what was named, and the channel."""
     do = (
-        "heard = [channel.recv(64) for _ in range(3)]; "
-        "result(passive_confirmed=True, heard=[h.decode() for h in heard], "
+        "received = [channel.recv(64) for _ in range(3)]; "
+        "result(passive_confirmed=True, received=[h.decode() for h in received], "
         "opened=os.path.exists(f'/proc/self/fd/{orders[\"keep\"]}'), parent=orders['parent_pid'])"
     )
     with (tmp_path / "claim").open("w") as claim:
@@ -288,7 +283,7 @@ def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None
         end = run.end()
     assert end.result == {
         "passive_confirmed": True,
-        "heard": ["\0"] * 3,
+        "received": ["\0"] * 3,
         "opened": True,
         "parent": os.getpid(),
     }
@@ -325,13 +320,13 @@ def test_heartbeats_go_by_the_clock() -> None:
     """A clock that stands still makes one, at once, however often the supervisor wakes up."""
     do = (
         "[(beat('running'), time.sleep(0.02)) for _ in range(10)]; channel.setblocking(False); "
-        "result(passive_confirmed=True, heard=channel.recv(64).decode()); "
+        "result(passive_confirmed=True, received=channel.recv(64).decode()); "
         "time.sleep(0.1); n = 0\n"
         "try:\n    channel.recv(64); n = 1\nexcept BlockingIOError:\n    pass\n"
         "sys.exit(n)"
     )
     end = Run(do, clock=VirtualClock(0)).end()
-    assert end.result == {"passive_confirmed": True, "heard": "\0"}
+    assert end.result == {"passive_confirmed": True, "received": "\0"}
     assert end.exit_code == 0
 
 
@@ -391,12 +386,9 @@ def limits(monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
     return found
 
 
-def test_a_process_has_three_seconds_to_end_after_its_last_word(
-    limits: list[float | None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_has_three_seconds_to_end_after_its_last_word(limits: list[float | None]) -> None:
     """It still has its files to close."""
-    monkeypatch.setattr(module, "_GRACE_S", GRACE_S)
-    assert Run("result(passive_confirmed=True)").end().exit_code == 0
+    assert Run("result(passive_confirmed=True)", grace_s=module.GRACE_S).end().exit_code == 0
     assert limits == [3.0]
 
 
@@ -405,7 +397,7 @@ def test_what_is_killed_is_hurried_and_waited_for_without_a_limit(
 ) -> None:
     """The robot is stiff meanwhile: no time is lost on a busy machine, nor by a wait that polls."""
     hurried: list[int] = []
-    monkeypatch.setattr(module, "hurry", hurried.append)
+    monkeypatch.setattr(module, "raise_priority", hurried.append)
     run = Run("beat('homing', 0.02); time.sleep(600)")
     assert run.end().exit_code == -9
     assert run.supervisor._child is not None and hurried == [run.supervisor._child.pid]

@@ -1,7 +1,7 @@
 """Real processes over a real wire, by the rigs of the fault tables: whatever goes wrong, it is passive.
 
 `tools/measure_go2_faults.py` and `tools/measure_cartpole_faults.py` draw moments and repeat each row; here
-the worst rows run once, at a moment of their own. The emulator says what the robot was told, never deal-hw.
+the worst rows run once, at a moment of their own. The emulator reports the robot's commands, never deal-hw.
 Rows of the cart-pole are short and no slow tests; those of the Go2 are, but one.
 """
 

@@ -388,14 +388,14 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "outcome", "told"),
+    ("reason", "outcome", "reported"),
     [
         ("", Outcome.FINISHED, "the run is over"),
         ("the battery is low", Outcome.STOPPED, "the battery is low"),
     ],
 )
 def test_a_planned_end_may_come_before_the_time_is_up(
-    rig: Any, reason: str, outcome: Outcome, told: str
+    rig: Any, reason: str, outcome: Outcome, reported: str
 ) -> None:
     """The cycle that is over is the last; its parts are events; it makes the robot passive like every end."""
     end = PlannedEnd()
@@ -413,7 +413,7 @@ def test_a_planned_end_may_come_before_the_time_is_up(
         rig.robot, Ends(DESCRIPTION), Safety(DESCRIPTION), rig.clock, rig.sink, settings, end=end
     )
     report = loop.run()
-    assert (report.outcome, report.reason, report.passive_confirmed) == (outcome, told, True)
+    assert (report.outcome, report.reason, report.passive_confirmed) == (outcome, reported, True)
     # Cycles 0 to 20 at 50 Hz; the last one, at 0.4 s, says that it is over.
     assert report.cycles_sent == 21
     assert [message for kind, message in rig.events if kind == ENDING_EVENT] == ["it lies down"]

@@ -44,7 +44,7 @@ class Tap:
 
     def __init__(self, device: Go2Device) -> None:
         self._device = device
-        self.heard: list[tuple[int, str, bytes]] = []
+        self.received: list[tuple[int, str, bytes]] = []
         self.heights: list[float] = []
         self.deaf_to: set[str] = set()
         self.state: Callable[[LowState], LowState] | None = None
@@ -56,7 +56,7 @@ class Tap:
 
     def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
         """Note what the host sent, and pass it on."""
-        self.heard.append((stamp_ns, topic, payload))
+        self.received.append((stamp_ns, topic, payload))
         if topic not in self.deaf_to:
             self._device.receive(topic, payload, stamp_ns)
 
@@ -74,18 +74,18 @@ class Tap:
 
 
 class Spy(Safety):
-    """The safety module, with a copy of what it was told."""
+    """The safety module, with a copy of its inputs."""
 
     def __init__(self) -> None:
         super().__init__(DRIVER)
-        self.told: list[CycleInput] = []
-        self.said: list[SafetyDecision] = []
+        self.inputs: list[CycleInput] = []
+        self.decisions: list[SafetyDecision] = []
 
     def step(self, cycle: CycleInput, wanted: JointCommand | None) -> SafetyDecision:
         """Judge as ever."""
-        self.told.append(cycle)
-        self.said.append(super().step(cycle, wanted))
-        return self.said[-1]
+        self.inputs.append(cycle)
+        self.decisions.append(super().step(cycle, wanted))
+        return self.decisions[-1]
 
 
 class LegRig:
@@ -122,10 +122,10 @@ class LegRig:
 
     @property
     def commands(self) -> list[tuple[int, str, bytes]]:
-        """When which kind of motor command was heard."""
+        """When which kind of motor command was received."""
         return [
             (stamp_ns, kind_of(decode_low_command(payload)), payload)
-            for stamp_ns, topic, payload in self.tap.heard
+            for stamp_ns, topic, payload in self.tap.received
             if topic == topics.LOW_COMMAND
         ]
 
@@ -200,10 +200,10 @@ def test_commands_are_repeated_between_cycles(stood: Stood) -> None:
 
 def test_the_safety_module_knows_when_a_command_was_last_sent(stood: Stood) -> None:
     """Not known in the first cycle; then the command was repeated as the cycle began."""
-    ages = [cycle.command_age_ns for cycle in stood[0].safety.told]
+    ages = [cycle.command_age_ns for cycle in stood[0].safety.inputs]
     assert ages[0] == -1
     assert set(ages[1:]) == {0}
-    assert {cycle.fault for cycle in stood[0].safety.told} == {""}
+    assert {cycle.fault for cycle in stood[0].safety.inputs} == {""}
 
 
 def test_the_heartbeat_is_as_short_as_the_robot_asks_for(stood: Stood) -> None:
@@ -253,7 +253,7 @@ def test_a_finished_run_hands_the_robot_back_after_damping(stood: Stood) -> None
     assert rig.device.sport_name == "normal"
     assert ("handed back", "the robot's own controller has the robot again") in rig.events
     last_command = max(stamp for stamp, *_ in rig.commands)
-    asked = [stamp for stamp, topic, _ in rig.tap.heard if topic == SWITCHER]
+    asked = [stamp for stamp, topic, _ in rig.tap.received if topic == SWITCHER]
     assert asked[-1] > last_command
     assert rig.records[-1].events[-1].kind == "ended"
 
@@ -282,9 +282,9 @@ def test_another_program_on_the_wire_trips_with_the_drivers_words(stood: Stood) 
     report = rig.loop().run()
     assert report.outcome is Outcome.TRIPPED
     assert "another program commands the robot's motors" in report.reason
-    assert rig.safety.said[-1].flags[0] == "device_fault"
-    assert rig.safety.told[-1].fault == report.reason
-    assert rig.safety.told[-2].fault == ""
+    assert rig.safety.decisions[-1].flags[0] == "device_fault"
+    assert rig.safety.inputs[-1].fault == report.reason
+    assert rig.safety.inputs[-2].fault == ""
 
 
 def test_the_remote_stops_the_run(stood: Stood) -> None:
@@ -304,17 +304,17 @@ def test_an_unconfirmed_robot_is_not_handed_back() -> None:
         rig.device.begin_fault("freeze")
         loop.request_stop()
 
-    # Long enough that the wire is opened again in vain.
+    # Long enough that the wire is opened again without success.
     loop = rig.loop(At(3, end), hand_back=True, passive=PassiveConfig(timeout_s=4.0))
     report = loop.run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, False)
     assert "handing back" not in dict(rig.beats)
     assert rig.commands[-1][1] == DAMPING
-    assert not any(t == SWITCHER for stamp, t, _ in rig.tap.heard if stamp >= rig.tripped_ns)
+    assert not any(t == SWITCHER for stamp, t, _ in rig.tap.received if stamp >= rig.tripped_ns)
 
 
 def test_a_robot_that_cannot_be_handed_back_is_a_warning() -> None:
-    """Its services do not answer any more: the run still finished, and the operator is told."""
+    """Its services do not answer any more: the run still finished, and the operator is informed."""
     rig = LegRig()
     report = rig.loop(
         At(3, lambda: rig.tap.deaf_to.add(SWITCHER)), hand_back=True, hand_back_timeout_s=1.0
@@ -368,7 +368,7 @@ def test_a_dry_run_sends_nothing_at_all() -> None:
     rig = LegRig()
     report = rig.loop(dry_run=True, hand_back=True, duration_s=0.5).run()
     assert (report.outcome, report.cycles_sent) == (Outcome.FINISHED, 0)
-    assert rig.tap.heard == []
+    assert rig.tap.received == []
     assert "handing back" not in dict(rig.beats), "nothing was taken"
     assert rig.device.sport_name == "normal"
     assert all(record.requested is not None and record.sent is None for record in rig.records[:-1])

@@ -1,4 +1,4 @@
-"""Channels out of the control process: nothing waits, refusals are counted, a dead peer is said."""
+"""Channels out of the control process: nothing waits, refusals are counted, a dead peer is reported."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from deal_hw.control.process.channel import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
-from deal_hw.control.process.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, hurry
+from deal_hw.control.process.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, raise_priority
 from deal_hw.data.recording.record import CycleRecord, decode
 from deal_hw.errors import DatasetError
 from deal_hw.transport import Message
@@ -156,9 +156,9 @@ def test_every_thread_of_a_killed_process_is_hurried(monkeypatch: pytest.MonkeyP
             raise PermissionError(1, "Operation not permitted")
 
         monkeypatch.setattr(os, "sched_setscheduler", lift)
-        hurry(process.pid)
+        raise_priority(process.pid)
         assert lifted == threads
         assert len(threads) == 4
         process.kill()
     assert not Path(f"/proc/{process.pid}").exists()
-    hurry(process.pid)
+    raise_priority(process.pid)

@@ -19,18 +19,18 @@ pytestmark = pytest.mark.real_time
 class Status:
     """Keeps what the supervisor would get."""
 
-    told: list[dict[str, Any]]
+    reported: list[dict[str, Any]]
 
     def __init__(self, channel: socket.socket) -> None:
         channel.close()
-        Status.told = []
+        Status.reported = []
 
     def beat(self, stamp_ns: int, phase: str, silence_s: float) -> None:
         """Ignore a heartbeat."""
 
     def result(self, values: dict[str, Any]) -> None:
         """Keep the result."""
-        self.told.append(values)
+        self.reported.append(values)
 
 
 @pytest.mark.parametrize("with_loop", [False, True])
@@ -52,6 +52,6 @@ def test_only_a_process_without_a_loop_knows_that_the_robot_is_passive(
     monkeypatch.setattr(control_process, "_run", broken)
     with mine:
         assert control_process.main() == 0
-    (result,) = Status.told
+    (result,) = Status.reported
     assert (result["outcome"], result["reason"]) == ("failed", "a bug")
     assert result["passive_confirmed"] is not with_loop

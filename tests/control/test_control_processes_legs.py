@@ -114,7 +114,7 @@ def control_pid() -> int:
 
 
 def kinds(report: dict[str, Any]) -> list[str]:
-    """Return the kinds of command that the emulator heard, in order, each change once."""
+    """Return the kinds of command that the emulator received, in order, each change once."""
     return [kind for _, _, kind in report["commands"]["changes"]]
 
 
@@ -140,20 +140,20 @@ def test_a_go2_stands_up_holds_and_lies_down(
 ) -> None:
     """Over the network into a dataset: every command, every state with its body, and damping at the end."""
     folder, report = finished(rig, tmp_path)
-    # What deal-hw cannot help, such as the death of both its processes, is said at the start.
+    # What deal-hw cannot help, such as the death of both its processes, is reported at the start.
     assert "holds its last command" in capsys.readouterr().err
-    told = rig.finish()
+    reported = rig.finish()
     (episode,) = report.episodes
     assert (episode.outcome, episode.error) == (Outcome.FINISHED, ""), episode.reason
     assert episode.passive_confirmed
     # 0.4 + 0.8 + 0.2 s up, 1 s held, 0.3 + 0.3 s (at most 3.3 s) until it stands still, 0.8 s down, at 50 Hz.
     assert 160 + 30 - 5 <= episode.cycles_sent <= 160 + 165
-    assert kinds(told)[-3:] == [DAMPING, STIFF, DAMPING]
-    assert told["commands"]["last_kind"] == DAMPING
-    assert told["commands"]["refused"] == 0
-    # Repeats in between: far more commands are heard than cycles were run.
-    assert told["commands"]["accepted"] > 5 * episode.cycles_sent
-    assert told["sport"] == ""
+    assert kinds(reported)[-3:] == [DAMPING, STIFF, DAMPING]
+    assert reported["commands"]["last_kind"] == DAMPING
+    assert reported["commands"]["refused"] == 0
+    # Repeats in between: far more commands are received than cycles were run.
+    assert reported["commands"]["accepted"] > 5 * episode.cycles_sent
+    assert reported["sport"] == ""
 
     read = Dataset.open(folder).read(0)
     trajectory, body = read.trajectory, read.trajectory.body
@@ -174,9 +174,9 @@ def test_a_killed_control_process_leaves_the_robot_damped(rig: Rig, tmp_path: Pa
     # A machine under load may take longer to bury it than its next heartbeat would have taken.
     with pytest.raises(SafetyError, match=r"died by signal 9 \(SIGKILL\)|was killed: it sent no heartbeat"):
         rig.run(tmp_path / "dataset", at_beat=80, act=lambda: os.kill(control_pid(), signal.SIGKILL))
-    told = rig.finish()
-    assert kinds(told) == [DAMPING, STIFF, DAMPING]
-    assert told["commands"]["last_kind"] == DAMPING
+    reported = rig.finish()
+    assert kinds(reported) == [DAMPING, STIFF, DAMPING]
+    assert reported["commands"]["last_kind"] == DAMPING
     info = Dataset.open(tmp_path / "dataset").episodes[0]
     assert info.facts["passive_confirmed"] is True
     read = Dataset.open(tmp_path / "dataset").read(0)
@@ -223,8 +223,8 @@ def test_a_session_that_ends_leaves_the_robot_damped(
 
     with pytest.raises(InterruptedRunError) as raised:
         rig.run(tmp_path / "dataset", at_beat=80, act=hang_up)
-    told = rig.finish()
-    assert kinds(told) == [DAMPING, STIFF, DAMPING]
+    reported = rig.finish()
+    assert kinds(reported) == [DAMPING, STIFF, DAMPING]
     (episode,) = raised.value.report.episodes
     assert episode.passive_confirmed
     assert episode.reason in [reason(number) for number in numbers]
@@ -239,8 +239,8 @@ def test_a_run_ends_damped_before_this_computer_sleeps(
         monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", logind.address)
         report = rig.run(tmp_path / "dataset", at_beat=80, act=logind.prepare_for_sleep)
         assert logind.released("delay")
-    told = rig.finish()
-    assert kinds(told) == [DAMPING, STIFF, DAMPING]
+    reported = rig.finish()
+    assert kinds(reported) == [DAMPING, STIFF, DAMPING]
     (episode,) = report.episodes
     assert (episode.outcome, episode.reason) == (Outcome.STOPPED, ASLEEP)
     assert episode.passive_confirmed

@@ -68,10 +68,10 @@ def simulator() -> Iterator[tuple[str, UnitreeMujoco]]:
 
 
 def test_a_run_ends_with_next_to_no_torque(tmp_path: Path, simulator: tuple[str, UnitreeMujoco]) -> None:
-    """Supervisor, control process and recorder: the limits are the robot's, what is missing is said once."""
+    """Supervisor, control process and recorder: the limits are the robot's, what is missing is named once."""
     port, device = simulator
-    said: list[str] = []
-    view = RunView(said.append)
+    printed: list[str] = []
+    view = RunView(printed.append)
     for attempt in range(3):
         folder = tmp_path / f"dataset_{attempt}"
         try:
@@ -86,7 +86,7 @@ def test_a_run_ends_with_next_to_no_torque(tmp_path: Path, simulator: tuple[str,
     assert episode.outcome is Outcome.FINISHED
     assert np.abs(device.torque).max() < 0.6
     assert device.command is not None and not device.command.stiffness.any()
-    assert sum("the simulator unitree_mujoco" in line for line in said) == attempt + 1
+    assert sum("the simulator unitree_mujoco" in line for line in printed) == attempt + 1
     with Dataset.open(folder) as dataset:
         thigh = dataset.read(0).trajectory.position[:, 1]
     assert thigh.min() < 1.0 < thigh.max()

@@ -11,7 +11,7 @@ import pytest
 
 from deal_hw.control.safety.filter import SafetyFilter, keep_effort
 from deal_hw.control.safety.leg_checks import LegChecks
-from deal_hw.control.safety.machine import SafetyFlags
+from deal_hw.control.safety.machine import SAFETY_FLAGS, in_order
 from deal_hw.control.safety.safety import CycleInput, Safety, SafetyConfig, SafetyState
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -208,11 +208,12 @@ def test_all_reasons_are_given_in_the_order_of_the_flags() -> None:
     assert armed_with(DESCRIPTION).step(cycle(sample=bad), command()).reason == both
 
 
-def test_flags_are_false_by_default_and_name_themselves() -> None:
-    """False means no failure."""
-    assert SafetyFlags().raised == ()
-    names = tuple(f.name for f in dataclasses.fields(SafetyFlags))
-    assert SafetyFlags(**dict.fromkeys(names, True)).raised == names
+def test_reasons_are_listed_in_one_order_whatever_was_found_first() -> None:
+    """An unknown name is a programming error."""
+    assert in_order(()) == ()
+    assert in_order([*SAFETY_FLAGS][::-1]) == tuple(SAFETY_FLAGS)
+    with pytest.raises(KeyError):
+        in_order(["position", "nothing"])
 
 
 def test_states_have_the_names_that_recordings_carry() -> None:
@@ -227,7 +228,7 @@ def test_nothing_is_sent_where_nothing_is_asked() -> None:
 
 
 def test_a_loop_that_does_not_say_when_it_sent_has_not_sent() -> None:
-    """The age of the last command must be told."""
+    """The age of the last command must be given."""
     now = T0 + 3 * S
     verdict = armed_with(robot(legs=LEGS)).step(cycle(now, state(now, body=body())), command())
     assert verdict.flags == ("command_stale",)

@@ -284,7 +284,7 @@ def test_turning_trips_beyond_the_limit(axis: int, speed: float) -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", ["orientation", "angular_velocity", "acceleration"])
 def test_a_body_that_is_not_finite_trips(field: str, bad: float) -> None:
-    """NaN passes every comparison unnoticed, so it is looked for by itself; nothing else is said then."""
+    """NaN passes every comparison unnoticed, so it is looked for by itself; nothing else is reported then."""
     for index in range(3):
         values = np.array([0.5, 0.5, 0.5, 0.5]) if field == "orientation" else np.ones(3)
         values[index] = bad

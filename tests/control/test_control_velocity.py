@@ -127,8 +127,8 @@ def test_what_a_policy_was_not_trained_for_is_told(tmp_path: Path) -> None:
     trained = ((-0.6, 1.0), (-0.5, 0.5), (-1.0, 1.0))
     script = tmp_path / "walk.csv"
     script.write_text("time_s,x,y,yaw\n0,0.5,0,0\n1,-0.8,0.1,0\n")
-    told = ["x -0.8 to 0.5, limited to -0.6 to 1"]
-    assert limited_axes(make_source(str(script)), trained) == told
+    reported = ["x -0.8 to 0.5, limited to -0.6 to 1"]
+    assert limited_axes(make_source(str(script)), trained) == reported
     assert limited_axes(make_source("remote"), trained) == ["x -1 to 1, limited to -0.6 to 1"]
     assert limited_axes(make_source("1,0.5,-1"), trained) == []
     assert limited_axes(make_source("-1,0,0"), trained) == ["x -1, limited to -0.6 to 1"]

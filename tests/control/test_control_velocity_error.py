@@ -1,4 +1,4 @@
-"""How well a robot followed what it was told, from where its base was."""
+"""How well a robot followed its commands, from where its base was."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def driven(ahead: float, turn: float, seconds: float = 6.0, heading: float = 0.7
     return Track(time_s, place, np.angle(np.exp(1j * angle)))
 
 
-def told(*velocities: tuple[float, float, float], every_s: float = 3.0) -> Wanted:
+def reported(*velocities: tuple[float, float, float], every_s: float = 3.0) -> Wanted:
     """Return velocities that are wanted one after the other."""
     times = every_s * np.arange(len(velocities), dtype=np.float64)
     return Wanted(times, np.array(velocities), every_s * len(velocities))
@@ -37,7 +37,7 @@ def told(*velocities: tuple[float, float, float], every_s: float = 3.0) -> Wante
 @pytest.mark.parametrize(("ahead", "turn"), [(0.8, 0.0), (0.5, 0.9), (0.0, -1.0)])
 def test_who_does_what_is_wanted_makes_no_error(ahead: float, turn: float) -> None:
     """Ahead and turning, whatever the heading; headings that wrap are no jump."""
-    error = velocity_error(driven(ahead, turn), told((ahead, 0.0, turn), every_s=6.0))
+    error = velocity_error(driven(ahead, turn), reported((ahead, 0.0, turn), every_s=6.0))
     assert error is not None
     assert error.velocity_m_s == pytest.approx(0.0, abs=5e-3)
     assert error.yaw_rad_s == pytest.approx(0.0, abs=1e-9)
@@ -47,7 +47,7 @@ def test_who_does_what_is_wanted_makes_no_error(ahead: float, turn: float) -> No
 
 def test_errors_are_those_of_each_part_after_it_has_settled() -> None:
     """Told 1 m/s ahead, then 1 m/s to the left, a base that goes 0.8 m/s ahead is off by 0.2 and 1.28."""
-    error = velocity_error(driven(0.8, 0.1), told((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    error = velocity_error(driven(0.8, 0.1), reported((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     assert error is not None
     assert error.parts["1,0,0"][0] == pytest.approx(0.2, abs=0.01)
     assert error.parts["0,1,0"][0] == pytest.approx(np.hypot(0.8, 1.0), abs=0.01)
@@ -58,7 +58,7 @@ def test_errors_are_those_of_each_part_after_it_has_settled() -> None:
 
 def test_standing_is_no_walk() -> None:
     """Its error stands among the parts, and no second of walking was judged."""
-    error = velocity_error(driven(0.1, 0.0), told((0.0, 0.0, 0.0), every_s=6.0))
+    error = velocity_error(driven(0.1, 0.0), reported((0.0, 0.0, 0.0), every_s=6.0))
     assert error is not None
     assert error.seconds == 0.0
     assert error.parts["0,0,0"][0] == pytest.approx(0.1, abs=1e-3)
@@ -66,7 +66,7 @@ def test_standing_is_no_walk() -> None:
 
 def test_velocities_that_change_too_often_are_not_judged() -> None:
     """A second after each change nothing is left of a part of 1.2 s."""
-    wanted = told((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (1.0, 0.0, 0.0), every_s=1.2)
+    wanted = reported((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (1.0, 0.0, 0.0), every_s=1.2)
     assert velocity_error(driven(1.0, 0.0), wanted) is None
     less = VelocityErrorSettings(settle_s=0.2)
     assert velocity_error(driven(1.0, 0.0), wanted, less) is not None

@@ -24,25 +24,25 @@ orders = json.load(sys.stdin)
 status = StatusSender(socket.socket(fileno=orders["status_fd"]))
 beat = lambda phase: status.beat(MonotonicClock().now_ns(), phase, 20.0)
 beat("listening")
-heard = []
-while "end" not in heard:
-    heard += status.heard()
+received = []
+while "end" not in received:
+    received += status.received()
     beat("listening")
 opened = sorted(int(name) for name in os.listdir("/proc/self/fd"))
-status.result({"heard": heard, "port_fd": orders["port_fd"], "opened": opened, "passive_confirmed": True})
+status.result({"got": received, "port_fd": orders["port_fd"], "opened": opened, "passive_confirmed": True})
 """
 
 
 def test_words_arrive_in_order_between_heartbeats() -> None:
-    """Both directions share one channel; nothing waits where nothing was said."""
+    """Both directions share one channel; nothing waits where nothing was sent."""
     ends = socket_pair()
     sender, receiver = StatusSender(ends[0]), StatusReceiver(ends[1])
-    assert sender.heard() == []
+    assert sender.received() == []
     for word in ("w", " ", "é"):
         receiver.tell(word)
     sender.beat(1, "running", 0.3)
-    assert sender.heard() == ["w", " ", "é"]
-    assert sender.heard() == []
+    assert sender.received() == ["w", " ", "é"]
+    assert sender.received() == []
     assert receiver.receive() == Beat(1, 0.3, "running", 0)
     receiver.close()
     ends[0].close()
@@ -53,7 +53,7 @@ def test_long_words_are_cut_and_odd_bytes_are_survived() -> None:
     ends = socket_pair()
     sender, receiver = StatusSender(ends[0]), StatusReceiver(ends[1])
     receiver.tell("x" * 255 + "é")
-    assert sender.heard() == ["x" * 255 + "�"]
+    assert sender.received() == ["x" * 255 + "�"]
     receiver.close()
     ends[0].close()
 
@@ -64,7 +64,7 @@ def test_words_to_nobody_are_lost_without_a_sound() -> None:
     sender, receiver = StatusSender(ends[0]), StatusReceiver(ends[1])
     for _ in range(5000):
         receiver.tell("w")
-    assert 0 < len(sender.heard()) <= 5000
+    assert 0 < len(sender.received()) <= 5000
     ends[0].close()
     receiver.tell("w")
     receiver.close()
@@ -77,8 +77,8 @@ def test_a_dead_supervisor_says_nothing() -> None:
     sender, receiver = StatusSender(ends[0]), StatusReceiver(ends[1])
     receiver.tell("w")
     receiver.close()
-    assert sender.heard() == ["w"]
-    assert sender.heard() == []
+    assert sender.received() == ["w"]
+    assert sender.received() == []
     ends[0].close()
 
 
@@ -96,7 +96,7 @@ class Run:
             on_beat=self._on_beat,
         )
 
-    def _passive(self, phase: str, in_vain: bool) -> bool:
+    def _passive(self, phase: str, already_tried: bool) -> bool:
         self.passive_calls += 1
         return True
 
@@ -113,7 +113,7 @@ class Run:
             self.supervisor.tell(word)
 
     def result(self) -> tuple[ChildEnd, dict[str, Any]]:
-        """Run to the end; return how it ended and what the process said."""
+        """Run to the end; return how it ended and what the process printed."""
         end = self.supervisor.run()
         assert end.result is not None
         return end, end.result
@@ -132,8 +132,8 @@ def test_the_supervisor_passes_words_on_without_a_port(child: None) -> None:
     run.supervisor.tell("too early, and lost")
     end, result = run.result()
     assert (end.exit_code, end.killed, end.stop_cause) == (0, "", "")
-    assert [word for word in result["heard"] if word != HEARTBEAT] == ["w", "a", "end"]
-    assert HEARTBEAT in result["heard"]
+    assert [word for word in result["got"] if word != HEARTBEAT] == ["w", "a", "end"]
+    assert HEARTBEAT in result["got"]
     assert result["port_fd"] is None
     # Standard input, output and error, the channel, and the folder that is being listed.
     assert len(result["opened"]) == 5

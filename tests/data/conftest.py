@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
+from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.transport import Message
 from deal_hw.types import Event, FloatArray, JointCommand, RobotState, Status, Trajectory

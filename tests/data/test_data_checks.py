@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deal_hw.data.checks.suite import check, examine
 from deal_hw.data.recording.excitation import excitation
-from deal_hw.data.recording.telemetry_checks import check
+from deal_hw.data.table import table_of
 from deal_hw.findings import Finding, Severity, worst
 from deal_hw.types import Status, Trajectory
 
@@ -60,14 +61,17 @@ def test_nan_fails_but_not_in_effort(make_trajectory: MakeTrajectory) -> None:
     position[[5, 9], 1] = np.nan
     found = verdict(make_trajectory(position=position), "finite")
     assert found.severity is Severity.FAIL
-    assert "position of pole: 2" in found.message
+    assert "position of pole (2 samples)" in found.message
     assert verdict(make_trajectory(effort=np.full((800, 2), np.nan)), "finite").severity is Severity.WARN
 
 
 def test_clock_faults_fail(make_trajectory: MakeTrajectory) -> None:
-    """A device clock that runs back, jumps or stands still is said."""
+    """A device clock that runs back, jumps or stands still is reported."""
     sound = make_trajectory()
-    for shift, words in ((-1.0, "ran backwards 1 times"), (0.1, "1 clock jumps (-100.0 ms at 2.10 s)")):
+    for shift, words in (
+        (-1.0, "goes backwards 1 times, first after sample 400"),
+        (0.1, "1 clock jumps (-100.0 ms at 2.10 s)"),
+    ):
         device_s = sound.device_s + np.where(np.arange(800) >= 400, shift, 0.0)
         found = verdict(replace(sound, device_s=device_s), "clock")
         assert found.severity is Severity.FAIL
@@ -85,7 +89,7 @@ def test_gaps_and_lost_frames(make_trajectory: MakeTrajectory) -> None:
     number = np.arange(800)
     found = verdict(cut(sound, (number < 400) | (number >= 419)), "gaps")
     assert found.severity is Severity.FAIL
-    assert "1 gaps in the state stream, the longest 100.0 ms" in found.message
+    assert "1 gaps, the longest 100 ms" in found.message
     assert verdict(cut(sound, number % 200 != 7), "gaps").severity is Severity.OK
     assert verdict(cut(sound, number % 20 != 7), "gaps").severity is Severity.WARN
     for lost, severity in ((8, Severity.OK), (40, Severity.WARN), (300, Severity.FAIL)):
@@ -108,7 +112,7 @@ def test_frozen_channel(make_trajectory: MakeTrajectory) -> None:
     wholly[:, 0] = 0.1
     found = verdict(replace(sound, position=partly), "frozen")
     assert found.severity is Severity.WARN
-    assert "pole for 1.00 s" in found.message
+    assert "pole for 1 s" in found.message
     assert verdict(replace(sound, position=wholly), "frozen").severity is Severity.FAIL
 
 
@@ -140,7 +144,7 @@ def test_clamping_by_the_device_is_data_and_by_us_is_flagged(make_trajectory: Ma
 
 
 def test_watchdog_end_stop_and_hand_over_warn(make_trajectory: MakeTrajectory) -> None:
-    """Motors that were off, end stops and cycles that were not recorded are said."""
+    """Motors that were off, end stops and cycles that were not recorded are reported."""
     for flag in (Status.WATCHDOG, Status.FAULT, Status.AT_END_STOP):
         status = np.where(np.arange(800) > 700, int(flag), 0)
         assert verdict(make_trajectory(status=status), "stopped").severity is Severity.WARN
@@ -170,3 +174,21 @@ def test_excitation_of_a_resting_robot_is_zero(make_trajectory: MakeTrajectory) 
     assert summary.speed_max == (0.0, 0.0)
     assert summary.reversals == (0, 0)
     assert summary.target_changes == (0,)
+
+
+def test_one_pause_is_judged_by_whose_recording_it_is(make_trajectory: MakeTrajectory) -> None:
+    """Ours are used in one piece, so 100 ms are too long; those of others are split there."""
+    number = np.arange(800)
+    paused = cut(make_trajectory(), (number < 400) | (number >= 419))
+    ours, others = verdict(paused, "gaps"), {f.code: f for f in examine(table_of(paused))}["gaps"]
+    assert (ours.severity, others.severity) == (Severity.FAIL, Severity.WARN)
+    assert ours.seen.startswith(others.seen) and others.do == "the recording is split there"
+
+
+@pytest.mark.parametrize("channel", ["position", "velocity", "effort"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_no_values_stop_the_checks(make_trajectory: MakeTrajectory, channel: str, value: float) -> None:
+    """Of a channel without one sound value all other checks still report."""
+    found = check(make_trajectory(**{channel: np.full((800, 2), value)}))
+    assert len(found) == len(check(make_trajectory()))
+    assert (worst(found) is Severity.FAIL) == (channel != "effort" and not np.isfinite(value))

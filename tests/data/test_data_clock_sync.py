@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.data.recording.clock_sync import command_bounds, find_jumps, synchronize
+from deal_hw.data.checks.clock_sync import command_bounds, find_jumps, synchronize
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray, Trajectory
 

@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.data.checks.command_kind import command_kind
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.findings import Severity
 from deal_hw.types import FloatArray
 

@@ -21,7 +21,7 @@ WriteEpisode = Callable[..., Path]
 
 @pytest.fixture
 def notes() -> list[str]:
-    """What the dataset told its user."""
+    """What the dataset printed for its user."""
     return []
 
 

@@ -119,7 +119,7 @@ class Work:
 def test_work_and_words_are_bounded(
     write_episode: WriteEpisode, monkeypatch: pytest.MonkeyPatch, junk: bytes, where: str
 ) -> None:
-    """Whatever is inserted, each byte is looked at a few times, and the damage is said in one short line."""
+    """Whatever is inserted, each byte is looked at a few times, and the damage is one short line."""
     monkeypatch.setattr(mcap_scan, "MAX_CHUNK_BYTES", 20_000)
     path = write_episode(cycles=40, torn=True)
     data = path.read_bytes()
@@ -305,8 +305,8 @@ def episode_of(
     with open(path, "wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library=LIBRARY)
-        said = {"description": description, "metadata": metadata, "wall_utc": "now", "host_ns": "0"}
-        writer.add_metadata(METADATA_NAME, said)
+        printed = {"description": description, "metadata": metadata, "wall_utc": "now", "host_ns": "0"}
+        writer.add_metadata(METADATA_NAME, printed)
         values = np.zeros(joints)
         for topic, data in (
             ("/state", STATE.encode(1, 1, 1, -1, -1, 0, values, ROW, ROW)),

@@ -15,13 +15,13 @@ import pytest
 
 from deal_hw.cli.data import Export, Import, data
 from deal_hw.cli.main import parse
-from deal_hw.data.checks.plausibility import examine
+from deal_hw.data.checks.suite import examine
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.columns import parse_column_map, read_column_map
 from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.table import Table
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.findings import Severity, worst
 from deal_hw.install import install_line
@@ -148,7 +148,7 @@ def test_import_refuses_what_is_not_plausible(
     with pytest.raises(DatasetError, match=r"hip follows the command of knee.*--force"):
         data(Import(paths=(recording,), out=out, columns=columns))
     assert not out.exists()
-    # The error has it; a line before it said the same in full.
+    # The error has it; a line before it had the same in full.
     assert "fail assignment" not in capsys.readouterr().err
     assert data(Import(paths=(recording,), out=out, columns=columns, force=True, name="odd")) == 0
     facts = Dataset.open(out).episodes[0].facts["plausibility"]["rec.csv"]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from deal_hw.data.importing.grid import Gains, common_period, period_of, to_trajectories
 from deal_hw.data.importing.load import own_episodes
 from deal_hw.data.importing.store import write_dataset
-from deal_hw.data.importing.table import Table, table_of
 from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.table import Table, table_of
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
@@ -74,7 +74,7 @@ def test_align_gives_the_arrays_back(make_table: MakeTable, rate_hz: float, per_
 
 
 def test_uneven_stamps_within_two_percent_move_to_the_grid(make_table: MakeTable) -> None:
-    """Values stay, commands of the same stamp act with their sample, and the shift is told."""
+    """Values stay, commands of the same stamp act with their sample, and the shift is reported."""
     table = jittered(make_table(), 0.015)
     (part,) = to_trajectories(table, GAINS)
     facts = part.trajectory.metadata["import"]

@@ -26,7 +26,7 @@ from deal_hw.data.importing.load import load_tables
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError
-from deal_hw.reading import YAML_BYTES, parse_yaml, reading
+from deal_hw.reading import RECORDING_BYTES, YAML_BYTES, parse_yaml, reading
 
 TWISTED = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
@@ -83,7 +83,7 @@ def test_a_decompression_bomb_is_refused_before_it_is_read(tmp_path: Path) -> No
 
 
 def test_what_is_not_wanted_is_not_read(tmp_path: Path) -> None:
-    """Pictures, objects and archives inside are left out by their headers, and told."""
+    """Pictures, objects and archives inside are left out by their headers, and reported."""
     path = tmp_path / "a.npz"
     np.savez(
         path, time=np.arange(3.0), picture=np.zeros((2, 2, 3), np.uint8), thing=np.array([{}], dtype=object)
@@ -137,21 +137,21 @@ def test_any_text_is_a_table_or_refused(tmp_path_factory: pytest.TempPathFactory
         assert "\n" not in str(error)
 
 
-def test_limits_of_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_of_a_table(tmp_path: Path) -> None:
     """Lines, columns, numbers and the file itself have limits."""
     path = tmp_path / "a.csv"
     path.write_text(",".join(f"c{i}" for i in range(5000)), encoding="utf-8")
     assert "has 5000 columns; 4096 are allowed" in refusal(lambda: read_csv(path), path)
     path.write_text("a,b\n" + "1" * (csv_source.LINE + 1), encoding="utf-8")
     assert "a line of 1048576 characters or more" in refusal(lambda: read_csv(path), path)
-    monkeypatch.setattr(csv_source, "NUMBERS", 8)
     path.write_text("a;b\n" + "1;2\n" * 4, encoding="utf-8")
-    assert read_csv(path).arrays["a"].size == 4
+    assert read_csv(path, 8).arrays["a"].size == 4
     path.write_text("a;b\n" + "1;2\n" * 5, encoding="utf-8")
-    assert "'a' has more than 4 numbers" in refusal(lambda: read_csv(path), path)
+    assert "'a' has more than 4 numbers" in refusal(lambda: read_csv(path, 8), path)
     path.write_text("a;b\n;\n;\n[1, 2, 3];1\n", encoding="utf-8")
-    assert "a" not in read_csv(path).arrays
-    monkeypatch.setattr(csv_source, "RECORDING_BYTES", 10)
+    assert "a" not in read_csv(path, 8).arrays
+    # A file with a hole takes no space.
+    os.truncate(path, RECORDING_BYTES + 1)
     assert "MiB" in refusal(lambda: read_csv(path), path)
 
 
@@ -254,14 +254,12 @@ def test_a_schema_without_bytes_does_not_run_for_ever(tmp_path: Path, schema: st
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
-def test_a_chunk_that_unpacks_to_too_much_is_refused(
-    tmp_path: Path, compression: CompressionType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_that_unpacks_to_too_much_is_refused(tmp_path: Path, compression: CompressionType) -> None:
     """A chunk is unpacked as far as the limit, whatever its header says."""
-    path = ros(tmp_path / "a.mcap", "p/msg/M", "uint8[] a", b"\0\1\0\0" + bytes(1 << 20), compression)
-    assert path.stat().st_size < 1 << 17
-    monkeypatch.setattr(mcap_source, "CHUNK_BYTES", 1 << 19)
-    assert "a chunk of more than 0.5 MiB" in refusal(lambda: read_mcap(path), path)
+    data = b"\0\1\0\0" + bytes(mcap_source.CHUNK_BYTES)
+    path = ros(tmp_path / "a.mcap", "p/msg/M", "uint8[] a", data, compression)
+    assert path.stat().st_size < 1 << 20
+    assert "a chunk of more than 64 MiB" in refusal(lambda: read_mcap(path), path)
 
 
 @pytest.mark.parametrize(

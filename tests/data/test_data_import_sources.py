@@ -37,7 +37,7 @@ def write(path: Path, text: str) -> Path:
 
 
 def test_csv_named_like_the_joints_needs_no_map(tmp_path: Path) -> None:
-    """Time in ms by name, degrees by name, order of the model; the guess is told."""
+    """Time in ms by name, degrees by name, order of the model; the guess is reported."""
     path = write(
         tmp_path / "rec.csv",
         "time_ms,elbow_cmd,elbow_pos_deg,Shoulder.pos,shoulder_target,shoulder_vel,note\n"
@@ -45,15 +45,15 @@ def test_csv_named_like_the_joints_needs_no_map(tmp_path: Path) -> None:
         "10,0.2,180,2.0,2.5,8,\n"
         "20,0.3,270,3.0,3.5,9,end\n",
     )
-    told: list[str] = []
-    (table,) = load_tables(path, joints=("shoulder_joint", "elbow"), say=told.append)
+    reported: list[str] = []
+    (table,) = load_tables(path, joints=("shoulder_joint", "elbow"), say=reported.append)
     assert table.joint_names == table.actuated == ("shoulder_joint", "elbow")
     np.testing.assert_allclose(table.time_s, [0.0, 0.01, 0.02], atol=1e-15)
     np.testing.assert_allclose(table.position, [[1, np.pi / 2], [2, np.pi], [3, 1.5 * np.pi]])
     np.testing.assert_allclose(table.target[:, 0], [1.5, 2.5, 3.5])
     assert table.velocity is not None and np.isnan(table.velocity[:, 1]).all()
     assert table.velocity[:, 0].tolist() == [7, 8, 9]
-    whole = "\n".join(told)
+    whole = "\n".join(reported)
     for words in (
         "text are left out: note",
         "guessed",
@@ -148,10 +148,10 @@ def test_npz_with_several_lists_of_names(tmp_path: Path) -> None:
     arrays: dict[str, Any] = {"time": time, "dof_pos": position, "dof_target": np.ones((4, 2))}
     others: dict[str, Any] = {"actuator_names": np.array(["knee", "hip"]), "task": np.array(["walk"])}
     np.savez(tmp_path / "a.npz", joint_names=np.array(["hip", "knee"]), **arrays, **others)
-    told: list[str] = []
-    (table,) = load_tables(tmp_path / "a.npz", joints=("hip", "knee"), say=told.append)
+    reported: list[str] = []
+    (table,) = load_tables(tmp_path / "a.npz", joints=("hip", "knee"), say=reported.append)
     np.testing.assert_array_equal(table.position, position)
-    assert any("actuator_names is left out: not the joints' names" in line for line in told)
+    assert any("actuator_names is left out: not the joints' names" in line for line in reported)
     np.savez(tmp_path / "b.npz", **arrays, **others)
     assert read_npz(tmp_path / "b.npz").joint_names == ()
 

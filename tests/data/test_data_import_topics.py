@@ -17,8 +17,8 @@ from deal_hw.cli.data import Import, data
 from deal_hw.data.importing import mcap_source
 from deal_hw.data.importing.columns import parse_column_map
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.importing.table import table_of
 from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.table import table_of
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import parse_yaml
 from deal_hw.types import Trajectory
@@ -126,8 +126,8 @@ def test_measured_and_sent_are_found(
         for number, each in enumerate(values)
     ]
     path = bag(tmp_path_factory.mktemp("bag") / "bag.mcap", rows)
-    told: list[str] = []
-    (table,) = load_tables(path, joints=("hip_joint", "knee_joint"), say=told.append)
+    reported: list[str] = []
+    (table,) = load_tables(path, joints=("hip_joint", "knee_joint"), say=reported.append)
     order = [names.index(name) for name in ("hip_joint", "knee_joint")]
     table_ = np.array(values)
     np.testing.assert_array_equal(table.position, table_[:, :2][:, order])
@@ -135,7 +135,7 @@ def test_measured_and_sent_are_found(
     np.testing.assert_allclose(table.time_s, 0.01 * np.arange(len(values)), atol=1e-9)
     # An array has no header, so its times and those that it is compared with are the recorder's.
     np.testing.assert_allclose(table.command_s, table.time_s, atol=1e-9)
-    whole = "\n".join(told)
+    whole = "\n".join(reported)
     assert "guessed" in whole and TOPICS[kind] in whole and 'position: "/joint_states.position"' in whole
 
 
@@ -157,11 +157,11 @@ def suggested(text: str) -> Any:
 
 
 def test_a_controllers_state_comes_before_its_goals(tmp_path: Path) -> None:
-    """What the servos were told is the reference; the goal says where a segment ends."""
+    """The servos' commands are the reference; the goal says where a segment ends."""
     rows = [[states(n), commands(n, CONTROLLER), commands(n, TRAJECTORY)] for n in range(5)]
-    told: list[str] = []
-    load_tables(bag(tmp_path / "bag.mcap", rows), say=told.append)
-    assert any('target: "/jtc/controller_state.reference.positions"' in line for line in told)
+    reported: list[str] = []
+    load_tables(bag(tmp_path / "bag.mcap", rows), say=reported.append)
+    assert any('target: "/jtc/controller_state.reference.positions"' in line for line in reported)
 
 
 @pytest.mark.parametrize(
@@ -218,17 +218,18 @@ def test_joints_by_other_names(tmp_path: Path) -> None:
 
 
 def test_trajectories_of_several_points_are_refused(tmp_path: Path) -> None:
-    """The controller interpolates between them: its state says what the servos were told."""
+    """The controller interpolates between them: its state has the servos' commands."""
     message = {"header": stamp(0), "joint_names": ["hip", "knee"], "points": [point((0, 0)), point((1, 1))]}
     rows = [[states(n), (TOPICS[TRAJECTORY], TRAJECTORY, message)] for n in range(5)]
     with pytest.raises(DatasetError, match="controller_state"):
         load_tables(bag(tmp_path / "bag.mcap", rows))
 
 
-def test_long_lists_of_messages_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_lists_of_messages_are_refused(tmp_path: Path) -> None:
     """Each point of a trajectory takes twenty times its bytes in memory."""
-    path = bag(tmp_path / "bag.mcap", [[states(n), commands(n, TRAJECTORY)] for n in range(3)])
-    monkeypatch.setattr(mcap_source, "LIST_BYTES", 64)
+    topic, kind, message = commands(0, TRAJECTORY)
+    long = {**message, "header": {**message["header"], "frame_id": "x" * mcap_source.LIST_BYTES}}
+    path = bag(tmp_path / "bag.mcap", [[states(0), (topic, kind, long)]])
     with pytest.raises(DatasetError, match="a message of more than"):
         load_tables(path)
 
@@ -250,9 +251,9 @@ def test_folder_of_a_bag(tmp_path: Path) -> None:
 def test_our_own_episode_reads_as_any_file(write_episode: Callable[..., Path]) -> None:
     """Samples on device time, commands where they came into force, units kept, joints renamed by a map."""
     path = write_episode()
-    told: list[str] = []
-    (table,) = load_tables(path, say=told.append)
-    assert table.joint_names == ("cart", "pole") and table.units == ("m", "rad") and told
+    reported: list[str] = []
+    (table,) = load_tables(path, say=reported.append)
+    assert table.joint_names == ("cart", "pole") and table.units == ("m", "rad") and reported
     np.testing.assert_allclose(table.time_s, 0.005 * np.arange(600), atol=1e-9)
     # Command n is received 1 ms before the first sample of cycle n + 1.
     np.testing.assert_allclose(table.command_s[:3], [0.019, 0.039, 0.059], atol=1e-9)

@@ -16,8 +16,8 @@ from deal_hw.data.importing.columns import JointKinds, parse_column_map
 from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.load import load_tables, tables_of
 from deal_hw.data.importing.memory_source import read_memory
-from deal_hw.data.importing.table import Table
 from deal_hw.data.importing.wraps import unwrap
+from deal_hw.data.table import Table
 from deal_hw.errors import ConfigurationError
 from deal_hw.findings import Severity
 from deal_hw.types import FloatArray
@@ -98,15 +98,15 @@ def cartpole(pole: FloatArray, t: FloatArray, target: FloatArray) -> dict[str, F
 
 
 def read(arrays: dict[str, FloatArray], **joints: Mapping[str, object]) -> tuple[Table, list[str]]:
-    """Return the recording by a column map with these entries, and what was said."""
-    said: list[str] = []
+    """Return the recording by a column map with these entries, and what was reported."""
+    printed: list[str] = []
     listed: list[dict[str, object]] = [{"name": name, **entries} for name, entries in joints.items()]
     listed[-1]["target"] = "none"
     values = {"time": "time", "position": "{joint}_pos", "target": "{joint}_cmd", "joints": listed}
     (table,) = tables_of(
-        [read_memory(arrays, "rec")], parse_column_map(values), None, said.append, None, POLE
+        [read_memory(arrays, "rec")], parse_column_map(values), None, printed.append, None, POLE
     )
-    return table, said
+    return table, printed
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("rad", 1.0), ("deg", 180 / np.pi)])
@@ -114,8 +114,8 @@ def test_an_import_says_that_it_unwraps(unit: str, scale: float) -> None:
     """In the file's unit; the sentence names file, joint and number of jumps, and the episode keeps them."""
     t, angle = swing(50.0)
     arrays = cartpole(folded(angle, -np.pi) * scale, t, 2 * np.sin(t))
-    table, said = read(arrays, cart={}, pole={"unit": unit})
-    (sentence,) = [text for text in said if "unwrapped" in text]
+    table, printed = read(arrays, cart={}, pole={"unit": unit})
+    (sentence,) = [text for text in printed if "unwrapped" in text]
     count = np.count_nonzero(np.diff(np.floor((angle + np.pi) / TURN)))
     assert f"rec: the angle of pole jumps by a full turn {count} times" in sentence
     assert table.source["unwrapped"] == {"pole": count} and json.dumps(table.source)
@@ -140,8 +140,8 @@ def test_a_slide_is_never_unwrapped() -> None:
     """6.2 m back in one sample is a fault of a slide's sensor, also where it looks like a turn."""
     t = np.arange(0, 6, 0.02)
     arrays = cartpole(0.3 * np.sin(t), t, 2 * np.sin(t)) | {"cart_pos": folded(2.0 * t, 0.0)}
-    table, said = read(arrays, cart={}, pole={})
-    assert "unwrapped" not in table.source and not [text for text in said if "unwrapped" in text]
+    table, printed = read(arrays, cart={}, pole={})
+    assert "unwrapped" not in table.source and not [text for text in printed if "unwrapped" in text]
     np.testing.assert_array_equal(table.position[:, 0], arrays["cart_pos"])
 
 
@@ -155,12 +155,12 @@ def test_commanded_angles_follow_the_measured_ones() -> None:
 
 def test_a_slide_is_guessed_in_metres(tmp_path: Path) -> None:
     """Without a map the model's slide is in metres, in the table and in the printed map; rad was printed."""
-    said: list[str] = []
+    printed: list[str] = []
     path = tmp_path / "r.csv"
     path.write_text("time,cart_pos,cart_cmd,pole_pos\n0,0.1,2,0\n0.02,0.2,-2,0.1\n", encoding="utf-8")
-    (table,) = load_tables(path, joints=("cart", "pole"), say=said.append, kinds=POLE)
+    (table,) = load_tables(path, joints=("cart", "pole"), say=printed.append, kinds=POLE)
     assert table.units == ("m", "rad")
-    (line,) = [text for text in said if '"cart_pos"' in text]
+    (line,) = [text for text in printed if '"cart_pos"' in text]
     assert 'unit: "m"' in line and "target_unit" not in line
     assert load_tables(path, joints=("cart", "pole"))[0].units == ("rad", "rad")
 

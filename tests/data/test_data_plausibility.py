@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from deal_hw.data.checks.joint_match import best_assignment
-from deal_hw.data.checks.plausibility import examine, require
-from deal_hw.data.importing.table import Table
+from deal_hw.data.checks.suite import examine, require
+from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError, MissingExtraError
 from deal_hw.findings import Finding, Severity, worst
 from deal_hw.install import install_line
@@ -128,7 +128,7 @@ def test_measurement_that_copies_the_command(make_table: MakeTable) -> None:
 
 
 def test_degrees(make_table: MakeTable) -> None:
-    """Degrees in either channel are told by the factor between them, in both by the limits."""
+    """Degrees in either channel are found by the factor between them, in both by the limits."""
     sound = make_table()
     for name in ("position", "target"):
         found = verdict(make_table(**{name: np.rad2deg(getattr(sound, name))}), "units")
@@ -271,7 +271,7 @@ def test_wrong_sign(make_table: MakeTable, signs: tuple[int, ...]) -> None:
 
 
 def test_wrong_order_and_sign(make_table: MakeTable) -> None:
-    """Two joints swapped, one of them turned as well: both are said."""
+    """Two joints swapped, one of them turned as well: both are reported."""
     sound = make_table()
     found = verdict(make_table(position=sound.position[:, [1, 0, 2]] * [-1, 1, 1]), "assignment")
     assert found.severity is Severity.FAIL
@@ -279,7 +279,7 @@ def test_wrong_order_and_sign(make_table: MakeTable) -> None:
 
 
 def test_joints_that_move_together_are_not_accused(make_table: MakeTable) -> None:
-    """Legs with one command for all cannot be told apart, so that a swap of two is no finding."""
+    """Legs with one command for all cannot be distinguished, so that a swap of two is no finding."""
     sound = make_table()
     together = make_table(position=sound.position[:, [0, 0, 0]], target=sound.target[:, [0, 0, 0]])
     assert verdict(together, "assignment").severity is Severity.OK

@@ -147,7 +147,7 @@ def test_layout_of_the_head(make_cycle: Callable[[int], CycleRecord]) -> None:
 
 
 def test_mixed_shapes_are_refused(make_cycle: Callable[[int], CycleRecord]) -> None:
-    """A state of three joints among states of two is a programming error that is said."""
+    """A state of three joints among states of two is a programming error that is reported."""
     good = make_cycle(0)
     odd = RobotState(np.zeros(3), np.zeros(3), np.zeros(3), 0, 0, 0, 0, 0, Status.NONE)
     record = CycleRecord(0, 0, 0, states=(*good.states, odd))

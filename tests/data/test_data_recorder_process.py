@@ -101,8 +101,8 @@ def test_ctrl_c_does_not_end_the_recorder(
     feed(recorder, [encode(make_cycle(1))])
     outcome = recorder.finish()
     assert outcome.complete and outcome.cycles == 2
-    (told,) = outcome.errors
-    assert told.startswith("it was told to end by SIG")
+    (reported,) = outcome.errors
+    assert reported.startswith("it was ended by SIG")
 
 
 def test_sigterm_ends_it_with_a_whole_file(

@@ -66,9 +66,7 @@ def test_slip_is_found_and_measured(at: float, by_s: float) -> None:
     """Its place within two seconds, its size within one sampling period, both joints agree."""
     found = find(slipped(arm(), at, by_s))
     assert found is not None and found.clear > 0.5 and found.agree == 1.0
-    inside = (
-        found.end_s > 19.0
-    )  # Up to the end, or from the beginning: the same thing told from the other side.
+    inside = found.end_s > 19.0  # Up to the end, or from the beginning: the same thing from the other side.
     assert (found.begin_s if inside else found.end_s) == pytest.approx(at, abs=2.0)
     assert (1 if inside else -1) * found.later_s == pytest.approx(by_s, abs=0.021)
 

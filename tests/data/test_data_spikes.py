@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.data.checks.plausibility import despiked, examine
+from deal_hw.data.checks.spikes import SpikeSettings, describe, find_spikes, sound, without_spikes
+from deal_hw.data.checks.suite import check, despiked, examine
 from deal_hw.data.importing.npz_source import read_npz
-from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.spikes import SpikeSettings, describe, find_spikes, sound, without_spikes
-from deal_hw.data.recording.telemetry_checks import check
+from deal_hw.data.table import Table
 from deal_hw.findings import Severity
 from deal_hw.types import FloatArray, Trajectory
 
@@ -169,7 +168,7 @@ def test_noise_and_sines_have_no_spikes(seed: int, size: float, frequency_hz: fl
 
 
 def test_check_of_an_imported_recording(make_table: Callable[..., Table]) -> None:
-    """Spikes are told, and the other checks, which they would upset, see the recording without them."""
+    """Spikes are reported, and the other checks, which they would upset, see the recording without them."""
     position = make_table().position.copy()
     position[300, 0], position[700, 2] = 300.0, -3.0
     table = make_table(position=position)

@@ -16,13 +16,13 @@ JOINTS = ("boom", "stick")
 
 def printed(path: Path, joints: tuple[str, ...] | None = JOINTS) -> list[str]:
     """Return the lines of the column map that reading a file prints."""
-    said: list[str] = []
+    output: list[str] = []
     try:
-        load_tables(path, joints=joints, say=said.append)
+        load_tables(path, joints=joints, say=output.append)
     except DatasetError as error:
-        said.append(str(error))
-    (start,) = (at for at, text in enumerate(said) if "a column map to start from" in text)
-    return [text for text in said[start + 1 :] if text.startswith("  ")]
+        output.append(str(error))
+    (start,) = (at for at, text in enumerate(output) if "a column map to start from" in text)
+    return [text for text in output[start + 1 :] if text.startswith("  ")]
 
 
 def test_unknown_channels_give_a_map_that_is_read_once_its_columns_are_named(tmp_path: Path) -> None:
@@ -72,13 +72,13 @@ def test_a_joint_that_was_not_found_is_added_to_the_guessed_ones(header: str, tm
 def test_a_guess_that_was_printed_is_not_printed_again(tmp_path: Path) -> None:
     """Twenty recordings of one robot give one map and nineteen lines; another header gives its own map."""
     one, other = "time,boom_pos,boom_cmd\n0,1,2\n1,1,2\n", "time,boom_pos\n0,1\n1,1\n"
-    told: list[str] = []
+    reported: list[str] = []
     known: dict[str, str] = {}
     for name, text in (("a.csv", one), ("b.csv", one), ("c.csv", other)):
         (tmp_path / name).write_text(text)
-        load_tables(tmp_path / name, joints=("boom",), say=told.append, said=known)
-    assert told.count("b.csv: the same column map as a.csv") == 1
-    assert [line.partition(":")[0] for line in told if "was guessed" in line] == ["a.csv", "c.csv"]
+        load_tables(tmp_path / name, joints=("boom",), say=reported.append, printed=known)
+    assert reported.count("b.csv: the same column map as a.csv") == 1
+    assert [line.partition(":")[0] for line in reported if "was guessed" in line] == ["a.csv", "c.csv"]
 
 
 @pytest.mark.parametrize(
@@ -92,10 +92,10 @@ def test_a_guess_is_printed_as_the_map_that_says_the_same(header: str, tmp_path:
     """A user who has to turn one sign saves the lines and changes one entry; units of targets stay."""
     path = tmp_path / "a.csv"
     path.write_text(f"{header}\n0,1,2,3,4,5\n10,6,8,7,9,10\n", encoding="utf-8")
-    said: list[str] = []
-    (guessed,) = load_tables(path, joints=JOINTS, say=said.append)
-    assert "no column map given; this one was guessed" in said[0]
-    text = "\n".join(line for line in said if line.startswith("  "))
+    output: list[str] = []
+    (guessed,) = load_tables(path, joints=JOINTS, say=output.append)
+    assert "no column map given; this one was guessed" in output[0]
+    text = "\n".join(line for line in output if line.startswith("  "))
     (tmp_path / "columns.yaml").write_text(text, encoding="utf-8")
     (read,) = load_tables(path, read_column_map(tmp_path / "columns.yaml"), JOINTS)
     np.testing.assert_array_equal(read.position, guessed.position)

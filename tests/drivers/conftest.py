@@ -30,7 +30,7 @@ def servo(position: FloatArray, stiffness: float = 60.0, damping: float = 5.0) -
 
 
 class Go2Bench:
-    """An emulated Go2 in virtual time and a client of it; sport mode is released unless told otherwise."""
+    """An emulated Go2 in virtual time and a client of it; sport mode is released by default."""
 
     def __init__(self, **options: Any) -> None:
         from deal_hw.drivers.go2.emulator.device import Go2Device

@@ -80,7 +80,7 @@ class Adapter:
         self.lines: list[bytes] = []
         self._reader = LineReader()
 
-    def heard(self, count: int) -> list[bytes]:
+    def received(self, count: int) -> list[bytes]:
         """Wait until that many lines have come since the last call, empty ones left out."""
         while len(self.lines) < count:
             assert select.select([self.master], [], [], 5.0)[0], f"only {self.lines}"
@@ -101,7 +101,7 @@ class Adapter:
         """Return what frames of the host carried."""
         data = b""
         while len(data) < count:
-            frame = decode_line(self.heard(1)[0])
+            frame = decode_line(self.received(1)[0])
             data += frame[1] if frame is not None else b""
         return data
 
@@ -174,9 +174,9 @@ class TestInheritedSlcan(TransportSuite):
             pair.near.send(Message("123", b"a", 0))
 
 
-@pytest.mark.parametrize(("port", "heard"), [("gs_usb:0", False), ("socketcan:can0", True)])
+@pytest.mark.parametrize(("port", "received"), [("gs_usb:0", False), ("socketcan:can0", True)])
 def test_an_adapters_echo_of_our_own_frame_is_left_out(
-    monkeypatch: pytest.MonkeyPatch, port: str, heard: bool
+    monkeypatch: pytest.MonkeyPatch, port: str, received: bool
 ) -> None:
     """Of socketcan the same mark says that another program of this computer sent the frame."""
     make_bus, channel = can.Bus, next(CHANNELS)
@@ -191,7 +191,7 @@ def test_an_adapters_echo_of_our_own_frame_is_left_out(
     near = PythonCanTransport(port)
     near.open()
     near.send(Message("321", b"a", 0))
-    if heard:
+    if received:
         assert near.receive(0.1).payload == b"a"
     else:
         with pytest.raises(TransportTimeoutError):
@@ -314,8 +314,8 @@ def test_filters_keep_foreign_frames_out() -> None:
 def test_a_serial_adapter_is_set_up_with_its_bit_rate(adapter: Adapter) -> None:
     """Close, bit rate, open; S8 is 1 Mbit/s. At the end its bus is closed."""
     with open_can(f"slcan:{adapter.port}?bitrate=1000000"):
-        assert adapter.heard(3) == [b"C", b"S8", b"O"]
-    assert adapter.heard(1) == [b"C"]
+        assert adapter.received(3) == [b"C", b"S8", b"O"]
+    assert adapter.received(1) == [b"C"]
 
 
 def test_an_inherited_adapter_is_neither_set_up_nor_closed(adapter: Adapter) -> None:
@@ -324,7 +324,7 @@ def test_an_inherited_adapter_is_neither_set_up_nor_closed(adapter: Adapter) -> 
     with open_can(f"slcan:{adapter.port}", fd=fd) as near:
         near.send(Message("123", b"\x01", 0))
     adapter.say(b"")
-    assert adapter.heard(1) == [b"t123101"]
+    assert adapter.received(1) == [b"t123101"]
     assert not select.select([adapter.master], [], [], 0.0)[0]
 
 
@@ -332,7 +332,7 @@ def test_half_a_line_of_another_process_is_ended_first(adapter: Adapter) -> None
     """The first line after a silence begins with an end of line; those that follow at once do not."""
     clock = VirtualClock()
     with SlcanTransport(f"slcan:{adapter.port}", clock) as near:
-        adapter.heard(3)
+        adapter.received(3)
         clock.advance_ns(SECOND_NS)
         near.send(Message("123", b"", 0))
         near.send(Message("124", b"", 0))
@@ -365,18 +365,18 @@ def test_garbage_is_counted_and_survived(adapter: Adapter) -> None:
 def test_a_refusal_is_asked_about_and_bus_off_is_reported(adapter: Adapter) -> None:
     """BELL, the flags 0xA0 (bus error, error-passive): lost, until reopened; then the set-up comes again."""
     with SlcanTransport(f"slcan:{adapter.port}") as near:
-        adapter.heard(3)
+        adapter.received(3)
         adapter.say(b"\a")
         with pytest.raises(TransportTimeoutError, match="refuses to send"):
             near.receive(0.05)
-        assert adapter.heard(1) == [b"F"]
+        assert adapter.received(1) == [b"F"]
         adapter.say(b"FA0\r")
         with pytest.raises(TransportLostError, match="bus-off"):
             near.receive(5.0)
         with pytest.raises(TransportLostError, match="bus-off"):
             near.send(Message("123", b"", 0))
         near.reopen()
-        assert adapter.heard(3) == [b"C", b"S6", b"O"]
+        assert adapter.received(3) == [b"C", b"S6", b"O"]
         adapter.write(b"back")
         assert near.receive(5.0).payload == b"back"
 
@@ -384,14 +384,14 @@ def test_a_refusal_is_asked_about_and_bus_off_is_reported(adapter: Adapter) -> N
 def test_a_full_buffer_refuses_the_next_frame_only(adapter: Adapter) -> None:
     """The flag 0x02 makes one send fail; the next is tried again."""
     with SlcanTransport(f"slcan:{adapter.port}") as near:
-        adapter.heard(3)
+        adapter.received(3)
         adapter.say(b"F02\r")
         with pytest.raises(TransportTimeoutError):
             near.receive(0.05)
         with pytest.raises(TransportTimeoutError, match="transmit buffer is full"):
             near.send(Message("123", b"", 0))
         near.send(Message("123", b"", 0))
-        assert adapter.heard(1) == [b"t1230"]
+        assert adapter.received(1) == [b"t1230"]
 
 
 def test_nobody_acknowledging_is_said(adapter: Adapter) -> None:

@@ -62,7 +62,7 @@ class Board(Chip):
         pole: int = 0,
         switches: tuple[bool, bool] = (False, False),
     ) -> list[protocol.AnyMessage]:
-        """Run some ticks with counts for each; return what was said beside the states."""
+        """Run some ticks with counts for each; return what was reported beside the states."""
         found: list[protocol.AnyMessage] = []
         for _ in range(ticks):
             for payload in self.decoder.feed(self.tick(cart, pole, switches, data)):

@@ -84,7 +84,7 @@ def test_a_state_by_hand(crc_bit_by_bit: Callable[[bytes], int]) -> None:
 
 
 def test_no_command_has_the_number_that_stands_for_none() -> None:
-    """A device that reported it would seem to have heard nothing."""
+    """A device that reported it would seem to have received nothing."""
     with pytest.raises(FrameError, match="does not fit its frames"):
         CanLink().encode(protocol.Target(protocol.NO_COMMAND, 0, 0, 0, 0, 0))
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.cli.emulate import KINDS as EMULATE
+from deal_hw.cli.emulate import emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
@@ -154,14 +155,14 @@ def test_the_port_vanishes_on_request() -> None:
 
 
 def test_the_wire_is_cut_for_a_time() -> None:
-    """0.3 s after arming nothing is heard or said for 0.4 s; the device's watchdog acts meanwhile."""
+    """0.3 s after arming nothing is received or sent for 0.4 s; the device's watchdog acts meanwhile."""
     bench = Bench(Hazards(cut_after_s=0.3, cut_s=0.4))
     try:
         bench.arm()
         assert len(bench.run(1000)) in range(201 - 90, 201 - 70)
         # Disarmed 0.2 s after the last word, 0.1 s before the cut: a robot goes on without its host.
-        told = [what for _, _, what in bench.emulator.changes]
-        assert told == ["homing", "held", "armed", "idle", "cut"]
+        reported = [what for _, _, what in bench.emulator.changes]
+        assert reported == ["homing", "held", "armed", "idle", "cut"]
         assert bench.emulator.report()["watchdog"]
         bench.emulator.cut()
         bench.send(protocol.Arm(3))
@@ -217,33 +218,33 @@ def test_a_link_is_made_replaced_and_removed(tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     """Unknown names list the table, negative times and impossible rates are refused."""
     with pytest.raises(UnknownNameError, match="known: cartpole"):
-        Emulate(robot="spot")
+        EMULATE.settings(robot="spot")
     with pytest.raises(UnknownNameError, match="known: serial"):
-        Emulate(transport="smoke")
+        EMULATE.settings(transport="smoke")
     with pytest.raises(ConfigurationError, match=r"--vanish-after-s -1\.0 s"):
-        Emulate(vanish_after_s=-1.0)
+        EMULATE.settings(vanish_after_s=-1.0)
     with pytest.raises(ConfigurationError, match="--return-after-s needs"):
-        Emulate(vanish_after_s=1.0, return_after_s=1.0)
+        EMULATE.settings(vanish_after_s=1.0, return_after_s=1.0)
     with pytest.raises(ConfigurationError, match="exclude each other"):
-        Emulate(nominal=True, truth_from=Path("truth.json"))
+        EMULATE.settings(nominal=True, truth_from=Path("truth.json"))
     with pytest.raises(ConfigurationError, match=r"--corrupt 1\.5: allowed are 0 to 1"):
-        emulate(Emulate(nominal=True, corrupt=1.5))
+        emulate(EMULATE.settings(nominal=True, corrupt=1.5))
 
 
 def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It prints the port first and the truth last, writes the same truth, and takes it back."""
     revealed = tmp_path / "truth.json"
-    config = Emulate(profile="sensor", seed=5, duration_s=0.0, reveal=True, reveal_to=revealed)
+    config = EMULATE.settings(profile="sensor", seed=5, duration_s=0.0, reveal=True, reveal_to=revealed)
     assert emulate(config) == 0
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("port /dev/")
-    told = json.loads(lines[-1])
-    assert told == json.loads(revealed.read_text())
-    assert (told["changes"], told["last_mode"], told["received_bytes"]) == ([], "idle", 0)
-    assert emulate(Emulate(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
+    reported = json.loads(lines[-1])
+    assert reported == json.loads(revealed.read_text())
+    assert (reported["changes"], reported["last_mode"], reported["received_bytes"]) == ([], "idle", 0)
+    assert emulate(EMULATE.settings(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
     again = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert CartpoleTruth.from_json(again) == CartpoleTruth.from_json(told)
+    assert CartpoleTruth.from_json(again) == CartpoleTruth.from_json(reported)
 
 
 def test_a_process_end_to_end(tmp_path: Path) -> None:
@@ -271,7 +272,7 @@ def test_a_process_end_to_end(tmp_path: Path) -> None:
 
 
 def test_a_process_that_loses_its_parent_ends() -> None:
-    """An emulator whose parent is another process than it was told stops by itself."""
+    """An emulator whose parent is another process than the given one stops by itself."""
     emulator = EmulatorProcess("cartpole", "--nominal", "--parent", "1")
     emulator.start()
     process = emulator._process

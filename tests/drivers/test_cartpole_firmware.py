@@ -227,7 +227,7 @@ def test_an_image_needs_no_environment(target: str, chip: str, tmp_path: Path) -
     """The target installs no package, and its program runs on a Python without any; fake compilers."""
     if shutil.which("make") is None:
         pytest.skip("no make")
-    said = subprocess.run(
+    printed = subprocess.run(
         # As on a machine that never ran `make setup`.
         ["make", "--no-print-directory", "-n", "-W", "pyproject.toml", f"VENV={tmp_path / 'venv'}", target],
         cwd=ROOT,
@@ -236,10 +236,10 @@ def test_an_image_needs_no_environment(target: str, chip: str, tmp_path: Path) -
         text=True,
         check=True,
     ).stdout
-    assert "pip" not in said and str(tmp_path) not in said
+    assert "pip" not in printed and str(tmp_path) not in printed
     _fake_tools(tmp_path)
     environment = {"PYTHONPATH": ".", "PATH": f"{tmp_path}:/usr/bin:/bin", "XDG_CACHE_HOME": str(tmp_path)}
-    arguments = said.strip().splitlines()[-1].partition("drivers/")[2].split()[:-1]
+    arguments = printed.strip().splitlines()[-1].partition("drivers/")[2].split()[:-1]
     command = [sys.executable, "-S", f"drivers/{arguments[0]}", *arguments[1:], str(tmp_path / "out")]
     done = subprocess.run(
         command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=60

@@ -134,11 +134,11 @@ def test_a_target_by_hand() -> None:
     so 0.84883 A.
     """
     parts = OdriveSettings(metres_per_turn=0.04, torque_constant=0.03, velocity_limit_m_s=8.0)
-    told = drive_command(TARGET, parts)
-    assert told.pos_gain == pytest.approx(10.0)
-    assert told.vel_gain == pytest.approx(2.0372e-3, rel=1e-4)
-    assert told.velocity_limit == pytest.approx(200.0)
-    assert told.current_limit == pytest.approx(0.84883, rel=1e-4)
+    reported = drive_command(TARGET, parts)
+    assert reported.pos_gain == pytest.approx(10.0)
+    assert reported.vel_gain == pytest.approx(2.0372e-3, rel=1e-4)
+    assert reported.velocity_limit == pytest.approx(200.0)
+    assert reported.current_limit == pytest.approx(0.84883, rel=1e-4)
     link = OdriveLink(parts, VirtualClock())
     found = frames(link.encode(TARGET))
     assert [identifier for identifier, _ in found] == [0x1A, 0x1B, 0x0F, 0x0C]
@@ -149,10 +149,10 @@ def test_a_target_by_hand() -> None:
 
 def test_the_gains_are_the_description_s_law() -> None:
     """Torque = vel_gain * (pos_gain * (target - pos) - vel), in newtons, is kp * (x* - x) - kd * v."""
-    told = drive_command(TARGET, PARTS)
+    reported = drive_command(TARGET, PARTS)
     x, v = -0.03, 0.2
     turns, speed = x / PARTS.metres_per_turn, v / PARTS.metres_per_turn
-    torque = told.vel_gain * (told.pos_gain * (0.01 / PARTS.metres_per_turn - turns) - speed)
+    torque = reported.vel_gain * (reported.pos_gain * (0.01 / PARTS.metres_per_turn - turns) - speed)
     assert torque * PARTS.newtons_per_nm == pytest.approx(80 * (0.01 - x) - 8 * v)
 
 
@@ -337,8 +337,12 @@ def test_without_the_watchdogs_numbers_the_operator_is_told() -> None:
     wire = Wire(PARTS)
     robot = wire.armed()
     assert robot.watchdog_s == 0.0
-    said = HOLDS_LAST_COMMAND.format(robot="cartpole", stopped_by=robot.stopped_by) + robot.if_cut
-    assert said.count("the power supply of its drive") == 2 and "remote" not in said and "bridge" not in said
+    printed = HOLDS_LAST_COMMAND.format(robot="cartpole", stopped_by=robot.stopped_by) + robot.if_cut
+    assert (
+        printed.count("the power supply of its drive") == 2
+        and "remote" not in printed
+        and "bridge" not in printed
+    )
     robot.send_command(default_command(robot))
     wire.clock.advance_ns(1000 * MS)
     assert Status.ARMED in wire.newest().status

@@ -75,7 +75,7 @@ def test_the_wire_of_a_port_is_named(what: str, transport: str, says: str, remed
 
 @pytest.mark.parametrize(("what", "transport"), [("adapter", "odrive"), ("servos", "dynamixel")])
 def test_the_right_wire_is_not_doubted(what: str, transport: str) -> None:
-    """Its fault is another one, and was told already."""
+    """Its fault is another one, and was reported already."""
     assert found(what, transport) == []
 
 

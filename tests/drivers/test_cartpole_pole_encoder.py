@@ -109,7 +109,7 @@ class Node(Stm32Chip):
         self.run(10)
 
     def run(self, ticks: int, data: bytes = b"", pole: int = 0, button: bool = False) -> list[CanMessage]:
-        """Run some ticks with counts for each; keep the samples, and return what was said beside them."""
+        """Run some ticks with counts for each; keep the samples, and return what was reported beside them."""
         found: list[CanMessage] = []
         self.raw, self.angles = b"", []
         for _ in range(ticks):

@@ -145,8 +145,8 @@ def test_the_image_starts_under_qemu_and_speaks(tmp_path: Path) -> None:
 @needs_arm
 def test_memory_use_is_the_one_in_the_docs(tmp_path: Path) -> None:
     """What the compiler's size tool says is what the page says, within 2 %."""
-    said = native.write_stm32_image(tmp_path)
-    sizes = [int(text) for text in re.findall(r"(\d+) bytes", said)]
+    printed = native.write_stm32_image(tmp_path)
+    sizes = [int(text) for text in re.findall(r"(\d+) bytes", printed)]
     docs = DOCS + (ROOT / "docs" / "how-to" / "cartpole-odrive.md").read_text(encoding="utf-8")
     documented = re.findall(r"\| STM32F103C8: (?:flash|RAM), fixed \| (\d+) of", docs)
     assert sizes == pytest.approx([int(text) for text in documented], rel=0.02)
@@ -187,7 +187,7 @@ class Board(Stm32Chip):
         pole: int = 0,
         switches: tuple[bool, bool] = (False, False),
     ) -> list[protocol.AnyMessage]:
-        """Run some ticks with counts for each; return what was said beside the states."""
+        """Run some ticks with counts for each; return what was reported beside the states."""
         found: list[protocol.AnyMessage] = []
         self.raw = b""
         for _ in range(ticks):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import signal
 import subprocess
@@ -22,14 +23,16 @@ from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
 from deal_hw.transport import Message, WireOptions
 
-pytestmark = pytest.mark.real_time
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"),
+]
 
-pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 MESSAGES = 300
 
 
 class Running:
-    """A running peer; after the block, what it said."""
+    """A running peer; after the block, what it printed."""
 
     def __init__(self) -> None:
         self.report: dict[str, Any] = {}
@@ -43,22 +46,22 @@ def running(peer: Path, *arguments: object) -> Iterator[Running]:
     process = subprocess.Popen(
         [peer, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    told = Running()
+    reported = Running()
     try:
-        yield told
+        yield reported
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
-        said, told.warnings = process.communicate(timeout=20)
-        told.returncode = process.returncode
-        if said:
-            told.report = json.loads(said)
+        printed, reported.warnings = process.communicate(timeout=20)
+        reported.returncode = process.returncode
+        if printed:
+            reported.report = json.loads(printed)
 
 
 def test_idlc_0102_gives_our_type_hashes(dds_peer: Path) -> None:
     """Types written in IDL and hashed by the robot's version of Cyclone are those we declare in Python."""
-    told = subprocess.run([dds_peer, "hashes"], capture_output=True, text=True, check=True).stdout
-    assert [line.split() for line in told.splitlines()] == [
+    reported = subprocess.run([dds_peer, "hashes"], capture_output=True, text=True, check=True).stdout
+    assert [line.split() for line in reported.splitlines()] == [
         [name, MINIMAL[name], COMPLETE[name]] for name in MINIMAL
     ]
 

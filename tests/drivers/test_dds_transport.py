@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import random
 import re
 import select
@@ -36,9 +37,10 @@ from deal_hw.install import install_line
 from deal_hw.testing.transport_suite import TopicPair, TopicTransportSuite
 from deal_hw.transport import Message, WireOptions
 
-pytestmark = pytest.mark.real_time
-
-pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"),
+]
 
 BYTES = {"rt/lowcmd": 812, "rt/lowstate": 1180, "rt/wirelesscontroller": 22}
 HEADER = bytes([0, 1, 0, 0])
@@ -237,7 +239,7 @@ sys.stdin.read()
 
 
 def test_another_writer_is_named_until_it_is_killed(domain: int) -> None:
-    """Process and host are told; a killed process of this computer does not haunt us for the 10 s of DDS."""
+    """Process and host are named; a killed process of this computer does not haunt us for the 10 s of DDS."""
     with make(domain, subscribe=("rt/lowcmd",)) as wire, child(WRITER, domain) as other:
         patiently(wire, lambda: wire.writers("rt/lowcmd"))
         (writer,) = wire.writers("rt/lowcmd")
@@ -265,7 +267,7 @@ participant = DomainParticipant(domain)
 topic = Topic(participant, "rt/lowcmd", load_types()["unitree_go::msg::dds_::LowCmd_"])
 reader = DataReader(participant, topic, qos=Qos(Policy.Reliability.Reliable(10**8), Policy.History.KeepAll))
 next(iter(reader.take_iter()))
-print("heard", flush=True)
+print("received", flush=True)
 sys.stdin.read()
 """
 
@@ -275,8 +277,8 @@ def test_a_frozen_peer_that_must_confirm_holds_no_send_up(domain: int) -> None:
     message = Message("rt/lowcmd", payload("rt/lowcmd", 1), 0)
     with make(domain, publish=("rt/lowcmd",)) as wire, child(RELIABLE_READER, domain) as frozen:
         assert frozen.stdout is not None
-        heard = frozen.stdout
-        patiently(wire, lambda: select.select([heard], [], [], 0)[0], lambda: wire.send(message))
+        received = frozen.stdout
+        patiently(wire, lambda: select.select([received], [], [], 0)[0], lambda: wire.send(message))
         frozen.send_signal(signal.SIGSTOP)
         for _ in range(10_000):
             wire.send(message)
@@ -331,7 +333,7 @@ def test_messages_of_several_topics_come_in_the_order_of_writing(domain: int) ->
 
 @pytest.mark.parametrize(("code", "error"), [(-10, TransportTimeoutError), (-1, TransportError)])
 def test_what_dds_refuses_is_an_error(domain: int, code: int, error: type[Exception]) -> None:
-    """A full queue is a time-out at once; anything else is told with its code."""
+    """A full queue is a time-out at once; anything else is reported with its code."""
     with make(domain, publish=("rt/lowcmd",)) as wire:
         assert wire._live is not None
         wire._live.write = lambda *_: code

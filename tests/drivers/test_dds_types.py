@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +22,9 @@ from deal_hw.drivers.transports.dds_types import (
 )
 from deal_hw.errors import VersionMismatchError
 
-pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"
+)
 IDL = Path(__file__).resolve().parent / "peer_0102/go2_messages.idl"
 WORDS = {
     "octet": "octet",

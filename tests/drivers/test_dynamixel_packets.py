@@ -234,10 +234,10 @@ def test_addresses_are_those_of_the_sdks_tables(model: int) -> None:
 
 def test_hardware_errors_are_told_with_their_remedies() -> None:
     """Each bit has its words; a bit that nobody knows is shown as it is."""
-    said = registers.explain_hardware_error(0b100101)
-    assert said.split("; ")[0].startswith("input voltage out of its limits (check the supply")
-    assert "overheated" in said
-    assert "overload" in said
+    printed = registers.explain_hardware_error(0b100101)
+    assert printed.split("; ")[0].startswith("input voltage out of its limits (check the supply")
+    assert "overheated" in printed
+    assert "overload" in printed
     assert "unknown bits 0x40" in registers.explain_hardware_error(0x40)
 
 

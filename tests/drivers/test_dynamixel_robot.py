@@ -483,11 +483,11 @@ def test_servos_that_only_answer_a_request_to_all_are_not_called_absent() -> Non
     wire = Wire(lambda inner: Deaf(inner, lambda request: request[4] != 0xFE and request[7] == 1))
     with pytest.raises(TransportTimeoutError) as caught:
         wire.robot.connect()
-    said = str(caught.value)
-    assert "servos 1 and 2 answered a request to all servos, but none of 10 requests" in said
-    assert "(20 without an answer within 3 ms, 0 corrupt)" in said
-    assert "answer_s" in said
-    assert "does not answer" not in said
+    printed = str(caught.value)
+    assert "servos 1 and 2 answered a request to all servos, but none of 10 requests" in printed
+    assert "(20 without an answer within 3 ms, 0 corrupt)" in printed
+    assert "answer_s" in printed
+    assert "does not answer" not in printed
 
 
 def test_two_servos_with_one_id_are_told() -> None:

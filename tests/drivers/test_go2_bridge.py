@@ -114,22 +114,22 @@ def test_an_observer_reads_and_cannot_command(rig: BridgeRig, controller: Bridge
 
 
 def test_a_run_with_an_observers_certificate_is_refused(rig: BridgeRig) -> None:
-    """It waited for a minute for services that never heard it, and blamed sport mode."""
+    """It waited for a minute for services that never received it, and blamed sport mode."""
     clock = MonotonicClock()
     with BridgeClient(rig.port, rig.options("observer")) as observer:
         # The controller of the test before counts as live until its last command is 0.5 s old.
         observer.hear(lambda: bool(observer.status) and observer.status["control"] != "controlled")
-    told = rig.commands()
+    reported = rig.commands()
     with Go2Robot(ZenohTransport(rig.port, clock, rig.options("observer")), clock) as robot:
         with pytest.raises(TransportTimeoutError, match=r"the certificate may only read.*--controllers"):
             robot.home(30.0)
         robot.passive()
-    assert rig.commands() == told
+    assert rig.commands() == reported
 
 
 def test_a_second_controller_and_replays_are_refused(rig: BridgeRig, controller: BridgeClient) -> None:
     """Both are counted, and the first one's commands go on: nothing else moved the robot."""
-    told = rig.commands()
+    reported = rig.commands()
 
     def refused(*kinds: str) -> int:
         return sum(controller.status["refused"].get(kind, 0) for kind in kinds)
@@ -149,37 +149,37 @@ def test_a_second_controller_and_replays_are_refused(rig: BridgeRig, controller:
 
     controller.hear(replay)
     assert controller.in_charge
-    assert rig.commands() == told
+    assert rig.commands() == reported
 
 
 def test_a_silent_controller_is_replaced_by_damping(rig: BridgeRig) -> None:
     """Its link is gone without a word; the stream that comes back has to take the robot over anew."""
     with BridgeClient(rig.port, rig.options("controller")) as client:
         client.take_over()
-        told = rig.commands()
+        reported = rig.commands()
         client.repeat(b"", lambda: client.status["control"] == "damping")
         assert "no admissible command" in client.status["reason"]
-        rig.await_commands([*told, "damping"])
+        rig.await_commands([*reported, "damping"])
         refused = client.status["refused"].get("handover", 0)
         client.repeat(client.pose(), lambda: client.status["refused"].get("handover", 0) > refused + 20)
-        rig.await_commands([*told, "damping"])
+        rig.await_commands([*reported, "damping"])
 
 
 def test_a_killed_bridge_damps_when_it_is_back(rig: BridgeRig) -> None:
     """The robot holds its last command; the next bridge damps it, and the old stream stays out."""
     with BridgeClient(rig.port, rig.options("controller")) as client:
         client.take_over()
-        told = rig.commands()
-        assert told[-1] == "stiff"
+        reported = rig.commands()
+        assert reported[-1] == "stiff"
         rig.kill_bridge()
-        assert rig.commands() == told
+        assert rig.commands() == reported
         client.status = {}
         rig.start_bridge()
         client.hear(lambda: client.status.get("refused", {}).get("handover", 0) > 20)
         assert client.status["control"] == "damping"
-        rig.await_commands([*told, "damping"])
+        rig.await_commands([*reported, "damping"])
         client.take_over()
-        rig.await_commands([*told, "damping", "stiff"])
+        rig.await_commands([*reported, "damping", "stiff"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGALRM])
@@ -187,11 +187,11 @@ def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig, number: signal
     """While a controller holds the robot: each signal that ends or stops the bridge damps the robot first."""
     with BridgeClient(rig.port, rig.options("controller")) as client:
         client.take_over()
-        told = rig.commands()
+        reported = rig.commands()
         os.kill(rig.bridge.pid, number)
-        rig.await_commands([*told, "damping"])
-        _, said = rig.bridge.stop()
-        assert "the bridge ended: " in said and "commands passed" in said
+        rig.await_commands([*reported, "damping"])
+        _, printed = rig.bridge.stop()
+        assert "the bridge ended: " in printed and "commands passed" in printed
     rig.start_bridge()
 
 
@@ -207,11 +207,11 @@ def test_stop_damps_through_the_bridge_and_fights_nobody(
     assert stop("observer").passive and stop("controller").passive
     with BridgeClient(rig.port, rig.options("controller")) as client:
         client.take_over()
-        told = rig.commands()
+        reported = rig.commands()
         for name in ("observer", "controller"):
             found = stop(name)
             assert not found.passive and "another controller commands the robot" in found.words
-        assert client.in_charge and rig.commands() == told
+        assert client.in_charge and rig.commands() == reported
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def frame() -> LowStateFrame:
 
 
 class Bench:
-    """A judge, and controllers that write to it; each message is heard 5 ms after the state it answers."""
+    """A judge, and controllers that write to it; each message is received 5 ms after the state it answers."""
 
     def __init__(self, frame: LowStateFrame, **settings: float) -> None:
         config = BridgeConfig(**{"margin_s": 0.006, **settings})
@@ -175,7 +175,7 @@ def test_a_second_controller_is_refused_and_the_first_goes_on(bench: Bench) -> N
 
 
 def test_why_commands_stayed_away_is_said(bench: Bench) -> None:
-    """The refusals of the stream that had the robot, and not what another one was told."""
+    """The refusals of the stream that had the robot, and not the messages to another one."""
     bench.walk()
     for _ in range(30):
         bench.send(HOLD, stream=2)
@@ -224,7 +224,7 @@ def test_a_replay_is_refused(bench: Bench) -> None:
 
 
 def test_a_restarted_bridge_knows_no_old_stream(bench: Bench) -> None:
-    """Stamps of the session before do not count; nor does a stream that goes on once it heard the new."""
+    """Stamps of the session before do not count; nor does a stream that goes on once it received the new."""
     bench.judge.take_charge("restarted")
     assert bench.send(HOLD, session=SESSION + 1) is None
     assert "before its restart" in bench.why()
@@ -235,13 +235,13 @@ def test_a_restarted_bridge_knows_no_old_stream(bench: Bench) -> None:
 
 
 def test_a_client_without_stamps_is_refused(bench: Bench) -> None:
-    """Neither order nor age of its messages is known; one that has heard no state is told so."""
+    """Neither order nor age of its messages is known; one that has received no state gets that message."""
     payload = ENCODER.encode(DAMPING)
     for attachment in (b"", b"\x01", Stamp(SESSION, bench.now_ns).encode(), b"\x02" * 40):
         assert bench.take(Message(topics.LOW_COMMAND, payload, 0, attachment)) is None
         assert "neither sequence nor age" in bench.why()
     assert bench.send(DAMPING, session=0) is None
-    assert "heard no state" in bench.why()
+    assert "received no state" in bench.why()
     assert bench.judge.refused == {"unstamped": 4, "session": 1}
 
 

@@ -55,32 +55,32 @@ class Bench:
         self.go2 = FakeGo2(mode)
         self.wire = FakeTopics(self.go2, self.clock)
         self.network = Network(self.clock)
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.bridge = Go2Bridge(
-            self.wire, self.network, self.clock, BridgeConfig(leave_s=0.02), tell=self.told.append
+            self.wire, self.network, self.clock, BridgeConfig(leave_s=0.02), tell=self.reported.append
         )
 
     def run(self, milliseconds: int) -> None:
-        """Let the bridge look every 2 ms and pass on what the robot said."""
+        """Let the bridge look every 2 ms and pass on what the robot reported."""
         for _ in range(milliseconds // 2):
             self.bridge.step()
             # More than the robot says in that time.
             for _ in range(4):
                 self.bridge.pass_one(0.0)
 
-    def heard(self, topic: str) -> list[Message]:
-        """Return what clients heard of a topic."""
+    def received(self, topic: str) -> list[Message]:
+        """Return what clients received of a topic."""
         return [message for message in self.network.sent if message.channel == topic]
 
     def status(self) -> str:
-        """Return who controls the robot, as clients are told."""
-        told = read_note(self.heard(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
-        assert told is not None
-        return told["control"]
+        """Return who controls the robot, as the status for clients has it."""
+        reported = read_note(self.received(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
+        assert reported is not None
+        return reported["control"]
 
     def say(self, topic: str, payload: bytes, sequence: int) -> None:
-        """Send as a client does that has heard the newest state."""
-        stamp = read_stamp(self.heard(topics.LOW_STATE)[-1].attachment)
+        """Send as a client does that has received the newest state."""
+        stamp = read_stamp(self.received(topics.LOW_STATE)[-1].attachment)
         assert stamp is not None
         self.network.arriving.append(Message(topic, payload, 0, Echo(7, sequence, stamp).encode()))
 
@@ -93,19 +93,19 @@ def make_bench(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Bench]:
 
 
 def kinds(go2: FakeGo2) -> list[bool]:
-    """Return whether each command that the robot was told is stiff."""
-    return [bool(command.stiffness.any()) for _, command in go2.heard]
+    """Return whether each command to the robot is stiff."""
+    return [bool(command.stiffness.any()) for _, command in go2.received]
 
 
 def test_it_leaves_a_robot_alone_that_sport_mode_has(make_bench: Callable[[str], Bench]) -> None:
     """From its start to its end no motor command goes out; what sport mode commands is passed on."""
     bench = make_bench("normal")
     bench.bridge.open()
-    assert bench.told == ["idle: the robot's own controller 'normal' has it"]
+    assert bench.reported == ["idle: the robot's own controller 'normal' has it"]
     bench.run(500)
     bench.bridge.close()
-    assert bench.go2.heard == []
-    assert bench.heard(topics.LOW_COMMAND)
+    assert bench.go2.received == []
+    assert bench.received(topics.LOW_COMMAND)
 
 
 def test_it_damps_a_robot_that_nobody_has_before_it_listens(make_bench: Callable[[str], Bench]) -> None:
@@ -123,7 +123,7 @@ def test_it_yields_at_its_start_to_another_program(make_bench: Callable[[str], B
     bench = make_bench("")
     bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.05)
     bench.bridge.open()
-    assert bench.told == ["idle: another program on the robot's side commands the motors"]
+    assert bench.reported == ["idle: another program on the robot's side commands the motors"]
     assert kinds(bench.go2) == [True], "the other program's command alone"
 
 
@@ -134,10 +134,10 @@ def test_it_yields_later_too_and_says_so(make_bench: Callable[[str], Bench]) -> 
     bench.run(20)
     bench.wire.say(topics.LOW_COMMAND, STIFF)
     bench.run(20)
-    count = len(bench.go2.heard)
+    count = len(bench.go2.received)
     bench.run(100)
-    assert len(bench.go2.heard) == count
-    assert bench.told[-1] == "idle: another program on the robot's side commands the motors"
+    assert len(bench.go2.received) == count
+    assert bench.reported[-1] == "idle: another program on the robot's side commands the motors"
 
 
 def test_it_takes_charge_again_after_a_stray_command(make_bench: Callable[[str], Bench]) -> None:
@@ -152,9 +152,9 @@ def test_it_takes_charge_again_after_a_stray_command(make_bench: Callable[[str],
     assert kinds(bench.go2)[-1]
     bench.run(520)
     assert bench.status() == "damping"
-    assert bench.told[-1].startswith("damping: nobody has commanded the motors for")
-    assert bench.told[-1].endswith("and no mode is active")
-    count = len(bench.go2.heard)
+    assert bench.reported[-1].startswith("damping: nobody has commanded the motors for")
+    assert bench.reported[-1].endswith("and no mode is active")
+    count = len(bench.go2.received)
     bench.run(100)
     assert kinds(bench.go2)[count:] == [False] * 50
 
@@ -167,9 +167,9 @@ def test_it_stays_idle_while_another_program_commands_slowly(make_bench: Callabl
     for k in range(50):
         bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.2 * k)
     bench.run(10)
-    count = len(bench.go2.heard)
+    count = len(bench.go2.received)
     bench.run(9800)
-    assert len(bench.go2.heard) == count + 49
+    assert len(bench.go2.received) == count + 49
 
 
 def test_it_takes_charge_once_sport_mode_is_released(make_bench: Callable[[str], Bench]) -> None:
@@ -177,10 +177,10 @@ def test_it_takes_charge_once_sport_mode_is_released(make_bench: Callable[[str],
     bench = make_bench("normal")
     bench.bridge.open()
     bench.run(3000)
-    assert bench.go2.heard == []
+    assert bench.go2.received == []
     bench.go2.mode = ""
     bench.run(4900)
-    assert bench.go2.heard == []
+    assert bench.go2.received == []
     bench.run(1100)
     assert bench.bridge.admission.control is Control.DAMPING
     assert kinds(bench.go2)[-1] is False
@@ -214,9 +214,9 @@ def test_it_leaves_a_robot_alone_that_another_program_gave_to_sport_mode(
     bench.run(1600)
     assert bench.bridge.admission.control is Control.IDLE
     bench.go2.mode = "ai"
-    count = len(bench.go2.heard)
+    count = len(bench.go2.received)
     bench.run(5000)
-    assert len(bench.go2.heard) == count
+    assert len(bench.go2.received) == count
 
 
 def test_without_an_answer_it_damps_later(make_bench: Callable[[str], Bench]) -> None:
@@ -230,7 +230,7 @@ def test_without_an_answer_it_damps_later(make_bench: Callable[[str], Bench]) ->
     assert bench.status() == "idle"
     bench.run(40)
     assert bench.status() == "damping"
-    assert bench.told[-1].endswith("and motion_switcher does not answer")
+    assert bench.reported[-1].endswith("and motion_switcher does not answer")
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
@@ -247,22 +247,22 @@ def test_a_robot_that_is_handed_back_keeps_its_damping_until_a_mode_has_it(
     bench.say(topics.request("motion_switcher"), encode_request(Request(9, 1002, '{"name": "ai"}')), 1)
     bench.run(4)
     assert bench.bridge.admission.control is Control.IDLE
-    count = len(bench.go2.heard)
+    count = len(bench.go2.received)
     bench.run(9900)
-    assert len(bench.go2.heard) == count
+    assert len(bench.go2.received) == count
     bench.run(200)
     assert bench.bridge.admission.control is (Control.DAMPING if stubborn else Control.IDLE)
 
 
 def test_a_robot_that_does_not_answer_is_not_damped(make_bench: Callable[[str], Bench]) -> None:
-    """Sport mode may hold it, and then damping would throw it down; the operator is told."""
+    """Sport mode may hold it, and then damping would throw it down; the operator is informed."""
     bench = make_bench("")
     bench.go2.deaf.add("motion_switcher")
     bench.bridge.open()
-    assert bench.go2.heard == []
-    assert "is unknown, so it is not damped yet" in bench.told[0]
+    assert bench.go2.received == []
+    assert "is unknown, so it is not damped yet" in bench.reported[0]
     bench.run(5000)
-    assert bench.go2.heard == []
+    assert bench.go2.received == []
     bench.go2.deaf.clear()
     bench.run(520)
     assert bench.bridge.admission.control is Control.DAMPING
@@ -273,16 +273,16 @@ def test_clients_hear_states_with_stamps_and_who_has_the_robot(make_bench: Calla
     bench = make_bench("")
     bench.bridge.open()
     bench.run(1000)
-    states = bench.heard(topics.LOW_STATE)
+    states = bench.received(topics.LOW_STATE)
     stamps = [read_stamp(message.attachment) for message in states]
     assert [stamp.time_ns for stamp in stamps if stamp] == [message.stamp_ns for message in states]
     assert len({stamp.session for stamp in stamps if stamp}) == 1
-    told = [read_note(message.payload, STATUS_TEXTS) for message in bench.heard(topics.BRIDGE)]
-    assert 5 <= len(told) <= 7
-    before = len(told)
+    reported = [read_note(message.payload, STATUS_TEXTS) for message in bench.received(topics.BRIDGE)]
+    assert 5 <= len(reported) <= 7
+    before = len(reported)
     bench.say(topics.LOW_COMMAND, DAMPING, 0)
     bench.run(4)
-    status = read_note(bench.heard(topics.BRIDGE)[before].payload, STATUS_TEXTS)
+    status = read_note(bench.received(topics.BRIDGE)[before].payload, STATUS_TEXTS)
     assert status == {"control": "controlled", "reason": "a controller took the robot over"}
 
 
@@ -311,7 +311,7 @@ def test_only_the_joints_numbers_pass(make_bench: Callable[[str], Bench]) -> Non
 
 
 def test_requests_and_claims_pass_and_rubbish_does_not(make_bench: Callable[[str], Bench]) -> None:
-    """A claim is heard on both sides; other text on its topic is dropped."""
+    """A claim is received on both sides; other text on its topic is dropped."""
     bench = make_bench("")
     bench.bridge.open()
     bench.run(20)
@@ -323,7 +323,7 @@ def test_requests_and_claims_pass_and_rubbish_does_not(make_bench: Callable[[str
     bench.wire.say(topics.CLAIM, claim)
     bench.run(20)
     assert [request.identity for _, request in bench.go2.requests[asked:]] == [5]
-    assert [message.payload for message in bench.heard(topics.response("sport"))] != []
+    assert [message.payload for message in bench.received(topics.response("sport"))] != []
     assert bench.bridge.counts[topics.CLAIM] == 2
 
 
@@ -334,7 +334,7 @@ def test_a_network_that_takes_nothing_is_counted(make_bench: Callable[[str], Ben
     bench.network.broken = True
     bench.run(20)
     assert bench.bridge.unsent > 5
-    assert len(bench.go2.heard) >= 10
+    assert len(bench.go2.received) >= 10
 
 
 def test_it_damps_when_it_ends_and_when_its_thread_fails(make_bench: Callable[[str], Bench]) -> None:
@@ -347,11 +347,11 @@ def test_it_damps_when_it_ends_and_when_its_thread_fails(make_bench: Callable[[s
     bench.bridge._failure = TransportLostError("the cable is out")
     with pytest.raises(TransportLostError):
         bench.bridge.step()
-    count = len(bench.go2.heard)
+    count = len(bench.go2.received)
     bench.bridge.close()
-    assert len(bench.go2.heard) >= count + 10
+    assert len(bench.go2.received) >= count + 10
     assert not bench.network.is_open
-    last = read_note(bench.heard(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
+    last = read_note(bench.received(topics.BRIDGE)[-1].payload, STATUS_TEXTS)
     assert last == {"control": "damping", "reason": "the bridge ends"}
 
 

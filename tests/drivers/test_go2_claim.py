@@ -30,12 +30,12 @@ class Bus:
     """Carries each message to every open end but the sender's.
 
     Attributes:
-        said: All claims so far, in order: identity and state.
+        sent_claims: All claims so far, in order: identity and state.
     """
 
     def __init__(self) -> None:
         self.ends: list[End] = []
-        self.said: list[tuple[str, str]] = []
+        self.sent_claims: list[tuple[str, str]] = []
 
     def end(self) -> End:
         """Return a new end, not open."""
@@ -86,7 +86,7 @@ class End(TopicTransport):
         if self.cut:
             return
         if (claim := read_note(message.payload, CLAIM_TEXTS)) is not None:
-            self._bus.said.append((claim["id"], claim["state"]))
+            self._bus.sent_claims.append((claim["id"], claim["state"]))
         for end in list(self._bus.ends):
             if end is not self:
                 end._arrived.put(message)
@@ -128,7 +128,7 @@ def test_a_claim_is_asked_for_then_held_then_released(bus: Bus, make: Callable[.
     claim.acquire()
     claim.release()
     claim.release()
-    states = [state for _, state in bus.said]
+    states = [state for _, state in bus.sent_claims]
     assert list(dict.fromkeys(states)) == [ASKING, HELD, RELEASED]
     assert states.count(RELEASED) == 1
 
@@ -139,8 +139,8 @@ def test_a_second_run_is_refused_at_once_and_told_by_whom(bus: Bus, make: Callab
     for other in ("a", "c"):
         with pytest.raises(PortBusyError, match="run b commands it, or is about to"):
             make(other).acquire()
-        assert [i for i, _ in bus.said].count(other) == 1, "it did not ask twice"
-    assert bus.said[-1] == ("b", HELD)
+        assert [i for i, _ in bus.sent_claims].count(other) == 1, "it did not ask twice"
+    assert bus.sent_claims[-1] == ("b", HELD)
 
 
 def test_of_two_that_ask_at_the_same_time_one_wins(bus: Bus, make: Callable[..., WireClaim]) -> None:
@@ -217,7 +217,7 @@ def test_a_wire_that_cannot_be_opened_leaves_nothing_open(bus: Bus) -> None:
 
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_claim_or_none(payload: bytes) -> None:
-    """Nothing that is heard raises."""
+    """Nothing that is received raises."""
     assert read_note(payload, CLAIM_TEXTS) is None or isinstance(read_note(payload, CLAIM_TEXTS), dict)
 
 

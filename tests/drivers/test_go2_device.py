@@ -197,7 +197,7 @@ def test_a_command_acts_after_the_hidden_latency(make_go2: Any) -> None:
 
 
 def test_hidden_gains_decide_the_effort(make_go2: Any) -> None:
-    """Half the stiffness gives 0.5 * 10 * 0.2 = 1.0 N·m at 0.2 rad; feed-forward acts as told."""
+    """Half the stiffness gives 0.5 * 10 * 0.2 = 1.0 N·m at 0.2 rad; feed-forward acts as commanded."""
     bench = make_go2(truth=nominal_truth(stiffness=(0.5,) * 12), on_stand=True)
     q = bench.device.true_position
     state = bench.run(1, servo(q + 0.2, 10.0, 0.0))[0]

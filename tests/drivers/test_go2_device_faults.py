@@ -54,7 +54,7 @@ def test_freeze_says_nothing_and_still_hears(make_go2: Any) -> None:
 
 
 def test_a_cut_is_silent_both_ways_and_ends(make_go2: Any) -> None:
-    """For 0.3 s nothing goes out or is heard, and the motors hold their last command; then all is well."""
+    """For 0.3 s nothing goes out or is received, and the motors hold their last command; then all is well."""
     bench = faulty(make_go2, "cut", cut_s=0.3)
     assert bench.out == []
     bench.run(150, DAMP)

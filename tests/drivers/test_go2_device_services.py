@@ -185,7 +185,7 @@ def test_sport_mode_fights_until_it_is_released(make_go2: Any) -> None:
 
 
 def test_sport_modes_commands_are_seen_on_the_wire(make_go2: Any) -> None:
-    """While it is active its commands come over rt/lowcmd at 500 Hz, valid ones; told to hide, none."""
+    """While it is active its commands come over rt/lowcmd at 500 Hz, valid ones; if it hides, none."""
     bench = make_go2(sport="normal", start="standing")
     bench.run(100)
     assert bench.count(topics.LOW_COMMAND) == 50

@@ -32,8 +32,8 @@ Tamper = Callable[[str, bytes], Iterable[bytes]]
 class Air:
     """A Go2 and what others do to its messages: tampering, and messages of their own by device time [ms]."""
 
-    def __init__(self, device: Go2Device, tamper: Tamper, said: dict[int, tuple[str, bytes]]) -> None:
-        self.device, self._tamper, self._said = device, tamper, said
+    def __init__(self, device: Go2Device, tamper: Tamper, printed: dict[int, tuple[str, bytes]]) -> None:
+        self.device, self._tamper, self._said = device, tamper, printed
 
     @property
     def device_ns(self) -> int:
@@ -60,15 +60,15 @@ class Wire(VirtualTopics):
 def examine(
     *,
     tamper: Tamper = lambda topic, payload: (payload,),
-    said: dict[int, tuple[str, bytes]] | None = None,
+    printed: dict[int, tuple[str, bytes]] | None = None,
     others: tuple[str, ...] = (),
     state_check: StateCheck = "strict",
     **options: Any,
 ) -> list[Finding]:
-    """Return the findings on an emulated Go2, without sport mode, with a remote, unless told otherwise."""
+    """Return the findings on an emulated Go2, without sport mode, with a remote, by default."""
     clock = VirtualClock()
     device = Go2Device(nominal_truth(), **{"sport": "", "remote": (), **options})
-    wire = Wire(Air(device, tamper, said or {}), clock)
+    wire = Wire(Air(device, tamper, printed or {}), clock)
     wire.known = others
     return list(Go2Doctor(wire, clock, 1.0, state_check).run())
 
@@ -102,8 +102,10 @@ def test_it_sends_no_motor_command() -> None:
 def test_sport_modes_own_commands_are_told_from_a_strangers() -> None:
     """While a mode is active, commands are probably its own; without one, somebody else sends them."""
     assert only(examine(sport="ai"), "commands", "sport mode 'ai'").severity is Severity.NOTE
-    said = {100 * k: (topics.LOW_COMMAND, b"whatever") for k in range(1, 6)}
-    stranger = only(examine(said=said, others=("process walk",)), "commands", "5 messages (process walk)")
+    printed = {100 * k: (topics.LOW_COMMAND, b"whatever") for k in range(1, 6)}
+    stranger = only(
+        examine(printed=printed, others=("process walk",)), "commands", "5 messages (process walk)"
+    )
     assert (stranger.severity, stranger.do) == (Severity.FAIL, "stop that program")
 
 
@@ -113,7 +115,7 @@ def test_commands_of_a_robot_that_does_not_say_its_mode_are_nobodys() -> None:
         sport="ai",
         tamper=lambda topic, payload: () if topic == topics.response(topics.SERVICES[0]) else (payload,),
     )
-    found = only(findings, "commands", "did not say whether its sport mode")
+    found = only(findings, "commands", "did not report whether its sport mode")
     assert found.severity is Severity.WARN and "controller" in found.do
 
 
@@ -246,8 +248,8 @@ def test_a_transport_without_topics_is_refused() -> None:
 def test_other_answers_are_passed_over() -> None:
     """An answer to somebody else's request, or garbage, is not taken for ours."""
     answers = topics.response("motion_switcher")
-    said = {k: (answers, b"garbage" if k % 2 else bytes(60)) for k in range(2000)}
-    assert only(examine(said=said), "services", "low level is free")
+    printed = {k: (answers, b"garbage" if k % 2 else bytes(60)) for k in range(2000)}
+    assert only(examine(printed=printed), "services", "low level is free")
 
 
 def test_faults_of_the_emulator_reach_the_doctor() -> None:
@@ -289,7 +291,7 @@ def test_a_simulator_is_recognised_and_its_option_named() -> None:
 
 
 def test_a_simulator_that_is_named_is_well() -> None:
-    """Services and battery that it lacks are no findings, and what is not checked is said once."""
+    """Services and battery that it lacks are no findings, and what is not checked is reported once."""
     findings = simulated("unitree_mujoco")
     assert {f.severity for f in findings} == {Severity.OK, Severity.NOTE}
     assert only(findings, "states", "states a second").seen.startswith("500 ")

@@ -66,7 +66,7 @@ def state(**changes: object) -> LowState:
 
 
 def with_bytes(payload: bytes, at: int, new: bytes, *, sign: bool = True) -> bytes:
-    """Return the payload with other bytes somewhere, its checksum right again unless told otherwise."""
+    """Return the payload with other bytes somewhere, its checksum right again by default."""
     changed = bytearray(payload)
     changed[at : at + len(new)] = new
     if sign:
@@ -115,7 +115,7 @@ def test_checksum_of_known_words() -> None:
 
 @pytest.mark.parametrize("size", [0, 3, 808, 811, 813, 1180])
 def test_a_command_of_another_length_is_refused(size: int) -> None:
-    """The message names both lengths; a body alone is told from other lengths."""
+    """The message names both lengths; a body alone is distinguished from other lengths."""
     with pytest.raises(FrameError, match=f"{size} bytes, expected 812") as caught:
         decode_low_command((COMMAND + bytes(400))[:size])
     assert ("header is missing" in str(caught.value)) == (size == 808)

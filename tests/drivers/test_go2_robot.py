@@ -70,7 +70,7 @@ def test_connecting_sends_nothing_and_learns_of_battery_and_firmware() -> None:
     assert wire.robot.info is not None
     assert (wire.robot.info.battery, wire.robot.info.voltage) == (0.77, 30.5)
     assert (wire.robot.info.serial, wire.robot.info.version) == ((1, 2), (3, 4))
-    assert wire.device.heard == [] and wire.device.requests == []
+    assert wire.device.received == [] and wire.device.requests == []
     assert wire.robot.fileno() == -1
 
 
@@ -104,7 +104,7 @@ def test_a_standing_clock_is_no_robot() -> None:
 
 
 def test_two_robots_on_one_network_are_refused() -> None:
-    """Half of what comes is old news of the other; who they are is told where discovery knows."""
+    """Half of what comes is old news of the other; who they are is reported where discovery knows."""
     wire = FakeBench()
     wire.topics.others = {topics.LOW_STATE: ("robot one", "robot two")}
     other = FakeGo2()
@@ -236,7 +236,7 @@ def test_a_state_with_nan_passes() -> None:
     wire.device.pose[4] = np.nan
     assert np.isnan(drained(wire.robot, 2)[-1].position[4])
     wire.robot.arm(1.0)
-    assert all(np.isfinite(command.position).all() for _, command in wire.device.heard)
+    assert all(np.isfinite(command.position).all() for _, command in wire.device.received)
 
 
 def ruled_otherwise(payload: bytes) -> list[bytes]:
@@ -258,7 +258,7 @@ def test_head_and_checksum_can_be_left_alone() -> None:
     robot.home(5.0)
     robot.arm(1.0)
     assert robot.read_state(0.1).position.shape == (12,)
-    assert robot.transport_errors == 0 and len(wire.device.heard) == 1
+    assert robot.transport_errors == 0 and len(wire.device.received) == 1
 
 
 @pytest.mark.parametrize(
@@ -300,7 +300,7 @@ def test_arming_damps_and_says_so() -> None:
     """The first thing that the motors hear is damping at the measured pose."""
     wire = FakeBench(mode="")
     robot = wire.armed()
-    _, command = wire.device.heard[0]
+    _, command = wire.device.received[0]
     assert not command.stiffness.any() and (command.damping == 5.0).all() and (command.mode == 1).all()
     np.testing.assert_allclose(command.position, RESTING, atol=1e-6)
     assert robot.last_sequence == -1
@@ -325,7 +325,7 @@ def test_nothing_is_sent_before_arming() -> None:
     with pytest.raises(SafetyError, match="arm"):
         wire.robot.send_command(default_command(wire.robot))
     wire.robot.read_state(0.1)
-    assert wire.device.heard == []
+    assert wire.device.received == []
 
 
 def test_a_command_reaches_the_motors_as_it_was() -> None:
@@ -344,7 +344,7 @@ def test_a_command_reaches_the_motors_as_it_was() -> None:
     )
     sent = robot.send_command(wish)
     robot.read_state(0.1)
-    _, heard = wire.device.heard[-1]
+    _, received = wire.device.received[-1]
     for ours, theirs in (
         ("position_target", "position"),
         ("velocity_target", "velocity"),
@@ -352,25 +352,25 @@ def test_a_command_reaches_the_motors_as_it_was() -> None:
         ("damping", "damping"),
         ("effort", "effort"),
     ):
-        np.testing.assert_array_equal(getattr(sent, ours), getattr(heard, theirs), ours)
+        np.testing.assert_array_equal(getattr(sent, ours), getattr(received, theirs), ours)
         np.testing.assert_allclose(getattr(sent, ours), getattr(wish, ours), rtol=1e-7)
     assert sent.effort_limit.tolist() == list(DRIVER.effort_limit)
     assert np.isinf(sent.speed_limit).all()
 
 
 def test_repeats_are_the_same_bytes_and_no_new_command() -> None:
-    """500 times a second the drives hear what they heard before; number and age go by the first."""
+    """500 times a second the drives hear what they received before; number and age go by the first."""
     wire = FakeBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot, target=0.5))
     drained(robot, 5)
-    before = len(wire.device.heard)
+    before = len(wire.device.received)
     for _ in range(3):
         robot.repeat()
         state = robot.read_state(0.1)
-    assert len(wire.device.heard) == before + 3
+    assert len(wire.device.received) == before + 3
     np.testing.assert_array_equal(
-        wire.device.heard[-1][1].position, wire.device.heard[before - 1][1].position
+        wire.device.received[-1][1].position, wire.device.received[before - 1][1].position
     )
     assert state.command_sequence == robot.last_sequence == 0
     assert state.command_age_ns >= 14 * MS
@@ -424,7 +424,7 @@ def test_passive_is_damping_sent_three_times() -> None:
     robot.send_command(default_command(robot))
     robot.passive()
     robot.read_state(0.1)
-    for _, command in wire.device.heard[-3:]:
+    for _, command in wire.device.received[-3:]:
         assert not command.stiffness.any() and not command.effort.any() and not command.velocity.any()
         assert (command.damping == 5.0).all()
     sent = robot.send_command(default_command(robot))
@@ -471,7 +471,7 @@ def status(control: str, reason: str = "no admissible command") -> bytes:
 
 
 def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:
-    """What it said before the arming, or just after it, is from before; its own hand-over is none."""
+    """What it reported before the arming, or just after it, is from before; its own hand-over is none."""
     wire = FakeBench(mode="")
     robot = wire.armed()
     wire.topics.say(topics.BRIDGE, status("damping"), 0.05)
@@ -485,7 +485,7 @@ def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:
 
 
 def test_a_robot_that_another_controls_through_the_bridge_is_not_taken_over() -> None:
-    """It is said before sport mode is asked for anything; one that only listens does not mind."""
+    """It is reported before sport mode is asked for anything; one that only listens does not mind."""
     wire = FakeBench()
     wire.robot.connect()
     wire.topics.say(topics.BRIDGE, status("controlled"), 0.001)
@@ -494,7 +494,7 @@ def test_a_robot_that_another_controls_through_the_bridge_is_not_taken_over() ->
     with pytest.raises(SafetyError, match="another controller commands the robot through the bridge"):
         wire.robot.home(10.0)
     assert wire.device.mode == "normal"
-    assert wire.device.heard == []
+    assert wire.device.received == []
 
 
 def test_another_process_can_make_it_passive() -> None:
@@ -520,8 +520,8 @@ def test_the_robot_on_a_stand_is_another_description() -> None:
 
 def test_a_lost_connection_speaks_of_no_watchdog() -> None:
     """The Go2 has none: it holds its last command, and only somebody beside it can stop it."""
-    said = FakeBench(mode="").robot.if_cut
-    assert "watchdog" not in said and "still holds its last command" in said and "remote" in said
+    printed = FakeBench(mode="").robot.if_cut
+    assert "watchdog" not in printed and "still holds its last command" in printed and "remote" in printed
 
 
 def test_recorded_bytes_can_be_decoded_again() -> None:

@@ -295,4 +295,4 @@ def test_a_robot_that_is_lifted_while_sport_mode_lets_go_is_refused() -> None:
     wire.device.serve = lift  # type: ignore[method-assign]
     with pytest.raises(SafetyError, match="holds the robot in the air"):
         wire.robot.home(10.0)
-    assert wire.device.mode == "" and wire.device.heard == []
+    assert wire.device.mode == "" and wire.device.received == []

@@ -35,7 +35,7 @@ def test_a_lying_robot_is_released_without_being_laid_down() -> None:
     wire.robot.connect()
     wire.robot.home(10.0)
     assert apis(wire) == [("motion_switcher", 1001), ("motion_switcher", 1003), ("motion_switcher", 1001)]
-    assert wire.device.mode == "" and wire.device.heard == []
+    assert wire.device.mode == "" and wire.device.received == []
     assert Status.HOMED in wire.robot.read_state(1.0).status
 
 
@@ -56,7 +56,7 @@ def test_a_robot_that_stays_standing_is_not_released() -> None:
         wire.robot.home(10.0)
     assert ("motion_switcher", 1003) not in apis(wire) and wire.device.mode == "normal"
     assert make_passive(wire.robot, wire.clock)
-    assert wire.device.heard == []
+    assert wire.device.received == []
 
 
 def test_a_robot_that_is_slower_than_real_time_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,12 +137,12 @@ def test_the_mode_that_was_released_gets_the_robot_back() -> None:
     with pytest.raises(SafetyError, match="passive"):
         robot.hand_back(5.0)
     robot.passive()
-    heard = len(wire.device.heard)
+    received = len(wire.device.received)
     robot.hand_back(5.0)
     assert wire.device.mode == "mcf"
     assert json.loads(wire.device.requests[-2][1].parameter) == {"name": "mcf"}
     robot.repeat()
-    assert len(wire.device.heard) == heard
+    assert len(wire.device.received) == received
     with pytest.raises(SafetyError, match="home"):
         robot.arm(1.0)
 
@@ -179,7 +179,7 @@ def test_a_robot_without_any_service_is_a_timeout_with_advice() -> None:
 
 
 @pytest.mark.parametrize(
-    ("heard", "words"),
+    ("received", "words"),
     [
         ("00000000000000bb", "the certificate may only read"),
         # Where the bridge hears us, or is too old to say whom it hears, the services are what is missing.
@@ -188,20 +188,20 @@ def test_a_robot_without_any_service_is_a_timeout_with_advice() -> None:
     ],
 )
 def test_a_bridge_that_does_not_hear_us_is_told_from_a_robot_without_services(
-    heard: str | None, words: str
+    received: str | None, words: str
 ) -> None:
     """With a certificate that may only read, Zenoh drops requests and tells nobody."""
     wire = FakeBench()
     wire.device.deaf, wire.topics.our_stream = set(topics.SERVICES), 0xAA
     wire.robot.connect()
-    told = {"control": "idle", "reason": "nobody", **({} if heard is None else {"heard": heard})}
+    reported = {"control": "idle", "reason": "nobody", **({} if received is None else {"heard": received})}
     for i in range(100):
-        wire.topics.say(topics.BRIDGE, encode_note(told), 0.2 * i)
+        wire.topics.say(topics.BRIDGE, encode_note(reported), 0.2 * i)
     began_ns = wire.clock.now_ns()
     with pytest.raises(TransportTimeoutError, match=words):
         wire.robot.home(30.0)
     assert (wire.clock.now_ns() - began_ns < 2_000_000_000) == ("read" in words)
-    assert wire.device.heard == []
+    assert wire.device.received == []
 
 
 def test_a_short_silence_of_the_switcher_is_no_older_firmware() -> None:
@@ -215,7 +215,7 @@ def test_a_short_silence_of_the_switcher_is_no_older_firmware() -> None:
 
 
 def test_refusals_are_put_into_words() -> None:
-    """An error code is told with what to do; a busy switcher is asked again."""
+    """An error code is reported with what to do; a busy switcher is asked again."""
     wire = FakeBench()
     wire.device.codes = {("motion_switcher", 1001): [7002, 0], ("motion_switcher", 1003): [7008]}
     wire.robot.connect()
@@ -365,9 +365,9 @@ def test_a_robot_is_free_if_nobody_commands_it(mode: str, deaf: bool, words: str
     if words:
         with pytest.raises(SafetyError, match=words):
             bench.robot.require_free(2.0)
-        assert bench.device.heard == []
+        assert bench.device.received == []
         return
     bench.robot.require_free(2.0)
     bench.robot.passive()
-    (_, command), *_ = bench.device.heard
+    (_, command), *_ = bench.device.received
     assert not command.stiffness.any() and command.damping.all()

@@ -345,7 +345,7 @@ def test_a_pause_of_the_physics_trips_within_the_limit_of_a_states_age() -> None
 
 
 def test_a_robot_in_the_air_is_not_stood_up() -> None:
-    """Floor and stand are told apart as on the robot."""
+    """Floor and stand are distinguished as on the robot."""
     rig = Rig(held=True)
     floor = UnitreeMujocoRobot(rig.wire, rig.clock)
     floor.connect()
@@ -395,11 +395,11 @@ def test_passive_is_damping_with_every_state_until_the_joints_are_slow() -> None
     """The robot sinks, and only a slow one counts as passive; what it holds then is next to nothing."""
     rig = Rig()
     robot = standing(rig)
-    heard = rig.device.commands
+    received = rig.device.commands
     begun_ns = rig.clock.now_ns()
     assert make_passive(robot, rig.clock)
     states = (rig.clock.now_ns() - begun_ns) // 2_000_000
-    assert rig.device.commands - heard >= states
+    assert rig.device.commands - received >= states
     command = rig.device.command
     assert command is not None and not command.stiffness.any()
     np.testing.assert_array_equal(command.damping, DRIVER.passive_damping)

@@ -81,7 +81,7 @@ def test_a_dry_run_reads_states_and_sends_not_one_message(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["cartpole", "go2"])
 def test_nobody_else_can_send_over_that_path_either(name: str) -> None:
-    """A loop that was not told, and a supervisor's passive command: refused before the wire."""
+    """A loop without that option, and a supervisor's passive command: refused before the wire."""
     robot = Counting(name)
     assert robot.run(dry_run=False) is Outcome.FAILED
     robot.robot.connect()

@@ -165,7 +165,7 @@ def test_others_get_no_session_and_are_told_why(
 
 @pytest.mark.usefixtures("impatient")
 def test_plain_text_finds_no_session_where_tls_listens(files: dict[str, WireOptions], endpoint: str) -> None:
-    """Who forgets TLS is told that the protocol may be the reason."""
+    """Who forgets TLS gets a message that the protocol may be the reason."""
     with ZenohTransport(endpoint, options=listening(files["robot"])):
         with pytest.raises(PortNotFoundError, match="uses the other protocol of tls/ and tcp/"):
             ZenohTransport(endpoint.replace("tls", "tcp")).open()

@@ -104,13 +104,13 @@ def wait_for_arrival(receiver: ZenohTransport, data: bytes) -> None:
 def test_a_client_hears_a_second_controller_and_a_peer_does_not(endpoint: str) -> None:
     """Commands of one controller reach the other through the robot's side where both are clients."""
     with opened(ZenohTransport(endpoint, options=LISTEN), STATE, COMMAND) as robot:
-        for mode, heard in (("client", True), ("peer", False)):
+        for mode, received in (("client", True), ("peer", False)):
             first, second = (ZenohTransport(endpoint, options=WireOptions(mode=mode)) for _ in range(2))
             with opened(first, STATE, COMMAND), opened(second, COMMAND, STATE):
                 meet(TopicPair(near=robot, far=second, down=STATE, up=COMMAND, payload=payload))
                 for _ in range(20):
                     second.send(Message(COMMAND, payload(COMMAND, 1), 0))
-                if heard:
+                if received:
                     assert first.receive(5.0).channel == COMMAND
                 else:
                     with pytest.raises(TransportTimeoutError):
@@ -161,7 +161,7 @@ def test_a_lost_link_is_opened_again_as_soon_as_the_end_point_answers(endpoint: 
 
 
 def test_a_link_that_is_silent_is_made_anew_when_asked(endpoint: str) -> None:
-    """Zenoh tells nothing of some dead links; one that was heard a moment ago is left alone."""
+    """Zenoh tells nothing of some dead links; one that was received a moment ago is left alone."""
     clock = VirtualClock(1)
     far = ZenohTransport(endpoint, MonotonicClock(), LISTEN)
     near = ZenohTransport(endpoint, clock)

@@ -279,8 +279,12 @@ def test_an_error_is_one_bounded_line(
 
     add_verb(fail)
     assert cli.main(["probe"]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("deal-hw: error: a b ?[31mxxx") and told.count("\n") == 1 and len(told) < 2100
+    reported = capsys.readouterr().err
+    assert (
+        reported.startswith("deal-hw: error: a b ?[31mxxx")
+        and reported.count("\n") == 1
+        and len(reported) < 2100
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -24,17 +24,17 @@ def lacks(document: Any) -> set[str]:
         return set().union(*map(lacks, document["calls"]))
     machine = document.get("machine") or {}
     commit = machine.get("git_commit") or ""
-    said = {
+    printed = {
         "command": bool(document.get("argv")),
         "commit": bool(commit),
         "clean tree": not commit.endswith("-dirty"),
         "machine": {"platform", "processors", "load"} <= set(machine),
         "versions": bool(machine.get("versions")),
     }
-    return {name for name, there in said.items() if not there}
+    return {name for name, there in printed.items() if not there}
 
 
-def told() -> dict[str, set[str]]:
+def reported() -> dict[str, set[str]]:
     """Return the facts that files lack, by the page."""
     table = PAGE.partition("| older file | lacks |")[2].partition("\n\n")[0]
     rows = [line.split("|") for line in table.splitlines()[2:]]
@@ -44,13 +44,13 @@ def told() -> dict[str, set[str]]:
 @pytest.mark.parametrize("path", sorted(MEASURED.glob("*.json")), ids=lambda path: str(path.name))
 def test_a_file_of_rows_says_where_it_comes_from(path: Path) -> None:
     """The page lists the missing facts of older files; a new file has all."""
-    assert lacks(json.loads(path.read_text(encoding="utf-8"))) == told().get(path.name, set())
+    assert lacks(json.loads(path.read_text(encoding="utf-8"))) == reported().get(path.name, set())
 
 
 def test_only_files_that_exist_are_excused() -> None:
     """The list of older files names no file that is gone, and excuses a changed tree alone."""
-    assert {name for name in told() if not (MEASURED / name).is_file()} == set()
-    assert set().union(*told().values()) == {"clean tree"}
+    assert {name for name in reported() if not (MEASURED / name).is_file()} == set()
+    assert set().union(*reported().values()) == {"clean tree"}
 
 
 @pytest.mark.parametrize("path", sorted(MEASURED.glob("*.json")), ids=lambda path: str(path.name))

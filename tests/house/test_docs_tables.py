@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import re
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import get_args
 import pytest
 
 from deal_hw.cli.main import JOBS
-from deal_hw.control.safety.machine import SafetyFlags
+from deal_hw.control.safety.machine import SAFETY_FLAGS
 from deal_hw.data.recording.record import CycleFlag
 from deal_hw.data.recording.schemas import CHANNELS, STANDARD
 from deal_hw.policy import Quantity
@@ -66,7 +65,7 @@ def test_each_safety_flag_is_described() -> None:
     """The tables of docs/explanation/safety.md have a row for each flag, and none for others."""
     page = (ROOT / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \|", page[page.index("## What trips") :], flags=re.M)
-    assert sorted(rows) == sorted(flag.name for flag in dataclasses.fields(SafetyFlags))
+    assert sorted(rows) == sorted(SAFETY_FLAGS)
 
 
 def test_readme_shows_each_job() -> None:
@@ -114,7 +113,7 @@ def test_the_paper_is_mapped_line_by_line() -> None:
     named = set(re.findall(r"`([\w./]+)`", algorithm + equations))
     files = {name for name in named if name.endswith((".py", "/"))}
     assert {
-        name for name in files if not ((ROOT / name).exists() or (ROOT / "calib" / "search" / name).exists())
+        name for name in files if not ((ROOT / name).exists() or (ROOT / "calib" / "paper" / name).exists())
     } == set()
     words = {part for name in named - files for part in name.split(".")}
     assert {word for word in words if not re.search(rf"\b{re.escape(word)}\b", SOURCES)} == set()

@@ -18,8 +18,8 @@ TOOL = ROOT / "tools" / "fuzz_files.py"
 
 def listed() -> list[str]:
     """Return the names of all kinds."""
-    said = subprocess.run([sys.executable, TOOL, "--list"], capture_output=True, text=True, check=True)
-    return said.stdout.split()
+    printed = subprocess.run([sys.executable, TOOL, "--list"], capture_output=True, text=True, check=True)
+    return printed.stdout.split()
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ VOCABULARY = (
     "reading",
     "schema",
     "install",
+    "on_use",
     "documentation",
     "ranges",
     "child_process",
@@ -53,9 +54,9 @@ ROOMS = {
     ),
     "calib": (
         {"data"},
-        {"search", "fit"},
-        {"validation"},
-        {"design", "baselines"},
+        {"paper", "fit"},
+        {"search", "baselines", "validation"},
+        {"design"},
         {"pipeline", "report"},
     ),
     "drivers.cartpole": (
@@ -73,7 +74,7 @@ ROOMS = {
         {"robot"},
         {"unitree_mujoco"},
     ),
-    "data": ({"files"}, {"recording", "run_folder"}, {"importing"}, {"checks", "export"}),
+    "data": ({"files", "table"}, {"checks"}, {"recording", "run_folder"}, {"importing"}, {"export"}),
     "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings", "robots"}),
 }
 """Rooms of a package, the lowest first: a room may import rooms of the sets before its own, and itself."""

@@ -186,7 +186,7 @@ def test_tests_are_no_package() -> None:
 
 
 def test_test_files_have_unique_names() -> None:
-    """Two test files of one name cannot be told apart in a report."""
+    """Two test files of one name cannot be distinguished in a report."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert sorted(set(names)) == sorted(names)
 
@@ -277,8 +277,8 @@ def test_the_wheel_calibrates_a_robot_in_a_clean_environment(wheel: Path, tmp_pa
     assert done.returncode == 0, done.stdout + done.stderr
     assert [path.name for path in (tmp_path / "found").rglob("calibrated.xml")]
     line = "import deal_hw; print(deal_hw.__file__)"
-    told = run([where / "bin" / "python", "-c", line]).stdout.strip()
-    assert Path(told).is_relative_to(site)
+    reported = run([where / "bin" / "python", "-c", line]).stdout.strip()
+    assert Path(reported).is_relative_to(site)
 
 
 def test_versions_agree() -> None:

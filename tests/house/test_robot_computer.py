@@ -170,8 +170,8 @@ def test_collect_runs_without_extras(tmp_path: Path, port: str) -> None:
     # A busy machine may trip the safety module; what is looked for here is a missing package.
     assert done.returncode in {FINISHED, TRIPPED}, done.stderr
     assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
-    told = run_bare(tmp_path, "data", "info", "run/dataset")
-    assert told.returncode == 0, told.stderr
+    reported = run_bare(tmp_path, "data", "info", "run/dataset")
+    assert reported.returncode == 0, reported.stderr
 
 
 def test_the_base_install_records_checks_and_converts(tmp_path: Path, port: str) -> None:
@@ -182,11 +182,11 @@ def test_the_base_install_records_checks_and_converts(tmp_path: Path, port: str)
     assert done.returncode in {FINISHED, TRIPPED}, done.stderr
     assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
     for verb in ("info", "verify"):
-        told = run("data", verb, "run/dataset")
-        assert told.returncode == 0, told.stdout + told.stderr
+        reported = run("data", verb, "run/dataset")
+        assert reported.returncode == 0, reported.stdout + reported.stderr
     _, (recording, *_), _ = write(make_robot("pendulum", seed=0), tmp_path / "robot", seconds=3.0)
-    told = run("data", "import", str(recording), "--out", "imported")
-    assert told.returncode == 0, told.stdout + told.stderr
+    reported = run("data", "import", str(recording), "--out", "imported")
+    assert reported.returncode == 0, reported.stdout + reported.stderr
     assert "fit1" in run("data", "info", "imported").stdout
     examined = run("doctor", "cartpole", "--port", port, "--seconds", "0.5")
     assert "states a second" in examined.stdout, examined.stdout + examined.stderr
@@ -243,12 +243,12 @@ def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, por
         timeout=120,
         check=True,
     )
-    told = json.loads(done.stdout)
+    reported = json.loads(done.stdout)
     networks = {"zenoh", "cyclonedds"}
     heavy = set(EXTRAS) - networks
-    assert not set(told["made"]) & (heavy | networks)
-    assert not set(told["opened"]) & heavy
-    assert set(told["opened"]) & networks == {own}
+    assert not set(reported["made"]) & (heavy | networks)
+    assert not set(reported["opened"]) & heavy
+    assert set(reported["opened"]) & networks == {own}
 
 
 def test_go2_runs_without_extras(tmp_path: Path) -> None:
@@ -261,12 +261,12 @@ def test_go2_runs_without_extras(tmp_path: Path) -> None:
             tmp_path, "collect", *reach, "--motion", "hold", "--seconds", "0.4", "--out", "run", *posture
         )
         assert done.returncode in {FINISHED, TRIPPED}, done.stderr
-        told = run_bare(tmp_path, "doctor", *reach, "--seconds", "1")
-    assert "refused" not in done.stderr + told.stdout + told.stderr
+        reported = run_bare(tmp_path, "doctor", *reach, "--seconds", "1")
+    assert "refused" not in done.stderr + reported.stdout + reported.stderr
     assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
-    assert told.returncode in {0, 1}, told.stderr
-    assert "Traceback" not in told.stderr
-    assert "the body leans by" in told.stdout
+    assert reported.returncode in {0, 1}, reported.stderr
+    assert "Traceback" not in reported.stderr
+    assert "the body leans by" in reported.stdout
 
 
 def test_dds_without_its_package_names_the_extra(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ import pytest
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.algorithm1 import DealPaper, PaperSettings
-from deal_hw.calib.search.resume import digest
-from deal_hw.calib.search.rollouts import control_ticks, rollout_population
+from deal_hw.calib.data.resume import digest
+from deal_hw.calib.paper.algorithm1 import DealPaper, PaperSettings
+from deal_hw.calib.paper.rollouts import control_ticks, rollout_population
 from deal_hw.calibration import Budget
 from deal_hw.errors import PolicyMismatchError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -198,8 +198,8 @@ def test_the_wish_is_observed() -> None:
     policy = Leap(walk_spec(GO2))
     position, velocity = resting(1)
     Demonstration(policy, GO2, WALK)(position[0], velocity[0], 0.0)
-    told = [term.quantity for term in policy.spec.observation].index("command")
-    assert policy.seen[0][0, told] == pytest.approx(0.4)
+    reported = [term.quantity for term in policy.spec.observation].index("command")
+    assert policy.seen[0][0, reported] == pytest.approx(0.4)
 
 
 def test_actions_are_clipped_and_limited() -> None:
@@ -217,7 +217,7 @@ def test_a_policy_for_another_robot_is_refused() -> None:
 
 
 def test_a_checkpoint_tells_policies_and_wishes_apart(tmp_path: Path) -> None:
-    """The digest of a search with pi_0 in the loop depends on the policy and on what it is told."""
+    """The digest of a search with pi_0 in the loop depends on the policy and on its commands."""
     ant = PopulationDemonstration(demonstration_policy("ant"), robot_description("ant"))
     made = [
         PopulationDemonstration(demonstration_policy("go2"), GO2, wanted)

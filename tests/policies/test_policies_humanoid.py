@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.drivers.humanoid.description import GEAR_NM
-from deal_hw.drivers.humanoid.model import joint_type
 from deal_hw.errors import ConfigurationError, PolicyError
 from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask, stride_spec
 from deal_hw.policies.onnx_export import export_network
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policies.ppo import PpoConfig, PpoTrainer
 from deal_hw.policies.vector_env import Mirror
 from deal_hw.policy import ObservationTerm
 from deal_hw.robots import robot_description
+from deal_hw.robots.humanoid.description import GEAR_NM
+from deal_hw.robots.humanoid.model import joint_type
 from deal_hw.types import FloatArray
 from deal_hw.workflows.train import nominal_distribution
 
@@ -144,6 +143,8 @@ def test_springs_pull_each_joint_to_the_upright_pose() -> None:
 
 def test_the_trained_network_contains_the_springs(tmp_path: Path) -> None:
     """One update: network and file are the same, and of a joint far off they still see the spring."""
+    from deal_hw.policies.ppo import PpoConfig, PpoTrainer
+
     env = make(4)
     config = PpoConfig(steps=1, hidden=(16,), rollout=4, batches=1, epochs=1)
     policy = PpoTrainer().train(env, config, np.random.default_rng(0))
@@ -162,6 +163,8 @@ def test_springs_of_single_precision_may_round(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounding: float, refused: bool
 ) -> None:
     """Sums of the springs reach some tens: their last places are above the tolerance of actions near 1."""
+    from deal_hw.policies.ppo import PpoConfig, PpoTrainer
+
     env = make(2)
     config = PpoConfig(steps=1, hidden=(16,), rollout=4, batches=1, epochs=1)
     policy = PpoTrainer().train(env, config, np.random.default_rng(0))
@@ -173,11 +176,13 @@ def test_springs_of_single_precision_may_round(
 
 def test_it_learns_from_reflections(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each batch is followed by its reflection."""
+    import rsl_rl.extensions.symmetry as rsl
+
+    from deal_hw.policies.ppo import PpoConfig, PpoTrainer
+
     env = make(2)
     sizes: list[int] = []
     config = PpoConfig(steps=1, hidden=(16,), rollout=4, batches=1, epochs=1)
-    import rsl_rl.extensions.symmetry as rsl
-
     real = rsl.Symmetry.augment_batch
 
     def augment(self: object, batch: object, count: int) -> None:

@@ -124,7 +124,7 @@ def test_go2_reward_by_hand() -> None:
     env.command[1:, 0] = 0.4
     position, velocity = state(3, 12)
     position[:, 2], position[:, 6:] = 0.27, GO2.default_position
-    # Stands as told, 2 cm low: 1.5 + 0.8 + 0.3 - 20 * 0.02^2 = 2.592.
+    # Stands as commanded, 2 cm low: 1.5 + 0.8 + 0.3 - 20 * 0.02^2 = 2.592.
     position[0, 2] = 0.25
     # Heads along the world's y axis at 0.2 m/s, 0.2 too slow, and yaws at 0.5 rad/s; one action changed by 1:
     # 1.5 exp(-0.04 / 0.2) + 0.8 exp(-0.25 / 0.2) + 0.3 - 0.03.
@@ -142,7 +142,7 @@ def test_go2_reward_by_hand() -> None:
 
 
 def test_go2_feet_are_paid_for_following_the_clock() -> None:
-    """Over a whole step, who stands earns all of it if told to stand; if told to walk, not the half sine.
+    """Over a whole step, standing earns all of it at a command to stand; at one to walk, not the half sine.
 
     Its mean over a step is (2 / pi) / 2, so 1 - 0.318 is left.
     """
@@ -192,7 +192,7 @@ def test_go2_ends_when_it_tilts_or_sinks() -> None:
 
 
 def test_go2_commands_are_drawn_and_observed() -> None:
-    """A tenth stands, a quarter of the others' parts is zero, all are in range, and the policy is told."""
+    """A tenth stands, a quarter of the others' parts is zero, all are in range, and the policy sees them."""
     env = make("go2", 400)
     assert isinstance(env, Go2Env)
     observation, _ = env.reset(seed=0)
@@ -202,8 +202,8 @@ def test_go2_commands_are_drawn_and_observed() -> None:
     assert 0.2 <= (command[~still] == 0).mean() <= 0.3
     low, high = np.array(env.task.command_range).T
     assert (command >= low).all() and (command <= high).all()
-    told = [k for k, term in enumerate(env.layout.observation) if term.quantity == "command"]
-    np.testing.assert_allclose(observation[:, told], command, rtol=1e-6)
+    reported = [k for k, term in enumerate(env.layout.observation) if term.quantity == "command"]
+    np.testing.assert_allclose(observation[:, reported], command, rtol=1e-6)
 
 
 def test_go2_targets_are_those_of_the_filter_that_deploys(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,7 +243,7 @@ def test_go2_targets_are_those_of_the_filter_that_deploys(monkeypatch: pytest.Mo
 
 
 def test_go2_sees_what_it_asked_for_and_not_what_was_sent() -> None:
-    """As when deployed, where the policy is not told what the filter made of its action."""
+    """As when deployed, where the policy does not see what the filter made of its action."""
     env = make("go2", 1, push_ticks=NEVER)
     env.reset(seed=0)
     observation = env.step(np.ones((1, 12)))[0]

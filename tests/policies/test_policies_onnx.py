@@ -6,11 +6,11 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnx
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -21,12 +21,17 @@ from deal_hw.policies.onnx_export import export_network, write_policy
 from deal_hw.policies.onnx_runtime import SPEC_KEY, OnnxPolicy
 from deal_hw.policy import ObservationTerm, PolicySpec
 
+if TYPE_CHECKING:
+    import torch
+
 SPEC = dataclasses.replace(
     balance_spec(DESCRIPTION, BalanceTask(), "0123456789abcdef"), training={"algorithm": "none"}
 )
 
 
 def network(inputs: int = len(SPEC.observation), outputs: int = 1, seed: int = 0) -> torch.nn.Sequential:
+    import torch
+
     torch.manual_seed(seed)
     layers = [torch.nn.Linear(inputs, 16), torch.nn.ReLU(), torch.nn.Linear(16, outputs), torch.nn.Tanh()]
     return torch.nn.Sequential(*layers)
@@ -42,6 +47,8 @@ def file(tmp_path: Path) -> Path:
 
 def test_file_computes_what_the_network_computes(file: Path) -> None:
     """One observation at a time or many at once, the file agrees with torch to 1e-5."""
+    import torch
+
     observations = np.random.default_rng(0).standard_normal((50, len(SPEC.observation))).astype(np.float32)
     with torch.no_grad():
         wanted = network()(torch.as_tensor(observations)).numpy()
@@ -53,6 +60,8 @@ def test_file_computes_what_the_network_computes(file: Path) -> None:
 
 def test_a_tiny_network_by_hand(tmp_path: Path) -> None:
     """tanh(2 * relu(3 * 0.1 - 0.2) + 0.5) = tanh(0.7), from the file."""
+    import torch
+
     first, last = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
     for layer, weight, bias in ((first, 3.0, -0.2), (last, 2.0, 0.5)):
         torch.nn.init.constant_(layer.weight, weight)
@@ -180,6 +189,8 @@ def test_an_observation_of_another_length_is_refused(file: Path) -> None:
 
 def test_an_unknown_layer_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
     """The message names the layer and the known ones; nothing that could be deployed is left."""
+    import torch
+
     with pytest.raises(
         PolicyError,
         match="cannot export a layer of type GELU; known inside Sequential: Linear, Hardtanh, ELU",

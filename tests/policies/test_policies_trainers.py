@@ -11,22 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from rsl_rl.algorithms import PPO
-from stable_baselines3 import SAC
-from stable_baselines3.common.env_util import make_vec_env
-from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import CheckpointError, ConfigurationError, TrainingDivergedError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.cartpole_env import BalanceTask, CartPoleEnv, balance_spec
 from deal_hw.policies.evaluate import evaluate_batch
-from deal_hw.policies.network_policy import NetworkPolicy
 from deal_hw.policies.onnx_export import export_network
-from deal_hw.policies.ppo import PpoConfig, PpoTrainer
-from deal_hw.policies.sac import SacConfig, SacTrainer
-from deal_hw.policies.sb3_model import model_path, read_start, restore_optimisers
 from deal_hw.policies.servo_loop import EXACT_SENSOR
 from deal_hw.policies.single_env import SingleEnv
 from deal_hw.policies.trainers import TRAINERS, make_trainer
@@ -42,6 +33,8 @@ TASK = BalanceTask(ticks=100, host_delay_s=(0.0, 0.0))
 
 def upright_seconds(policy: Policy) -> float:
     """Return how long a policy holds the pole of the toy upright, of 5 s, in the mean over six starts."""
+    from deal_hw.policies.network_policy import NetworkPolicy
+
     assert isinstance(policy, NetworkPolicy)
     start = np.zeros((6, 2))
     start[:, 1] = np.linspace(-0.05, 0.05, 6)
@@ -61,6 +54,8 @@ def upright_seconds(policy: Policy) -> float:
 
 
 def export(policy: Policy, path: Path) -> Policy:
+    from deal_hw.policies.network_policy import NetworkPolicy
+
     assert isinstance(policy, NetworkPolicy)
     return export_network(policy.network, policy.spec, path)
 
@@ -82,6 +77,8 @@ def toy_case(trainer: Any, members: int, config: Any, short_config: Any) -> Trai
 
 def sac_case() -> TrainerCase:
     """Return SAC and the toy."""
+    from deal_hw.policies.sac import SacConfig, SacTrainer
+
     return toy_case(
         SacTrainer(),
         16,
@@ -92,6 +89,8 @@ def sac_case() -> TrainerCase:
 
 def ppo_case() -> TrainerCase:
     """Return PPO and the toy."""
+    from deal_hw.policies.ppo import PpoConfig, PpoTrainer
+
     settings: dict[str, Any] = {
         "hidden": (32, 32),
         "rollout": 16,
@@ -129,6 +128,8 @@ def test_a_request_to_stop_is_heard_within_an_update(make: Callable[[], TrainerC
 
     Eight steps are in the middle of the first updates of SAC (three optimisers) and of PPO (20 an update).
     """
+    from torch.optim.optimizer import register_optimizer_step_pre_hook
+
     case, file, steps = make(), tmp_path / "checkpoint.safetensors", 0
 
     def count(*_: object) -> None:
@@ -152,9 +153,6 @@ def test_a_request_to_stop_is_heard_within_an_update(make: Callable[[], TrainerC
     assert resumed
 
 
-SHORT = SacConfig(steps=800, hidden=(32, 32), warmup=500)
-
-
 def toy() -> CartPoleEnv:
     """Return the toy with four members."""
     return CartPoleEnv(DESCRIPTION, TOY, 4, task=TASK, sensor=EXACT_SENSOR)
@@ -164,17 +162,25 @@ def toy() -> CartPoleEnv:
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train shortly with SAC; return the checkpoint."""
     file = tmp_path_factory.mktemp("kept") / "policy.safetensors"
-    SacTrainer().train(toy(), SHORT, np.random.default_rng(0), files=TrainingFiles(checkpoint=file))
+    make_trainer("sac").train(
+        toy(), sac_case().short_config, np.random.default_rng(0), files=TrainingFiles(checkpoint=file)
+    )
     return file
 
 
 @pytest.mark.slow
 def test_stable_baselines3_goes_on_with_the_model_that_is_kept(kept: Path, tmp_path: Path) -> None:
     """The zip opens in SAC.load on a registered task's spaces, trains there, and is a start of ours again."""
+    import torch
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from deal_hw.policies.sb3_model import model_path, read_start
+
     path = model_path(kept)
     vector = make_vec_env(lambda: SingleEnv(CartPoleEnv(DESCRIPTION, TOY, 1, task=TASK)), n_envs=2)
     model = SAC.load(path, env=vector, device="cpu")
-    assert model.num_timesteps == SHORT.steps
+    assert model.num_timesteps == sac_case().short_config.steps
     before = [value.clone() for value in model.policy.actor.parameters()]
     model.learn(40, reset_num_timesteps=False)
     model.learning_starts = 0
@@ -186,12 +192,17 @@ def test_stable_baselines3_goes_on_with_the_model_that_is_kept(kept: Path, tmp_p
     for name, value in model.policy.state_dict().items():
         assert torch.equal(start.tensors[f"policy.{name}"], value)
     files = TrainingFiles(start=tmp_path / "theirs.zip", stop=lambda: True)
-    policy = SacTrainer().train(toy(), SHORT, np.random.default_rng(1), files=files)
+    policy = make_trainer("sac").train(toy(), sac_case().short_config, np.random.default_rng(1), files=files)
     assert policy.spec.training["algorithm"] == "sac"
 
 
 def test_a_resumed_training_takes_up_the_optimisers_memory(kept: Path, tmp_path: Path) -> None:
     """Where checkpoint and model are of one moment; a model of another moment is left alone."""
+    import torch
+    from stable_baselines3 import SAC
+
+    from deal_hw.policies.sb3_model import model_path, restore_optimisers
+
     model = SAC.load(model_path(kept), device="cpu")
     fresh = SAC.load(model_path(kept), device="cpu")
     for optimiser in (fresh.actor.optimizer, fresh.critic.optimizer, fresh.ent_coef_optimizer):
@@ -210,15 +221,19 @@ def test_only_the_same_unfinished_training_is_resumed(kept: Path) -> None:
     """A complete one would lose its averaged weights; of another distribution it would claim all steps."""
     rng, files = np.random.default_rng(0), TrainingFiles(checkpoint=kept, resume=True)
     with pytest.raises(CheckpointError, match="has done 800 of 800 steps: nothing is left to resume"):
-        SacTrainer().train(toy(), SHORT, rng, files=files)
+        make_trainer("sac").train(toy(), sac_case().short_config, rng, files=files)
     other = dataclasses.replace(TOY, latency_s=(0.0, 0.001))
     env = CartPoleEnv(DESCRIPTION, other, 4, task=TASK, sensor=EXACT_SENSOR)
     with pytest.raises(CheckpointError, match=r"trained under another distribution .* with --start"):
-        SacTrainer().train(env, dataclasses.replace(SHORT, steps=900), rng, files=files)
+        make_trainer("sac").train(
+            env, dataclasses.replace(sac_case().short_config, steps=900), rng, files=files
+        )
 
 
 def test_models_that_are_none_are_refused(tmp_path: Path) -> None:
     """A file that is no archive, and one that has pickles alone: nothing of it is executed."""
+    from deal_hw.policies.sb3_model import read_start
+
     marker = tmp_path / "executed"
 
     class Evil:
@@ -239,6 +254,11 @@ def test_a_training_that_diverges_is_stopped_and_keeps_its_checkpoint(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """From the third update on the critic is NaN: the error names steps and checkpoint, which is sound."""
+    import torch
+    from rsl_rl.algorithms import PPO
+
+    from deal_hw.policies.ppo import PpoConfig, PpoTrainer
+
     file = tmp_path / "checkpoint.safetensors"
     config = PpoConfig(steps=10_000, hidden=(8,), checkpoint_updates=1)
     make = toy_case(PpoTrainer(), 16, config, config).make_env
@@ -290,20 +310,19 @@ def test_every_task_has_settings_for_every_trainer(robot: str, name: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ("config", "settings", "message"),
+    ("name", "settings", "message"),
     [
-        (PpoConfig, {"steps": 0}, "steps must be positive, got 0"),
-        (PpoConfig, {"trace": 0.0}, r"trace must lie in \(0, 1\], got 0.0"),
-        (PpoConfig, {"hidden": ()}, "hidden must name at least one layer"),
-        (SacConfig, {"steps": 0}, "steps must be positive, got 0"),
-        (SacConfig, {"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
-        (SacConfig, {"hidden": ()}, "hidden must name at least one layer"),
-        (SacConfig, {"steps": 100, "warmup": 100}, r"100 steps: give more than the 100 steps of warmup"),
+        ("ppo", {"steps": 0}, "steps must be positive, got 0"),
+        ("ppo", {"trace": 0.0}, r"trace must lie in \(0, 1\], got 0.0"),
+        ("ppo", {"hidden": ()}, "hidden must name at least one layer"),
+        ("sac", {"steps": 0}, "steps must be positive, got 0"),
+        ("sac", {"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
+        ("sac", {"hidden": ()}, "hidden must name at least one layer"),
+        ("sac", {"steps": 100, "warmup": 100}, r"100 steps: give more than the 100 steps of warmup"),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(
-    config: type[PpoConfig | SacConfig], settings: dict[str, Any], message: str
-) -> None:
+def test_settings_that_mean_nothing_are_refused(name: str, settings: dict[str, Any], message: str) -> None:
     """The message names the setting, what was given and what is allowed."""
+    _, known = training_task("cartpole").trainer_and_config(name, 200_000)
     with pytest.raises(ConfigurationError, match=message):
-        config(**settings)
+        type(known)(**settings)

@@ -185,7 +185,7 @@ def test_gravity_tells_a_gain_and_its_sign(tmp_path: Path) -> None:
 
 
 def test_an_actuator_that_drives_no_joint_is_named_as_such(tmp_path: Path) -> None:
-    """A tendon's motor was told to name its target, which it had."""
+    """The message about a tendon's motor asked for a target, which it had."""
     path = tmp_path / "arm.xml"
     tendon = '<tendon><fixed name="belt"><joint joint="lift" coef="1"/></fixed></tendon>'
     motor = '<motor name="winch" tendon="belt"/></actuator>'

@@ -10,7 +10,7 @@ import pytest
 from deal_hw.sim.recordings.gravity_gain import GravityGain, gravity_gain
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration import checks
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 
 
@@ -19,7 +19,7 @@ def test_the_truth_lies_within_four_standard_errors(seed: int, tmp_path: Path) -
     """An arm of three joints, 6 s of motion: both loaded joints, and the vertical one says nothing."""
     robot = make_robot("arm", seed)
     model, paths, _ = write(robot, tmp_path, seconds=6.0)
-    work = prepare(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
+    work = calibration_input(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
     found = gravity_gain(work.robot, list(work.episodes))
     assert found is not None
     truth = np.array([robot.truth[f"{joint}.servo_stiffness"] for joint in ("shoulder", "elbow")])
@@ -31,16 +31,16 @@ def test_the_truth_lies_within_four_standard_errors(seed: int, tmp_path: Path) -
 def test_a_gain_that_chance_explains_is_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same gain, far outside the search range: with a small error a warning, with a large one none."""
     model, paths, _ = write(make_robot("pendulum", 0), tmp_path, seconds=3.0)
-    work = prepare(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
+    work = calibration_input(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
     for error, warned in ((0.1, True), (0.6, False)):
         found = GravityGain(*(np.array([v]) for v in (0.5, error, 0.6, 0.1, 0.03)))
         monkeypatch.setattr("deal_hw.sim.recordings.gravity_gain.gravity_gain", lambda *_, f=found: f)
-        said: list[str] = []
-        checks.warn_of_gravity(work.robot, work.space, list(work.episodes), said.append)
-        assert bool(said) is warned
+        printed: list[str] = []
+        checks.warn_of_gravity(work.robot, work.space, list(work.episodes), printed.append)
+        assert bool(printed) is warned
     found = GravityGain(*(np.array([v]) for v in (0.5, 0.1, 0.6, 0.1, 0.03)))
     monkeypatch.setattr("deal_hw.sim.recordings.gravity_gain.gravity_gain", lambda *_: found)
     work.robot.model.dof_frictionloss[:] = 0.2
-    said = []
-    checks.warn_of_gravity(work.robot, work.space, list(work.episodes), said.append)
-    assert not said, "dry friction of 0.2 N·m holds 0.1 N·m"
+    printed = []
+    checks.warn_of_gravity(work.robot, work.space, list(work.episodes), printed.append)
+    assert not printed, "dry friction of 0.2 N·m holds 0.1 N·m"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import mujoco
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,7 @@ from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
 from deal_hw.sim.parameters.template import left_at_zero, template
-from deal_hw.sim.parameters.yaml_space import parse_space, read_space, write_space
+from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
 MODEL = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
 
@@ -221,6 +222,29 @@ def _parameters(draw: st.DrawFn, number: int) -> Parameter:
         prior_mean=nominal if prior else None,
         prior_std=draw(st.floats(1e-3, 10)) if prior else None,
     )
+
+
+def write_space(space: ParameterSpace) -> str:
+    """Return YAML text that :func:`parse_space` reads back to the same space."""
+    # ASCII only: with allow_unicode PyYAML writes a next-line character unquoted and reads it as a space.
+    return yaml.safe_dump({"parameters": [_as_entry(p) for p in space.parameters]}, sort_keys=False)
+
+
+def _as_entry(p: Parameter) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "kind": p.kind,
+        "elements": list(p.elements),
+        "group": "together",
+        "name": p.name,
+        "nominal": float(p.nominal),
+        "range": [float(p.low), float(p.high)],
+        "scale": p.scale,
+    }
+    if p.known:
+        entry["known"] = True
+    if p.prior_mean is not None and p.prior_std is not None:
+        entry["prior"] = {"mean": float(p.prior_mean), "std": float(p.prior_std)}
+    return entry
 
 
 @settings(max_examples=60, deadline=None)

@@ -150,7 +150,7 @@ def test_nothing_is_sensed_where_nothing_floats(recording: Trajectory, robot: Ro
 
 
 def test_without_a_body_there_are_no_predictions(recording: Trajectory, truth: FloatArray) -> None:
-    """The reason is said; a robot that hangs needs none."""
+    """The reason is reported; a robot that hangs needs none."""
     bare = dataclasses.replace(recording, body=None)
     with pytest.raises(InsufficientDataError, match="lacks the floating base"):
         compute_overlay(bare, DRIVER, SPACE, {"true": truth})

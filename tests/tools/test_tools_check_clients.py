@@ -46,12 +46,12 @@ def test_a_can_interface_becomes_an_adapter() -> None:
     """`can0` of ODrive's examples: bus.send is a line to the adapter, and its lines are what is received."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    heard = bytearray()
+    received = bytearray()
 
     def adapter() -> None:
         # Until the frame came, then one of our own.
-        while b"t0078" not in heard:
-            heard.extend(os.read(master, 100))
+        while b"t0078" not in received:
+            received.extend(os.read(master, 100))
         os.write(master, b"t0018AABBCCDD00000000\r")
 
     thread = threading.Thread(target=adapter)
@@ -67,7 +67,7 @@ def test_a_can_interface_becomes_an_adapter() -> None:
     os.close(master)
     os.close(slave)
     assert out.startswith("0x1 aabbccdd00000000 True")
-    assert b"S6\r" in heard
+    assert b"S6\r" in received
 
 
 def test_keys_are_pressed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

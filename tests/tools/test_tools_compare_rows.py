@@ -37,8 +37,8 @@ class Files:
             path.write_text(json.dumps({"format": "deal_hw.bench/1", "rows": rows}), encoding="utf-8")
             paths.append(str(path))
         code = compare_rows.main([*paths, *options])
-        said = self._capsys.readouterr()
-        return code, said.out + said.err
+        printed = self._capsys.readouterr()
+        return code, printed.out + printed.err
 
 
 @pytest.fixture
@@ -49,14 +49,14 @@ def files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Files:
 
 def test_same_rows_are_no_loss(files: Files) -> None:
     """A file beside itself: every ratio is 1."""
-    code, said = files([row(0), row(1)], [row(0), row(1)])
+    code, printed = files([row(0), row(1)], [row(0), row(1)])
     assert code == 0
-    line = said.splitlines()[1]
+    line = printed.splitlines()[1]
     assert line.split() == [
         "fixed-range", "cartpole", "sensor", "ratio", "5", "default", "2",
         "1", "1", "1.00", "0.01", "0.01", "1.00", "0.900/0.900", "0/0", "10.0/10.0",
     ]  # fmt: skip
-    assert said.splitlines()[-1] == "1 cells, 0 worse"
+    assert printed.splitlines()[-1] == "1 cells, 0 worse"
 
 
 @pytest.mark.parametrize(
@@ -72,33 +72,33 @@ def test_same_rows_are_no_loss(files: Files) -> None:
 def test_median_error(files: Files, errors: tuple[float, ...], loss: str) -> None:
     """The median over seeds may grow by a tenth."""
     old = [row(0, 1.0), row(1, 2.0), row(2, 5.0)]
-    code, said = files(old, [row(seed, error) for seed, error in enumerate(errors)])
+    code, printed = files(old, [row(seed, error) for seed, error in enumerate(errors)])
     assert code == bool(loss)
-    assert loss in said
+    assert loss in printed
 
 
 def test_errors_at_numerical_zero_are_equal(files: Files) -> None:
     """A hundred times an error of 1e-6 % is below the floor of 1e-3 %."""
     assert files([row(error=1e-6, heldout=1e-9)], [row(error=1e-4, heldout=1e-6)])[0] == 0
-    code, said = files([row(error=1e-6)], [row(error=1e-4)], "--error-floor", "1e-5")
+    code, printed = files([row(error=1e-6)], [row(error=1e-4)], "--error-floor", "1e-5")
     assert code == 1
-    assert "seed 0: error_percent 1e-06 -> 0.0001" in said
+    assert "seed 0: error_percent 1e-06 -> 0.0001" in printed
 
 
 def test_heldout_error(files: Files) -> None:
     """The held-out error may grow by a fiftieth: 0.01 to 0.0102."""
     assert files([row()], [row(heldout=0.0102)])[0] == 0
-    code, said = files([row()], [row(heldout=0.0103)])
+    code, printed = files([row()], [row(heldout=0.0103)])
     assert code == 1
-    assert "median heldout_nrmse_calibrated 0.01 -> 0.0103, more than 1.02 times" in said
+    assert "median heldout_nrmse_calibrated 0.01 -> 0.0103, more than 1.02 times" in printed
     assert files([row()], [row(heldout=0.0103)], "--heldout-limit", "1.05")[0] == 0
 
 
 def test_bad_seed_is_named(files: Files) -> None:
     """A median hides one bad seed; it is named and not judged."""
-    code, said = files([row(s) for s in range(3)], [row(0), row(1), row(2, error=19.6)])
+    code, printed = files([row(s) for s in range(3)], [row(0), row(1), row(2, error=19.6)])
     assert code == 0
-    assert "seed 2: error_percent 1 -> 19.6" in said
+    assert "seed 2: error_percent 1 -> 19.6" in printed
 
 
 @pytest.mark.parametrize(
@@ -116,10 +116,10 @@ def test_bad_seed_is_named(files: Files) -> None:
 )
 def test_coverage(files: Files, old: float, new: float, other: Row, losses: list[str]) -> None:
     """Not below the old one; where the model is right and intervals are claimed, not below 0.85."""
-    code, said = files([row(coverage=old, **other)], [row(coverage=new, **other)])
+    code, printed = files([row(coverage=old, **other)], [row(coverage=new, **other)])
     assert code == bool(losses)
-    assert said.count("worse: ") == len(losses)
-    assert all(loss in said for loss in losses)
+    assert printed.count("worse: ") == len(losses)
+    assert all(loss in printed for loss in losses)
 
 
 def test_coverage_that_is_enough(files: Files) -> None:
@@ -139,10 +139,10 @@ def test_a_whole_methods_refinement_does_not_matter(files: Files) -> None:
 
 def test_search_with_and_without_refinement_are_two_cells(files: Files) -> None:
     """The refined search is not compared with the bare one."""
-    code, said = files([row(method="eki")], [row(method="eki", refined=False)])
+    code, printed = files([row(method="eki")], [row(method="eki", refined=False)])
     assert code == 1
-    assert "missing in NEW" in said
-    assert "only in new.json: fixed-range cartpole sensor ratio 5 eki\n" in said
+    assert "missing in NEW" in printed
+    assert "only in new.json: fixed-range cartpole sensor ratio 5 eki\n" in printed
 
 
 def test_map_compares_methods_by_hand(files: Files) -> None:
@@ -154,16 +154,16 @@ def test_map_compares_methods_by_hand(files: Files) -> None:
 
 def test_what_is_missing_is_a_loss(files: Files) -> None:
     """A cell, a seed, a figure, or a seed with an error; an old error and a new cell are none."""
-    _, said = files([row(), row(range_ratio=20.0)], [row()])
-    assert "missing in NEW" in said
-    code, said = files([row(0), row(1), row(2)], [row(0), row(1) | {"error": "CalibrationError: no"}])
+    _, printed = files([row(), row(range_ratio=20.0)], [row()])
+    assert "missing in NEW" in printed
+    code, printed = files([row(0), row(1), row(2)], [row(0), row(1) | {"error": "CalibrationError: no"}])
     assert code == 1
-    assert "seed 2 is missing in NEW" in said
-    assert "seed 1: CalibrationError: no" in said
-    code, said = files([row()], [row(coverage90=None)])
-    assert (code, "coverage90 is missing in NEW for seed 0" in said) == (1, True)
-    code, said = files([row(0), row(1) | {"error": "refused"}], [row(0), row(1), row(range_ratio=20.0)])
-    assert (code, "seed 1 had an error in OLD" in said) == (0, True)
+    assert "seed 2 is missing in NEW" in printed
+    assert "seed 1: CalibrationError: no" in printed
+    code, printed = files([row()], [row(coverage90=None)])
+    assert (code, "coverage90 is missing in NEW for seed 0" in printed) == (1, True)
+    code, printed = files([row(0), row(1) | {"error": "refused"}], [row(0), row(1), row(range_ratio=20.0)])
+    assert (code, "seed 1 had an error in OLD" in printed) == (0, True)
 
 
 def test_real_recordings_are_judged_in_radians_too(files: Files) -> None:
@@ -175,10 +175,10 @@ def test_real_recordings_are_judged_in_radians_too(files: Files) -> None:
         "heldout_pooled_calibrated": 0.006,
     }  # fmt: skip
     other = real | {"split": "b"}
-    code, said = files([real, other], [real, other | {"heldout_pooled_calibrated": 0.007}])
+    code, printed = files([real, other], [real, other | {"heldout_pooled_calibrated": 0.007}])
     assert code == 1
-    assert said.count("worse: ") == 1
-    assert "real so101 real b ratio 5 default\n  worse: median heldout_pooled_calibrated" in said
+    assert printed.count("worse: ") == 1
+    assert "real so101 real b ratio 5 default\n  worse: median heldout_pooled_calibrated" in printed
 
 
 def test_seconds_are_judged_where_asked(files: Files) -> None:
@@ -199,9 +199,9 @@ def test_seconds_are_judged_where_asked(files: Files) -> None:
 )
 def test_what_cannot_be_compared(files: Files, rows: list[Any], options: list[str], message: str) -> None:
     """One line and exit code 2."""
-    code, said = files([row()], rows, *options)
+    code, printed = files([row()], rows, *options)
     assert code == 2
-    assert message in said
+    assert message in printed
 
 
 def test_file_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -65,11 +65,11 @@ def test_as_logged_keeps_angle_and_power(tmp_path: Path) -> None:
     """The importer unwraps the log's angle, and the map says what a power of 1 is."""
     path = log(tmp_path, [1210] * 60)
     assert convert_cartpole.main([str(path), "--out", str(tmp_path), "--as-logged", "--rotor", "0"]) == 0
-    said: list[str] = []
+    printed: list[str] = []
     (table,) = load_tables(
-        tmp_path / "Experiment-0.npz", read_column_map(tmp_path / "columns.yaml"), say=said.append
+        tmp_path / "Experiment-0.npz", read_column_map(tmp_path / "columns.yaml"), say=printed.append
     )
-    assert any("the angle of pole jumps by a full turn 3 times" in text for text in said)
+    assert any("the angle of pole jumps by a full turn 3 times" in text for text in printed)
     np.testing.assert_allclose(np.diff(table.position[:, 1]), 0.3, atol=1e-9)
     np.testing.assert_allclose(table.target, 1.31)
 

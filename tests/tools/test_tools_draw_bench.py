@@ -23,7 +23,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
 def test_a_figure_is_drawn_beside_its_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The rows stay as they are; where every cell failed, that is said and nothing is drawn."""
+    """The rows stay as they are; where every cell failed, that is reported and nothing is drawn."""
     rows, failed = tmp_path / "searches.json", tmp_path / "failed.json"
     rows.write_bytes(ROWS.read_bytes())
     document = json.loads(ROWS.read_text(encoding="utf-8"))

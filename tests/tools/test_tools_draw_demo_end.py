@@ -47,7 +47,7 @@ def test_the_picture_says_what_the_terminal_said(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(sys, "argv", ["draw_demo_end.py", str(run), "--out", str(picture)])
     main()
     text = picture.read_text(encoding="utf-8")
-    told = "".join(ElementTree.fromstring(text).itertext()).replace("\xa0", " ")
+    reported = "".join(ElementTree.fromstring(text).itertext()).replace("\xa0", " ")
     for words in (
         "The policy held the pole up.",
         *space.names,
@@ -55,7 +55,7 @@ def test_the_picture_says_what_the_terminal_said(tmp_path: Path, monkeypatch: py
         "18 (outside)",
         "deal-hw inspect",
     ):
-        assert words in told
+        assert words in reported
     assert set(re.findall(r"https?://[^\s\"<)]+", re.sub(r"<!--.*?-->", "", text))) <= {
         "http://www.w3.org/2000/svg"
     }

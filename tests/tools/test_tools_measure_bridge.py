@@ -10,8 +10,8 @@ import pytest
 def test_one_way_times_count_what_both_sides_noted() -> None:
     """Messages before the first that arrived and after the last are nobody's loss; those between are."""
     sent = {str(number): 1_000_000 * number for number in range(1, 11)}
-    heard = {number: stamp + 2_000_000 for number, stamp in sent.items() if number in "34678"}
-    row = measure_bridge._one_way(sent, {**heard, "99": 5})
+    received = {number: stamp + 2_000_000 for number, stamp in sent.items() if number in "34678"}
+    row = measure_bridge._one_way(sent, {**received, "99": 5})
     assert row == {"p50_ms": 2.0, "p99_ms": 2.0, "max_ms": 2.0, "messages": 5, "lost": 3}
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import CheckpointError
-from deal_hw.policies.checkpoint import read_checkpoint
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import ObservationBuilder
 from deal_hw.workflows.shipped import shipped_policy
@@ -41,6 +40,8 @@ def test_the_shipped_policy_walks_where_it_is_told(
 
 def test_policy_record_and_checkpoint_belong_together(policy: OnnxPolicy) -> None:
     """The record is of this file; the checkpoint's networks, to fine-tune from, are those of the policy."""
+    from deal_hw.policies.checkpoint import read_checkpoint
+
     record = json.loads(policy.path.with_suffix(".json").read_text(encoding="utf-8"))
     assert record["onnx_sha256"] == policy.digest and record["spec_digest"] == policy.spec.digest()
     assert policy.path.stat().st_size < 200_000
@@ -60,6 +61,8 @@ def test_policy_record_and_checkpoint_belong_together(policy: OnnxPolicy) -> Non
 @pytest.mark.parametrize("field", ["clock_hz", "observation"])
 def test_a_task_of_another_clock_or_command_scale_is_not_fine_tuned(policy: OnnxPolicy, field: str) -> None:
     """The networks would read another gait, or commands of another size: the message names what differs."""
+    from deal_hw.policies.checkpoint import read_checkpoint
+
     spec = policy.spec
     scaled = tuple(
         dataclasses.replace(term, scale=2.0 * term.scale) if term.quantity == "command" else term

@@ -16,11 +16,11 @@ def row(seed: int, error: str = "") -> dict[str, Any]:
 
 
 def test_the_file_is_whole_after_each_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Row, command and machine; the row is printed as JSON, or as it is said, beside a table on stderr."""
+    """Row, command and machine; the row is printed as JSON, or as a given text, beside a table on stderr."""
     path = tmp_path / "folder" / "rows.json"
     rows = Rows("anywhere/measure_it.py", path)
-    for number, said in enumerate((None, "one row", "")):
-        rows.add(row(number), said, table=number > 0)
+    for number, output in enumerate((None, "one row", "")):
+        rows.add(row(number), output, table=number > 0)
         document = json.loads(path.read_text(encoding="utf-8"))
         assert document["rows"] == [row(k) for k in range(number + 1)] == read_rows(path)
         assert document["argv"][0] == "tools/measure_it.py" and document["machine"]["versions"]

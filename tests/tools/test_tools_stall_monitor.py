@@ -69,7 +69,7 @@ def test_a_late_cycle_that_the_machine_slept_through_is_not_held_against_the_wir
 
 
 def test_each_processor_is_watched_until_the_block_ends() -> None:
-    """With no least length every wake-up is a pause: all processors are heard, in order."""
+    """With no least length every wake-up is a pause: all processors are received, in order."""
     try:
         with watch_stalls(-1) as seen:
             time.sleep(0.05)

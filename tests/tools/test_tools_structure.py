@@ -67,7 +67,7 @@ SETTINGS = {
     "tests/test_effort.py": (
         "from deal_hw.calib import effort\n"
         "def test_it(monkeypatch):\n"
-        "    monkeypatch.setattr(effort, 'LIMIT', 1)\n    monkeypatch.setattr(effort, 'run', print)\n"
+        "    monkeypatch.setattr(effort, 'LIMIT', 1)\n    monkeypatch.setattr(os, 'CDLL', print)\n"
         "    monkeypatch.setattr('deal_hw.calib.effort.FitSettings', None)\n"
         "    effort.LongSettings(4)\n"
     ),

@@ -14,13 +14,13 @@ pytestmark = pytest.mark.real_time
 
 def test_failures_are_read_from_the_summary() -> None:
     """With and without a message; a parameter may have spaces; an error of the set-up counts."""
-    said = (
+    printed = (
         "FAILED tests/a.py::test_one[a b] - assert 1 == 2 - 1\n"
         "FAILED tests/a.py::test_two\n"
         "ERROR tests/b.py - ImportError\n"
         "2 failed, 1 passed, 1 error in 0.1s\n"
     )
-    assert test_under_load.failures(said) == [
+    assert test_under_load.failures(printed) == [
         "tests/a.py::test_one[a b]",
         "tests/a.py::test_two",
         "tests/b.py",
@@ -39,9 +39,9 @@ def test_every_run_is_beside_the_loops_and_failures_are_counted(
     line = ["test_under_load.py", "--loops", "2", "--repetitions", "2", "--workers", "0", "test_it.py"]
     monkeypatch.setattr(sys, "argv", line)
     assert test_under_load.main() == 1
-    told = capsys.readouterr().out
-    assert told.count("exit code 1: 1 failed, 1 passed") == 2
-    assert "failed in 2 of 2: test_it.py::test_bad" in told
+    reported = capsys.readouterr().out
+    assert reported.count("exit code 1: 1 failed, 1 passed") == 2
+    assert "failed in 2 of 2: test_it.py::test_bad" in reported
     left = [p.cmdline() for p in psutil.Process().children()]
     assert [sys.executable, "-c", test_under_load.BUSY] not in left
 

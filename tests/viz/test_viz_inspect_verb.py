@@ -147,7 +147,7 @@ def test_web_ends_with_its_server(episode_file: Path, number: signal.Signals) ->
 
 
 def test_wrong_files_are_named(episode_file: Path, tmp_path: Path) -> None:
-    """A missing recording, a missing or foreign result, and a folder to save to are each said in one line."""
+    """A missing recording, a missing or foreign result, and a folder to save to are one line each."""
     save = tmp_path / "a.rrd"
     with pytest.raises(DatasetError, match=r"none\.mcap"):
         inspect(Inspect(episode=tmp_path / "none.mcap", save=save))

@@ -1,4 +1,4 @@
-"""Rerun's program as a child: where it listens, what it is told, how it ends."""
+"""Rerun's program as a child: where it listens, its arguments, how it ends."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_web_is_served_on_loopback_only(shown: Any) -> None:
 
 
 def test_windows_and_pages_are_light() -> None:
-    """A window's settings choose the light theme and no look for updates; a page is told in its address."""
+    """A window's settings choose the light theme and no look for updates; a page has these in its address."""
     port = free_port()
     with run_viewer(["--serve-grpc", "--bind", LOOPBACK, "--port", str(port)]) as viewer:
         wait_until_listening(viewer, port, 20)

@@ -15,8 +15,8 @@ import deal_hw
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, PolicyError, UnknownNameError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import searched_space
 from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.space import searched_space
 
 Arrays = dict[str, FloatArray]
 T = np.arange(400) * 0.01
@@ -155,9 +155,9 @@ def test_what_the_model_has_as_zero_is_said(pendulum: tuple[Path, Path, Path]) -
     """It is not searched by default; the user's own list of parameters says all by itself."""
     model = mujoco.MjModel.from_xml_path(str(pendulum[0]))
     model.dof_frictionloss[:] = 0
-    said: list[str] = []
-    searched_space(CalibrateSettings(), model, said.append)
-    assert said == [
+    printed: list[str] = []
+    searched_space(CalibrateSettings(), model, printed.append)
+    assert printed == [
         "not searched, because they are 0 in the model: dof_frictionloss of pivot. If the robot has them, "
         "write values above 0 into the MJCF"
     ]
@@ -233,7 +233,7 @@ def test_importing_the_package_loads_nothing() -> None:
         "import sys, deal_hw; "
         "print([n for n in ('mujoco', 'torch', 'scipy', 'numpy', 'tyro') if n in sys.modules], dir(deal_hw))"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told.startswith("[] ") and "'calibrate'" in told
+    reported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert reported.startswith("[] ") and "'calibrate'" in reported
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         deal_hw.calibrat  # noqa: B018

@@ -64,9 +64,9 @@ def test_a_link_to_an_emulator_is_followed(tmp_path: Path) -> None:
     assert on_this_computer("serial", str(tmp_path / "robot"))
 
 
-@pytest.mark.parametrize(("flag", "told"), [("state_stale", True), ("velocity", False)])
+@pytest.mark.parametrize(("flag", "reported"), [("state_stale", True), ("velocity", False)])
 def test_a_run_that_tripped_on_late_states_names_the_load(
-    flag: str, told: bool, monkeypatch: pytest.MonkeyPatch
+    flag: str, reported: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The motion's own limits have nothing to do with it."""
     monkeypatch.setattr(causes.Load, "now", classmethod(lambda cls: BUSY))
@@ -91,4 +91,4 @@ def test_a_run_that_tripped_on_late_states_names_the_load(
     )
     report = account(end, None, "", True)
     assert report.outcome is Outcome.TRIPPED and report.flags == (flag,)
-    assert any(str(BUSY) in warning for warning in report.warnings) is told
+    assert any(str(BUSY) in warning for warning in report.warnings) is reported

@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
@@ -25,6 +24,8 @@ IDS = [entry.environment for entry in robots().entries() if entry.environment]
 @pytest.mark.parametrize("name", IDS)
 def test_checkers_accept_every_task(name: str) -> None:
     """Spaces, seeds, determinism, types of what reset and step return."""
+    from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
     env = gymnasium.make(name)
     with warnings.catch_warnings():
         # Observations have no bounds, and nothing is rendered.

@@ -24,7 +24,7 @@ SCRIPTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "make_crane": (["crane"], ("crane/crane.xml", "crane/other.csv")),
     "compare_models": ([], ("nominal: position error", "calibrated: position error", "compare.rrd")),
 }
-"""Script -> arguments, and what it must have told at its end."""
+"""Script -> arguments, and what it must print at its end."""
 SHORT: dict[str, Any] = {"refine": False, "population": 20, "generations": 3}
 """A calibration that ends at once, for a script in real time, for which other such tests have to wait."""
 IN_REAL_TIME = ("cartpole_loop", "compare_models")
@@ -80,8 +80,8 @@ def test_a_script_runs(
     if name == "compare_models":  # cartpole_loop deploys a policy, for which the verdict counts.
         monkeypatch.setattr(deal_hw, "calibrate", functools.partial(deal_hw.calibrate, **SHORT))
     run(EXAMPLES / f"{name}.py")
-    told = capsys.readouterr().out
-    assert all(word in told for word in words), told
+    reported = capsys.readouterr().out
+    assert all(word in reported for word in words), reported
 
 
 def outputs_of(notebook: Path) -> list[dict[str, Any]]:

@@ -30,7 +30,7 @@ class Terminal:
 
     operator: int
     program: int
-    heard: queue.Queue[str] = field(default_factory=queue.Queue)
+    received: queue.Queue[str] = field(default_factory=queue.Queue)
 
     def type(self, text: bytes) -> None:
         """Press keys."""
@@ -38,11 +38,11 @@ class Terminal:
 
     def stop(self) -> None:
         """Take the order to stop."""
-        self.heard.put(STOP)
+        self.received.put(STOP)
 
     def next(self, count: int) -> list[str]:
-        """Return the next things that were heard."""
-        return [self.heard.get(timeout=PATIENCE_S) for _ in range(count)]
+        """Return the next things that were received."""
+        return [self.received.get(timeout=PATIENCE_S) for _ in range(count)]
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
 
 def test_keys_arrive_one_by_one_without_enter(terminal: Terminal, capsys: pytest.CaptureFixture[str]) -> None:
     """Letters and space, as they are typed; the help says which have a meaning."""
-    with keys(terminal.heard.put, terminal.stop):
+    with keys(terminal.received.put, terminal.stop):
         terminal.type(b"wa ")
         assert terminal.next(3) == ["w", "a", " "]
         terminal.type("é".encode())
@@ -70,21 +70,21 @@ def test_keys_arrive_one_by_one_without_enter(terminal: Terminal, capsys: pytest
 
 def test_escape_stops_and_is_no_key(terminal: Terminal) -> None:
     """What follows still arrives: the run is over only when the control process says so."""
-    with keys(terminal.heard.put, terminal.stop):
+    with keys(terminal.received.put, terminal.stop):
         terminal.type(b"w\x1bs")
         assert terminal.next(3) == ["w", STOP, "s"]
 
 
 def test_p_is_a_key_of_the_control_process(terminal: Terminal) -> None:
     """It ends the run as planned, so it goes the way of the other keys."""
-    with keys(terminal.heard.put, terminal.stop):
+    with keys(terminal.received.put, terminal.stop):
         terminal.type(b"wp")
         assert terminal.next(2) == ["w", "p"]
 
 
 def test_a_key_that_is_held_stops_once(terminal: Terminal) -> None:
     """A second stop would kill a control process that is making the robot passive."""
-    with keys(terminal.heard.put, terminal.stop):
+    with keys(terminal.received.put, terminal.stop):
         terminal.type(b"\x1b\x1b\x1bw")
         assert terminal.next(2) == [STOP, "w"]
         terminal.type(b"\x1bd")
@@ -95,7 +95,7 @@ def test_the_terminal_is_as_before_afterwards(terminal: Terminal) -> None:
     """Echo and whole lines are off in between, and back after an error, too; Ctrl-C stays a signal."""
     before = termios.tcgetattr(terminal.program)
     assert before[3] & termios.ICANON and before[3] & termios.ECHO
-    with pytest.raises(ZeroDivisionError), keys(terminal.heard.put, terminal.stop):
+    with pytest.raises(ZeroDivisionError), keys(terminal.received.put, terminal.stop):
         within = termios.tcgetattr(terminal.program)[3]
         assert not within & (termios.ICANON | termios.ECHO)
         assert within & termios.ISIG
@@ -107,7 +107,7 @@ def test_no_descriptor_is_left(terminal: Terminal) -> None:
     """Episode after episode."""
     before = os.listdir("/proc/self/fd")
     for _ in range(3):
-        with keys(terminal.heard.put, terminal.stop):
+        with keys(terminal.received.put, terminal.stop):
             terminal.type(b"w")
             terminal.next(1)
     assert len(os.listdir("/proc/self/fd")) == len(before)
@@ -115,13 +115,13 @@ def test_no_descriptor_is_left(terminal: Terminal) -> None:
 
 def test_a_terminal_that_goes_away_stops(terminal: Terminal) -> None:
     """Nobody is left to stop the robot by a key."""
-    with keys(terminal.heard.put, terminal.stop):
+    with keys(terminal.received.put, terminal.stop):
         terminal.type(b"w")
         assert terminal.next(1) == ["w"]
         os.close(terminal.operator)
         terminal.operator = -1
         assert terminal.next(1) == [STOP]
-    assert terminal.heard.empty()
+    assert terminal.received.empty()
 
 
 def test_without_a_terminal_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,7 +133,7 @@ def test_without_a_terminal_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_run_without_a_terminal_does_not_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It is said before the port is opened, and before there is a recorder or a dataset."""
+    """It is reported before the port is opened, and before there is a recorder or a dataset."""
     monkeypatch.setattr("sys.stdin", io.StringIO("w"))
     plan = RunPlan(robot="cartpole", motion="hold", velocity="keyboard")
     with pytest.raises(ConfigurationError, match="needs a terminal"):

@@ -12,7 +12,7 @@ import deal_hw
 from deal_hw.calib.data.noise import HELD_STD, white_noise_std
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.prepare import prepare
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
 
@@ -74,26 +74,26 @@ def test_a_free_swing_shows_friction_damping_and_inertia(
     swing: dict[str, FloatArray], tmp_path: Path
 ) -> None:
     """All three within 5 % of the truth; the motor's gain keeps its value, and a sentence says why."""
-    said: list[str] = []
+    printed: list[str] = []
     model = write_model(tmp_path, MOTOR)
-    found = deal_hw.calibrate(model=model, data=[swing], say=said.append, threads=1)
+    found = deal_hw.calibrate(model=model, data=[swing], say=printed.append, threads=1)
     values = {row["parameter"]: row["estimate"] for row in found.rows()}
     assert values["hub.damping"] == pytest.approx(0.004, rel=0.05)
     assert values["hub.frictionloss"] == pytest.approx(0.003, rel=0.05)
     assert values["hub.armature"] == pytest.approx(0.001, rel=0.05)
     assert "drive.gain" not in values and values["latency"] == 0.0
-    assert any("no commands, and its motors (hub) were off" in text for text in said)
-    assert any("not identifiable without commands" in text and "drive.gain" in text for text in said)
+    assert any("no commands, and its motors (hub) were off" in text for text in printed)
+    assert any("not identifiable without commands" in text and "drive.gain" in text for text in printed)
     assert found.colour == "green"
 
 
 def test_a_model_needs_no_actuator(swing: dict[str, FloatArray], tmp_path: Path) -> None:
     """Its three parameters are searched."""
-    said: list[str] = []
+    printed: list[str] = []
     settings = CalibrateSettings(recordings=Recordings(model=write_model(tmp_path, "")), threads=1)
-    inputs = prepare(settings, data=[swing], say=said.append)
+    inputs = calibration_input(settings, data=[swing], say=printed.append)
     assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
-    assert any("the model has no actuators" in text for text in said)
+    assert any("the model has no actuators" in text for text in printed)
 
 
 @pytest.mark.parametrize("command", [None, 0.0, np.nan])
@@ -111,7 +111,7 @@ def test_a_free_swing_beside_a_driven_recording(
     config = Recordings(model=write_model(tmp_path, MOTOR), columns=None if command is None else columns)
     # Torques up to 1.6 N·m, so that none is taken for a share of full power.
     data = [free, recording(4.0, 1)]
-    inputs = prepare(CalibrateSettings(recordings=config, threads=1), data=data)
+    inputs = calibration_input(CalibrateSettings(recordings=config, threads=1), data=data)
     assert "drive.gain" in [p.name for p in inputs.space]
     still = [e for e in inputs.episodes if not np.any(e.target)]
     assert still and len(still) < len(inputs.episodes)
@@ -121,7 +121,7 @@ def test_servos_without_commands_are_refused(swing: dict[str, FloatArray], tmp_p
     """A servo holds its joint: the message says what to do if it was off."""
     settings = CalibrateSettings(recordings=Recordings(model=write_model(tmp_path, SERVO)))
     with pytest.raises(DatasetError, match="remove the actuators from a copy of the MJCF"):
-        prepare(settings, data=[swing])
+        calibration_input(settings, data=[swing])
 
 
 def test_a_free_swing_is_imported(swing: dict[str, FloatArray], tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_free_swing_is_imported(swing: dict[str, FloatArray], tmp_path: Path) 
     assert dataset is not None
     trajectory = dataset.read(0).trajectory
     assert trajectory.actuated == ("hub",) and not trajectory.position_target.any()
-    inputs = prepare(CalibrateSettings(dataset=tmp_path / "data", threads=1))
+    inputs = calibration_input(CalibrateSettings(dataset=tmp_path / "data", threads=1))
     assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
 
 

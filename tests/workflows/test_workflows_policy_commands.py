@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
+from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands
-from deal_hw.workflows.calibration.prepare import prepare
 from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
@@ -72,15 +72,15 @@ def without_commands(table: Table) -> Table:
 
 def test_states_alone_get_the_commands_that_were_sent(table: Table, policy: Path, facts: JointFacts) -> None:
     """The sample of each period that the policy saw is found, and its commands are those of the run."""
-    said: list[str] = []
-    (found,) = with_policy_commands([without_commands(table)], policy, facts, said.append)
+    printed: list[str] = []
+    (found,) = with_policy_commands([without_commands(table)], policy, facts, printed.append)
     assert found.actuated == ("cart",)
     assert np.allclose(np.diff(found.command_s), 1 / DESCRIPTION.control_rate_hz, atol=1e-6)
     # The robot reports a command some milliseconds after the state that it answers.
     late = table.target_at(found.command_s + 1.5 / DESCRIPTION.state_rate_hz)
     spread = np.sum((late - late.mean()) ** 2)
     assert np.sum((late - found.target) ** 2) < 0.02 * spread
-    assert f"every {STATES_A_TICK} later" in said[0] and "50 Hz" in said[0]
+    assert f"every {STATES_A_TICK} later" in printed[0] and "50 Hz" in printed[0]
 
 
 def test_differences_stand_in_for_velocities(table: Table, policy: Path, facts: JointFacts) -> None:
@@ -93,29 +93,29 @@ def test_differences_stand_in_for_velocities(table: Table, policy: Path, facts: 
 
 def test_commands_on_the_states_clock_stay(table: Table, policy: Path, facts: JointFacts) -> None:
     """They are the policy's, soon after the states that it saw; nothing is changed."""
-    said: list[str] = []
-    (found,) = with_policy_commands([table], policy, facts, said.append)
+    printed: list[str] = []
+    (found,) = with_policy_commands([table], policy, facts, printed.append)
     np.testing.assert_array_equal(found.command_s, table.command_s)
-    assert "both have one clock" in said[0]
+    assert "both have one clock" in printed[0]
 
 
 @pytest.mark.parametrize("apart_s", [-0.8, 0.6])
 def test_another_clock_is_found_and_undone(
     table: Table, policy: Path, facts: JointFacts, apart_s: float
 ) -> None:
-    """A recording whose commands come from another clock is aligned, and the distance is said."""
-    said: list[str] = []
+    """A recording whose commands come from another clock is aligned, and the distance is reported."""
+    printed: list[str] = []
     off = dataclasses.replace(table, command_s=table.command_s + apart_s)
-    (found,) = with_policy_commands([off], policy, facts, said.append)
+    (found,) = with_policy_commands([off], policy, facts, printed.append)
     moved_s = off.command_s - found.command_s
     assert np.ptp(moved_s) < 1e-12
     # The policy's own delay, at most a control period, goes with it.
     assert abs(float(moved_s[0]) - apart_s) <= 1 / DESCRIPTION.control_rate_hz
-    assert "clocks are apart" in said[0]
+    assert "clocks are apart" in printed[0]
 
 
 def test_commands_of_another_policy_are_refused(table: Table, policy: Path, facts: JointFacts) -> None:
-    """Commands that no shift in time explains: said before any fit, with what to do."""
+    """Commands that no shift in time explains: reported before any fit, with what to do."""
     wrong = dataclasses.replace(table, target=table.target[::-1])
     with pytest.raises(DatasetError, match=r"rec.csv: the recorded commands are not those of .*column map"):
         with_policy_commands([wrong], policy, facts, lambda _: None)
@@ -165,8 +165,8 @@ def test_a_file_of_states_is_prepared_with_its_policy(table: Table, policy: Path
     np.savetxt(file, columns, delimiter=",", header="time,cart.pos,pole.pos,cart.vel,pole.vel", comments="")
     settings = CalibrateSettings(recordings=Recordings(model=DESCRIPTION.mjcf, data=(file,)))
     with pytest.raises(DatasetError, match="--policy"):
-        prepare(settings)
-    said: list[str] = []
-    work = prepare(dataclasses.replace(settings, policy=str(policy)), say=said.append)
-    assert any("no commands, so they are those of" in line for line in said)
+        calibration_input(settings)
+    printed: list[str] = []
+    work = calibration_input(dataclasses.replace(settings, policy=str(policy)), say=printed.append)
+    assert any("no commands, so they are those of" in line for line in printed)
     assert sum(len(np.unique(e.target)) for e in work.episodes) > 50

@@ -1,4 +1,4 @@
-"""What a control process is told: plain JSON and back, and what is made of it."""
+"""The plan of a control process: plain JSON and back, and what is made of it."""
 
 from __future__ import annotations
 

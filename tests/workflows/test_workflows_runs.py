@@ -1,4 +1,4 @@
-"""Runs of a robot from Python: what comes back, what is told, and that nothing is printed."""
+"""Runs of a robot from Python: what comes back, what is reported, and that nothing is printed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT
 from deal_hw.workflows.emulation.common import next_line
 from deal_hw.workflows.emulation.process import arguments
-from deal_hw.workflows.emulation.settings import EmulateSettings, Go2Options
+from deal_hw.workflows.emulation.settings import EmulateCartpoleSettings, EmulateGo2Settings, Go2Options
 from deal_hw.workflows.running import supervised
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
@@ -42,12 +42,12 @@ def test_a_robot_is_emulated_recorded_and_replayed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Paths, outcome and truth come back; sentences go to `say` alone; a path may be a string."""
-    said: list[str] = []
+    output: list[str] = []
     with deal_hw.emulate("cartpole", nominal=True, profile="sensor", seed=3) as robot:
         port = robot.port
         assert port in repr(robot) and not robot.truth
         run = deal_hw.collect(
-            "cartpole", port=port, out=str(tmp_path), motion="hold", seconds=SECONDS, say=said.append
+            "cartpole", port=port, out=str(tmp_path), motion="hold", seconds=SECONDS, say=output.append
         )
         again = deal_hw.replay(run.paths[0], port=port, dataset=str(tmp_path / "again"))
         dry = deal_hw.deploy("cartpole", port=port, seconds=SECONDS, dry_run=True)
@@ -59,8 +59,8 @@ def test_a_robot_is_emulated_recorded_and_replayed(
     assert again.paths[0].parent == tmp_path / "again" / "episodes" and dry.paths == ()
     assert kept.dataset == Path("runs/replay_cartpole/dataset") and kept.paths[0].is_file()
     assert lost.dataset is None and lost.paths == ()
-    assert any("too short: `deal-hw calibrate`" in text for text in said)
-    assert "finished: the run is over" in said
+    assert any("too short: `deal-hw calibrate`" in text for text in output)
+    assert "finished: the run is over" in output
     for shown in (run._repr_html_(), run.table()):
         assert str(run.paths[0]) in shown and "finished" in shown
     assert robot.truth["seed"] == 3 and robot.truth["parameters"]
@@ -76,12 +76,12 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
         passive_confirmed=False,
         warnings=("switch it off by hand",),
     )
-    said: list[str] = []
-    for view in (RunView.of_python(silent), RunView.of_python(said.append), RunView()):
+    output: list[str] = []
+    for view in (RunView.of_python(silent), RunView.of_python(output.append), RunView()):
         view.ended(lost)
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
-    assert said == ["tripped: the connection is lost", "warning: switch it off by hand"]
+    assert output == ["tripped: the connection is lost", "warning: switch it off by hand"]
     # The reason of a failure follows as the error.
     assert dataclasses.replace(lost, outcome=Outcome.FAILED).lines() == ["failed"]
     kept = dataclasses.replace(lost, path=Path("000003.mcap"))
@@ -126,17 +126,17 @@ def test_an_emulator_that_does_not_start_says_why(tmp_path: Path) -> None:
 
 def test_an_emulator_says_how_to_reach_it() -> None:
     """The line can be pasted into another terminal."""
-    settings = EmulateSettings("cartpole", transport="can")
+    settings = EmulateCartpoleSettings("cartpole", transport="can")
     line = next_line(settings, "/dev/pts/3").partition(": ")[2]
     assert line == "deal-hw doctor cartpole --port /dev/pts/3 --transport can"
 
 
 def test_settings_become_options_of_the_command_line() -> None:
     """What differs from the defaults, switches that are off among it, and groups inside."""
-    settings = EmulateSettings(
+    settings = EmulateCartpoleSettings(
         "cartpole", transport="can", seed=2, nominal=True, can=CanFaults(node=3, no_acknowledge=True)
     )
-    assert arguments(settings, EmulateSettings("cartpole")) == [
+    assert arguments(settings, EmulateCartpoleSettings("cartpole")) == [
         "--transport",
         "can",
         "--seed",
@@ -146,8 +146,8 @@ def test_settings_become_options_of_the_command_line() -> None:
         "3",
         "--no-acknowledge",
     ]
-    go2 = EmulateSettings("go2", go2=Go2Options(remote_script=Path("r.json")))
-    assert arguments(go2, EmulateSettings("go2")) == ["--remote-script", "r.json"]
+    go2 = EmulateGo2Settings("go2", go2=Go2Options(remote_script=Path("r.json")))
+    assert arguments(go2, EmulateGo2Settings("go2")) == ["--remote-script", "r.json"]
     link = deal_hw.LinkOptions(record_wire=False)
     assert arguments(link, deal_hw.LinkOptions()) == ["--no-record-wire"]
 
@@ -191,8 +191,8 @@ def test_functions_for_a_robot_load_neither_torch_nor_mujoco() -> None:
         "    getattr(deal_hw, name)\n"
         "print([n for n in ('mujoco', 'torch', 'scipy', 'rich', 'tyro') if n in sys.modules])"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told == "[]\n"
+    reported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert reported == "[]\n"
 
 
 def test_no_workflow_prints_asks_or_ends_the_program() -> None:

@@ -1,4 +1,4 @@
-"""A verb in a process of its own: what is said when it ends before its host does."""
+"""A verb in a process of its own: what is reported when it ends before its host does."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class FakeGo2:
         stubborn: Whether requests leave its mode unchanged.
         codes: Errors that a service answers with, in order, by service and function.
         command: The command in force.
-        heard: Device time and command of each received command.
+        received: Device time and command of each received command.
         requests: Service and request of each received request.
 
     Args:
@@ -89,7 +89,7 @@ class FakeGo2:
         self.stubborn = False
         self.codes: dict[tuple[str, int], list[int]] = {}
         self.command: LowCommand | None = None
-        self.heard: list[tuple[int, LowCommand]] = []
+        self.received: list[tuple[int, LowCommand]] = []
         self.requests: list[tuple[str, Request]] = []
         self._answers: list[tuple[int, str, bytes]] = []
 
@@ -98,7 +98,7 @@ class FakeGo2:
         if topic == topics.LOW_COMMAND:
             if self.hears:
                 self.command = decode_low_command(payload)
-                self.heard.append((self.device_ns, self.command))
+                self.received.append((self.device_ns, self.command))
             return
         if not topic.endswith("/request"):
             return

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from mcap_ros2.writer import Writer
 
-from deal_hw.calib.search.resume import SearchCheckpoint, pack
+from deal_hw.calib.data.resume import SearchCheckpoint, pack
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.data.importing.columns import read_column_map
 from deal_hw.data.importing.grid import common_period, to_trajectories

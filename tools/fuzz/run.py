@@ -51,8 +51,8 @@ def run(kind: Kind, count: int, seed: int, limit_s: float, limit_bytes: int) -> 
                 os.close(reading)
                 _child(kind, seeds, range(start, count), seed, shared, writing, limit_s, limit_bytes, folder)
             os.close(writing)
-            with open(reading, encoding="utf-8", errors="replace") as said:
-                failure = said.read().strip()
+            with open(reading, encoding="utf-8", errors="replace") as report:
+                failure = report.read().strip()
             _, status = os.waitpid(child, 0)
             number, read, refused = _STEP.unpack_from(shared)
             found.update(read=read, refused=refused)

@@ -140,20 +140,20 @@ class ControlLoop:
 
     def _prepare(self) -> None:
         c = self._config
-        self._phase(CONNECTING, 10.0)
+        self._progress(CONNECTING, 10.0)
         self._robot.connect()
         self._connected = True
         self._behaviour.reset()
         if c.home and not c.dry_run:
             # Reported before it happens, so that a supervisor that finds this process dead knows whether to
             # send damping.
-            self._phase(HOMING, c.home_timeout_s + c.state_timeout_s + 2.0)
+            self._progress(HOMING, c.home_timeout_s + c.state_timeout_s + 2.0)
             self._commanding = self._robot.homes_by_motor
             self._robot.home(c.home_timeout_s)
         self._await_state()
         if not c.dry_run:
             self._safety.arm(self._input())
-            self._phase(ARMING, c.arm_timeout_s + c.state_timeout_s + 2.0)
+            self._progress(ARMING, c.arm_timeout_s + c.state_timeout_s + 2.0)
             self._commanding = True
             self._robot.arm(c.arm_timeout_s)
             self.note("armed", "the motors follow commands")
@@ -168,9 +168,6 @@ class ControlLoop:
         self._receive(self._robot.read_state(self._config.state_timeout_s))
         self._drain()
 
-    def _phase(self, name: str, silence_s: float) -> None:
-        self._progress(name, silence_s)
-
     def _cycles(self) -> tuple[Outcome, str]:
         count = round(self._config.duration_s * self._robot.description.control_rate_hz)
         while True:
@@ -178,7 +175,7 @@ class ControlLoop:
             if self._loop_timing.next_index >= count or self._end.over:
                 break
             index, deadline_ns = self._loop_timing.begin()
-            self._phase(RUNNING, self._robot.description.limits.silence_s)
+            self._progress(RUNNING, self._robot.description.limits.silence_s)
             verdict = self._cycle(index, deadline_ns)
             if verdict.state is SafetyState.PASSIVE:
                 stopped = verdict.flags[:1] == ("operator_stop",)
@@ -334,21 +331,21 @@ class ControlLoop:
             self._safety.stop("the run ended")
         if not self._commanding:
             return True
-        self._phase(MAKING_PASSIVE, 2.0)
+        self._progress(MAKING_PASSIVE, 2.0)
         # Samples read here are not recorded, since it is unknown which of them came after the passive
         # command.
         return make_passive(
             self._robot,
             self._clock,
             self._config.passive,
-            progress=lambda text, silence_s: self._phase(f"{MAKING_PASSIVE}: {text}", silence_s),
+            progress=lambda text, silence_s: self._progress(f"{MAKING_PASSIVE}: {text}", silence_s),
         )
 
     def _hand_back(self) -> None:
         if not self._config.hand_back or self._config.dry_run or not self._connected:
             return
         timeout_s = self._config.hand_back_timeout_s
-        self._phase(HANDING_BACK, timeout_s + 2.0)
+        self._progress(HANDING_BACK, timeout_s + 2.0)
         try:
             self._robot.hand_back(timeout_s)
             self.note("handed back", "the robot's own controller has the robot again")

@@ -123,7 +123,7 @@ class StatusSender:
         """Return the descriptor, for ``select``."""
         return self._socket.fileno()
 
-    def heard(self) -> list[str]:
+    def received(self) -> list[str]:
         """Return the supervisor's messages since the last call; never waits."""
         words: list[str] = []
         try:

@@ -96,7 +96,7 @@ def priority(level: int, *, children: bool = False, lock: bool = False) -> Itera
             os.sched_setscheduler(0, *before)
 
 
-def hurry(pid: int) -> None:
+def raise_priority(pid: int) -> None:
     """Give the threads of a process real-time priority if permitted, so that a killed process ends sooner.
 
     It ends only after each of its threads has run once more. On a busy machine threads of ordinary priority,

@@ -3,7 +3,7 @@
 It owns the port as long as it lives. No other program can then take the robot, and the passive command can
 still be sent after the control process has died. It never sends while the control process lives: two writers
 on one port would corrupt each other's frames. It sends nothing if the control process had not begun to
-command the robot. The control process also watches the supervisor ( :mod:`deal_hw.control.process.vigil`).
+command the robot. The control process also watches the supervisor ( :mod:`deal_hw.control.process.watchdog`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from deal_hw.control.process.channel import (
     StatusReceiver,
     socket_pair,
 )
-from deal_hw.control.process.realtime import SUPERVISOR_PRIORITY, hurry, priority
+from deal_hw.control.process.realtime import SUPERVISOR_PRIORITY, priority, raise_priority
 from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
 from deal_hw.signals import held_back, name, reason, taken
 
@@ -40,7 +40,7 @@ PATIENCE_S = 1.0
 0.25 s at most (measured). A session that ends sends SIGTERM and SIGHUP to each process, and a key that is
 held repeats."""
 _POLL_S = 0.05
-_GRACE_S = 3.0
+GRACE_S = 3.0
 """How long a control process may take to exit after it closed its end of the channel [s]."""
 
 
@@ -82,6 +82,8 @@ class Supervisor:
         on_beat: Called with each heartbeat.
         clock: For heartbeats; the machine's monotonic clock by default.
         keep_fds: More descriptors that live as long as the control process, such as a claim.
+        patience_s: Time after which a further request to end kills the control process [s].
+        grace_s: Time for the control process to exit after it closed its end of the channel [s].
     """
 
     _stale_ns: int
@@ -97,8 +99,11 @@ class Supervisor:
         on_beat: Callable[[Beat], None] = lambda beat: None,
         clock: Clock | None = None,
         keep_fds: Sequence[int] = (),
+        patience_s: float = PATIENCE_S,
+        grace_s: float = GRACE_S,
     ) -> None:
         self._keep_fds = tuple(keep_fds)
+        self._patience_ns, self._grace_s = round(patience_s * 1e9), grace_s
         self._module, self._plan, self._port_fd, self._passive = module, plan, port_fd, passive
         self._recorder, self._on_beat, self._clock = recorder, on_beat, clock or MonotonicClock()
         self._child: subprocess.Popen[bytes] | None = None
@@ -143,7 +148,7 @@ class Supervisor:
             return
         if not again:
             child.send_signal(number)
-        elif self._clock.now_ns() - self._asked_ns >= round(PATIENCE_S * 1e9):
+        elif self._clock.now_ns() - self._asked_ns >= self._patience_ns:
             self._kill(child, "it did not end when it was asked, and was asked again")
 
     def _signalled(self, number: int) -> None:
@@ -220,13 +225,13 @@ class Supervisor:
         # SIGKILL also ends a process stopped by SIGSTOP.
         self._killed = self._killed or why
         child.kill()
-        hurry(child.pid)
+        raise_priority(child.pid)
 
     def _reap(self, child: subprocess.Popen[bytes]) -> int:
         """Return the exit code of the control process, which sends no more messages."""
         try:
             # A wait with a limit polls with pauses of up to 50 ms, in which a robot may be stiff.
-            return child.wait() if self._killed else child.wait(_GRACE_S)
+            return child.wait() if self._killed else child.wait(self._grace_s)
         except subprocess.TimeoutExpired:
             self._kill(child, "it did not end after its last message")
             return child.wait()

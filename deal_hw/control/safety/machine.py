@@ -1,4 +1,4 @@
-"""The safety state machine. Time is an argument; a flag is True for a failure.
+"""The safety state machine. Time is an argument; a flag is the name of a failed check.
 
     DISARMED --arm--> EASING_IN --time--> ACTIVE
                           |                  |
@@ -9,9 +9,8 @@ Only an explicit re-arm leaves PASSIVE. It leads to DISARMED, so arming is a sec
 
 from __future__ import annotations
 
-import dataclasses
 import enum
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
 
 from deal_hw.errors import SafetyError
 
@@ -33,69 +32,43 @@ class SafetyState(enum.Enum):
         return self in (SafetyState.EASING_IN, SafetyState.ACTIVE)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SafetyFlags:
-    """Possible failures in one cycle; True means failed. Reasons are listed in this order.
+SAFETY_FLAGS: Mapping[str, str] = {
+    "operator_stop": "The operator asked to stop.",
+    "no_state": "No state sample has arrived yet.",
+    "state_stale": "The newest state is too old, or was delayed on its way.",
+    "clock_jump": "The device's clock jumped, as after a restart.",
+    "device_fault": (
+        "The device reports a fault, or the driver saw a problem after which the run must not continue."
+    ),
+    "device_watchdog": "The device stopped its motors because no commands arrived.",
+    "device_disarmed": "The device reports that its motors do not follow commands.",
+    "position": "A joint is outside its trip range.",
+    "velocity": "A joint is faster than its trip speed.",
+    "state_not_finite": "The state contains NaN or infinity.",
+    "body_missing": "A robot with legs reports no state of its body.",
+    "body_not_finite": "The inertial sensor reports NaN or infinity.",
+    "orientation": "The orientation is no unit quaternion.",
+    "tilt": "The base leans too far.",
+    "tumble": "The base turns too fast.",
+    "free_fall": "The robot has been falling for too long.",
+    "flail": "A joint has been fast for too long.",
+    "motor_temperature": "A motor is too hot, or its temperature is unknown.",
+    "lost_commands": "A motor misses too many commands.",
+    "battery_low": "The battery is too empty; arming asks for more.",
+    "voltage_low": "The supply voltage is too low; arming asks for more.",
+    "action_not_finite": "The requested command contains NaN or infinity.",
+    "action_late": "The policy took too long.",
+    "transport_errors": "Too large a share of the state frames is corrupt or lost.",
+    "command_stale": "No command has been sent to a robot with legs for too long.",
+}
+"""Name of each check that can fail in a cycle -> what failed. Reasons are listed in this order."""
 
-    Attributes:
-        operator_stop: The operator asked to stop.
-        no_state: No state sample has arrived yet.
-        state_stale: The newest state is too old, or was delayed on its way.
-        clock_jump: The device's clock jumped, as after a restart.
-        device_fault: The device reports a fault, or the driver saw a problem after which the run must not
-            continue.
-        device_watchdog: The device stopped its motors because no commands arrived.
-        device_disarmed: The device reports that its motors do not follow commands.
-        position: A joint is outside its trip range.
-        velocity: A joint is faster than its trip speed.
-        state_not_finite: The state contains NaN or infinity.
-        body_missing: A robot with legs reports no state of its body.
-        body_not_finite: The inertial sensor reports NaN or infinity.
-        orientation: The orientation is no unit quaternion.
-        tilt: The base leans too far.
-        tumble: The base turns too fast.
-        free_fall: The robot has been falling for too long.
-        flail: A joint has been fast for too long.
-        motor_temperature: A motor is too hot, or its temperature is unknown.
-        lost_commands: A motor misses too many commands.
-        battery_low: The battery is too empty; arming asks for more.
-        voltage_low: The supply voltage is too low; arming asks for more.
-        action_not_finite: The requested command contains NaN or infinity.
-        action_late: The policy took too long.
-        transport_errors: Too large a share of the state frames is corrupt or lost.
-        command_stale: No command has been sent to a robot with legs for too long.
-    """
+_ORDER = {name: number for number, name in enumerate(SAFETY_FLAGS)}
 
-    operator_stop: bool = False
-    no_state: bool = False
-    state_stale: bool = False
-    clock_jump: bool = False
-    device_fault: bool = False
-    device_watchdog: bool = False
-    device_disarmed: bool = False
-    position: bool = False
-    velocity: bool = False
-    state_not_finite: bool = False
-    body_missing: bool = False
-    body_not_finite: bool = False
-    orientation: bool = False
-    tilt: bool = False
-    tumble: bool = False
-    free_fall: bool = False
-    flail: bool = False
-    motor_temperature: bool = False
-    lost_commands: bool = False
-    battery_low: bool = False
-    voltage_low: bool = False
-    action_not_finite: bool = False
-    action_late: bool = False
-    transport_errors: bool = False
-    command_stale: bool = False
 
-    @property
-    def raised(self) -> tuple[str, ...]:
-        """Names of the flags that are set."""
-        return tuple(f.name for f in dataclasses.fields(self) if getattr(self, f.name))
+def in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Return names of failed checks in the order of :data:`SAFETY_FLAGS`; each must be one of them."""
+    return tuple(sorted(names, key=_ORDER.__getitem__))
 
 
 class SafetyMachine:
@@ -125,9 +98,9 @@ class SafetyMachine:
         """Restart the time of easing in."""
         self._armed_ns = now_ns
 
-    def update(self, now_ns: int, flags: SafetyFlags) -> SafetyState:
+    def update(self, now_ns: int, flags: Collection[str]) -> SafetyState:
         """Advance by one cycle: trip on any flag, else finish easing in after its time."""
-        if self.state.armed and flags.raised:
+        if self.state.armed and flags:
             self.state = SafetyState.PASSIVE
         elif self.state is SafetyState.EASING_IN and now_ns - self._armed_ns >= self._ease_in_ns:
             self.state = SafetyState.ACTIVE

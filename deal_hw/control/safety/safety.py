@@ -15,12 +15,12 @@ import numpy as np
 
 from deal_hw.control.safety.filter import SafetyFilter
 from deal_hw.control.safety.leg_checks import LegChecks
-from deal_hw.control.safety.machine import SafetyFlags, SafetyMachine, SafetyState
+from deal_hw.control.safety.machine import SafetyMachine, SafetyState, in_order
 from deal_hw.description import RobotDescription
 from deal_hw.errors import SafetyError
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
-__all__ = ["CycleInput", "Safety", "SafetyConfig", "SafetyDecision", "SafetyFlags", "SafetyState"]
+__all__ = ["CycleInput", "Safety", "SafetyConfig", "SafetyDecision", "SafetyState"]
 
 _DRIFT = 5e-4
 """Largest rate difference between host and device clock that counts as drift (a bad crystal has 1e-4)."""
@@ -156,14 +156,14 @@ class Safety:
         failures = self._failures(cycle, wanted)
         unsound = "action_not_finite" in failures or "state_not_finite" in failures
         was_armed = self.state.armed
-        flags = SafetyFlags(**dict.fromkeys(failures, True))
+        flags = in_order(failures)
         state = self._machine.update(cycle.now_ns, flags)
         if was_armed and not state.armed:
-            self.reason = "; ".join(failures[name] for name in flags.raised)
+            self.reason = "; ".join(failures[name] for name in flags)
         if state is SafetyState.PASSIVE or wanted is None or cycle.state is None or unsound:
-            return SafetyDecision(state, None, (), flags.raised, self.reason)
+            return SafetyDecision(state, None, (), flags, self.reason)
         command, clipped = self._clip(cycle.now_ns, wanted, cycle.state)
-        return SafetyDecision(state, command, clipped, flags.raised, self.reason)
+        return SafetyDecision(state, command, clipped, flags, self.reason)
 
     def stop(self, reason: str) -> None:
         """Go passive without a failed check, such as at the end of the run."""

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray
 
@@ -71,18 +71,18 @@ def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None)
 
 
 def _accusation(names: Sequence[str], *, servo: bool) -> str:
-    said = ", ".join(names)
+    names_text = ", ".join(names)
     if servo:
         return (
-            f"commands that look like efforts ({said}): no joint follows them as positions, but they "
+            f"commands that look like efforts ({names_text}): no joint follows them as positions, but they "
             "explain its acceleration, and the model's actuators take positions. If they are torques "
             "(N·m) or forces (N), replace <position> by <motor> in a copy of the MJCF; if not, name the "
             "column of commanded positions as `target`"
         )
     return (
-        f"commands that look like positions ({said}): the joints follow them, but the model has motors, "
-        "which would take them as torques. Replace <motor> by <position joint=... kp=... kv=...> in a "
-        "copy of the MJCF, with the gains of the drives; or name the column of torques as `target`"
+        f"commands that look like positions ({names_text}): the joints follow them, but the model has "
+        "motors, which would take them as torques. Replace <motor> by <position joint=... kp=... kv=...> in "
+        "a copy of the MJCF, with the gains of the drives; or name the column of torques as `target`"
     )
 
 

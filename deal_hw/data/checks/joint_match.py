@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.errors import MissingExtraError
 from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray, IntArray

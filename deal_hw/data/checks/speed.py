@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from deal_hw.data.files import write_json
 from deal_hw.data.importing.grid import common_period, to_trajectories
-from deal_hw.data.importing.table import table_of
+from deal_hw.data.table import table_of
 from deal_hw.errors import DatasetError, InsufficientDataError, MissingExtraError
 from deal_hw.types import FloatArray, Trajectory
 

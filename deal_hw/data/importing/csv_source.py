@@ -21,11 +21,12 @@ LINE = 1 << 20
 _NOTHING = {"", "nan", "null", "none", "na", "n/a", "-"}
 
 
-def read_csv(path: Path) -> Channels:
+def read_csv(path: Path, most_numbers: int = NUMBERS) -> Channels:
     """Read a CSV file; the delimiter is a comma, a semicolon or a tab, comment lines start with ``#``.
 
     With a semicolon, a comma is read as the decimal point. An empty cell is NaN. Columns of text are left
-    out. An incomplete last row is left out with a note. Sizes are limited, see :mod:`deal_hw.reading`.
+    out. An incomplete last row is left out with a note. Sizes are limited, see :mod:`deal_hw.reading`;
+    ``most_numbers`` is the limit of numbers.
 
     Raises:
         DatasetError: It cannot be read, has no header, or a row does not fit it.
@@ -35,7 +36,7 @@ def read_csv(path: Path) -> Channels:
         check_size(path, RECORDING_BYTES)
         digest = digest_of_file(path)
         with open(path, newline="", encoding="utf-8-sig") as file:
-            arrays, notes = _parse(path, _Lines(file))
+            arrays, notes = _parse(path, _Lines(file), most_numbers)
     return Channels(path=path, kind="csv", digest=digest, arrays=arrays, notes=notes)
 
 
@@ -55,7 +56,7 @@ class _Lines(Iterator[str]):
         raise StopIteration
 
 
-def _parse(path: Path, lines: _Lines) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+def _parse(path: Path, lines: _Lines, most_numbers: int) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     header = next(lines, None)
     if header is None:
         raise DatasetError(f"{path} is empty; a CSV file starts with a line that names its columns")
@@ -75,7 +76,7 @@ def _parse(path: Path, lines: _Lines) -> tuple[dict[str, FloatArray], tuple[str,
     if len(names) > NAMES:
         raise DatasetError(f"{path} has {len(names)} columns; {NAMES} are allowed")
     rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    columns = [_Column(path, name, delimiter == ";", NUMBERS // len(names)) for name in names]
+    columns = [_Column(path, name, delimiter == ";", most_numbers // len(names)) for name in names]
     cut = 0
     for row in rows:
         if cut:

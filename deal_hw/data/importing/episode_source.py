@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from deal_hw.data.importing.channels import Channels, digest_of_file
-from deal_hw.data.importing.table import table_of
 from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.table import table_of
 
 
 def read_own(path: Path) -> Channels:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.data.importing.table import Table
+from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError
 from deal_hw.types import BodyTrajectory, FloatArray, IntArray, Status, Trajectory
 

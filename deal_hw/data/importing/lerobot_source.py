@@ -35,12 +35,15 @@ def is_lerobot(path: Path) -> bool:
     return (Path(path) / "meta" / "info.json").is_file()
 
 
-def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Channels]:
+def read_lerobot(
+    path: Path, episodes: tuple[int, ...] | None = None, most_numbers: int = NUMBERS
+) -> list[Channels]:
     """Read a LeRobot dataset; one :class:`Channels` per episode, in the order of their numbers.
 
     Args:
         path: The dataset's folder.
         episodes: Which to read; None: all.
+        most_numbers: Most numbers of one file.
 
     Raises:
         MissingExtraError: pyarrow is not installed.
@@ -53,7 +56,7 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
         raise DatasetError(f"{path} has no data/*/*.parquet; download the whole dataset")
     found: dict[int, list[dict[str, FloatArray]]] = {}
     for file in files:
-        for episode, arrays in _read_file(file, info.features):
+        for episode, arrays in _read_file(file, info.features, most_numbers):
             for name, feature in info.features.items():
                 # One motor's values are plain numbers in the file; a column name marks them as those of a
                 # joint.
@@ -105,7 +108,7 @@ def _info(path: Path) -> _Info:
     return read_json(file, _Info, "the description of a LeRobot dataset")
 
 
-def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[str, FloatArray]]]:
+def _read_file(file: Path, features: Mapping[str, Any], most: int) -> list[tuple[int, dict[str, FloatArray]]]:
     """Return number and channels of each episode in a Parquet file."""
     try:
         import pyarrow as pa
@@ -123,13 +126,13 @@ def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[
             ]
             own = ("episode_index", "frame_index")
             wanted += [name for name in own if name in known and name not in wanted]
-            _check_extent(opened.metadata, len(wanted))
+            _check_extent(opened.metadata, len(wanted), most)
             batches, count = [], 0
             for batch in opened.iter_batches(batch_size=_BATCH_ROWS, columns=wanted):
                 # Lists may have any length, which is known only now.
                 count += batch.nbytes // 8
-                if count > NUMBERS:
-                    raise ValueError(f"more than {NUMBERS} numbers")
+                if count > most:
+                    raise ValueError(f"more than {most} numbers")
                 batches.append(batch)
             table = pa.Table.from_batches(batches, opened.schema_arrow.empty_table().select(wanted).schema)
         arrays = {name: _array(table.column(name)) for name in wanted}
@@ -143,14 +146,14 @@ def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[
         ]
 
 
-def _check_extent(metadata: Any, columns: int) -> None:
+def _check_extent(metadata: Any, columns: int, most: int) -> None:
     """Check the announced size of a file's data, since a run of one value takes no bytes in it.
 
     The metadata of single columns are not read: pyarrow ends the process if these are damaged.
     """
     size = sum(metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups))
-    if metadata.num_rows * columns > NUMBERS or size > 8 * NUMBERS:
-        raise ValueError(f"more than {NUMBERS} numbers")
+    if metadata.num_rows * columns > most or size > 8 * most:
+        raise ValueError(f"more than {most} numbers")
 
 
 def _array(column: Any) -> FloatArray:

@@ -19,10 +19,11 @@ from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.starting_map import starting_map
-from deal_hw.data.importing.table import Table, build_table
+from deal_hw.data.importing.table import build_table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.data.table import Table
 from deal_hw.documentation import page
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
@@ -82,7 +83,7 @@ def load_tables(
     columns: ColumnMap | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
-    said: dict[str, str] | None = None,
+    printed: dict[str, str] | None = None,
     kinds: JointKinds | None = None,
 ) -> list[Table]:
     """Read the recordings in a file, in SI units, on their own stamps.
@@ -93,8 +94,8 @@ def load_tables(
         columns: Meaning of its channels; None: guessed from their names.
         joints: Names of the model's joints; None: those of the map, or of the file.
         say: Called with sentences on guesses and omissions.
-        said: Guessed maps that were printed already, each with the recording's name; a new one is added. One
-            that is in it is not printed again.
+        printed: Guessed maps that were printed already, each with the recording's name; a new one is added.
+            One that is in it is not printed again.
         kinds: Which of the model's joints slide or have motors; None: unknown.
 
     Raises:
@@ -102,7 +103,7 @@ def load_tables(
     """
     described = f"{page('how-to/import.md')} describes one"
     with reading(path, "a recording of a robot", described):
-        tables = tables_of(read_channels(path), columns, joints, say, said, kinds)
+        tables = tables_of(read_channels(path), columns, joints, say, printed, kinds)
     if not tables:
         raise DatasetError(f"{path} holds no recording")
     return tables
@@ -113,7 +114,7 @@ def tables_of(
     columns: ColumnMap | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
-    said: dict[str, str] | None = None,
+    printed: dict[str, str] | None = None,
     kinds: JointKinds | None = None,
 ) -> list[Table]:
     """Interpret channels, as :func:`load_tables` does for a file."""
@@ -123,7 +124,7 @@ def tables_of(
         if kinds is not None:
             used = used.for_model(kinds)
         if say is not None:
-            _tell(say, channels, used, joints, columns is None and number == 0, said)
+            _tell(say, channels, used, joints, columns is None and number == 0, printed)
         table = build_table(channels, used, joints)
         if unsaid := _unsaid(table, used):
             table.source["unsaid"] = unsaid
@@ -226,11 +227,11 @@ def _say_map(
     joints: Sequence[str] | None,
     guessed: ColumnMap | None,
     title: str = _INCOMPLETE,
-    said: dict[str, str] | None = None,
+    printed: dict[str, str] | None = None,
 ) -> None:
     name = f"{channels.path.name} {channels.part}".strip()
     lines = starting_map(channels, joints, guessed)
-    first = name if said is None else said.setdefault("\n".join([title, *lines]), name)
+    first = name if printed is None else printed.setdefault("\n".join([title, *lines]), name)
     if first != name:
         say(f"{name}: the same column map as {first}")
         return
@@ -245,7 +246,7 @@ def _tell(
     columns: ColumnMap,
     joints: Sequence[str] | None,
     guessed: bool,
-    said: dict[str, str] | None,
+    printed: dict[str, str] | None,
 ) -> None:
     name = f"{channels.path.name} {channels.part}".strip()
     for note in channels.notes:
@@ -256,4 +257,4 @@ def _tell(
             say(f"{name}: not in the file: {', '.join(missing)}; its channels: {channels.listed()}")
         if not (columns.target or any(joint.target for joint in columns.joints)):
             say(f"{name}: no commanded positions found")
-        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED, said)
+        _say_map(say, channels, joints, columns, _INCOMPLETE if missing else _GUESSED, printed)

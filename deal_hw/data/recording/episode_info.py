@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from deal_hw.data.recording.clock_sync import synchronize
+from deal_hw.data.checks.clock_sync import synchronize
+from deal_hw.data.checks.suite import check
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import Episode, read_episode
-from deal_hw.data.recording.telemetry_checks import check
 from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
 from deal_hw.findings import Finding, Severity
 from deal_hw.schema import STRICT

@@ -28,8 +28,8 @@ from deal_hw.errors import DealHwError, ProtocolError
 
 EXIT_OK, EXIT_INCOMPLETE = 0, 3
 TERM_GRACE_S = 2.0
-"""How long the peer may still send after a signal [s]: the supervisor is told, so the run ends, and its last
-records follow."""
+"""How long the peer may still send after a signal [s]: the supervisor gets a message, so the run ends, and
+its last records follow."""
 
 
 class RecorderProcess:
@@ -55,7 +55,7 @@ class RecorderProcess:
         """Take a signal: report it, which ends the run, and finish soon even if the peer does not close."""
         if self._stop_at_ns is None:
             self._stop_at_ns = self._clock.now_ns() + round(TERM_GRACE_S * 1e9)
-            self._report({"kind": "error", "message": f"it was told to end by {signals.name(number)}"})
+            self._report({"kind": "error", "message": f"it was ended by {signals.name(number)}"})
 
     def run(self) -> int:
         """Write until the peer closes; return the exit code."""

@@ -96,11 +96,11 @@ def wanted_in(events: Sequence[Event], start_ns: int, seconds: float) -> Wanted 
         start_ns: Host time of the recording's time 0 [ns].
         seconds: How long the policy ran, without slowing down [s]; a planned end in the events shortens it.
     """
-    told = [event for event in events if event.kind == VELOCITY_EVENT]
-    if not told:
+    noted = [event for event in events if event.kind == VELOCITY_EVENT]
+    if not noted:
         return None
-    times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in told])
-    velocity = np.array([[float(event.data[axis]) for axis in AXES] for event in told])
+    times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in noted])
+    velocity = np.array([[float(event.data[axis]) for axis in AXES] for event in noted])
     # While the robot slows down, no velocity is requested that it should keep.
     ended = [(event.stamp_ns - start_ns) * 1e-9 for event in events if event.kind == ENDING_EVENT]
     return Wanted(times, velocity, min([float(times[0]) + seconds, *ended]))

@@ -215,14 +215,14 @@ class ServoBatch:
     @property
     def position(self) -> FloatArray:
         """Present tangent coordinates, (N, C), around the identity."""
-        return self._chart(self._qpos, None)
+        return self._tangent_coordinates(self._qpos, None)
 
     @property
     def velocity(self) -> FloatArray:
         """Present velocities, (N, C)."""
         return np.asarray(self._qvel[:, self._dof])
 
-    def _chart(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
+    def _tangent_coordinates(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
         """Return qpos, (N, ..., nq), as reported tangent coordinates, (N, ..., C)."""
         joints = qpos[..., list(self.robot.qpos)]
         if self._biased:
@@ -283,7 +283,7 @@ class ServoBatch:
             if force is not None:
                 # Otherwise the engine would keep the last forces.
                 self._applied[:] = 0.0
-        position = self._chart(record["qpos"][:, every - 1 :: every], reference)
+        position = self._tangent_coordinates(record["qpos"][:, every - 1 :: every], reference)
         velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
         bad = self._warnings() > before
         if bad.any():

@@ -12,8 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from deal_hw.documentation import page
 from deal_hw.errors import QUOTED, ConfigurationError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
@@ -89,29 +87,6 @@ def parse_space(text: str, model: Any, source: str = "params.yaml") -> Parameter
         err.args = (f"{source}: {err}",)
         raise
     return space
-
-
-def write_space(space: ParameterSpace) -> str:
-    """Return YAML text that :func:`parse_space` reads back to the same space."""
-    # ASCII only: with allow_unicode PyYAML writes a next-line character unquoted and reads it as a space.
-    return yaml.safe_dump({"parameters": [_entry(p) for p in space.parameters]}, sort_keys=False)
-
-
-def _entry(p: Parameter) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "kind": p.kind,
-        "elements": list(p.elements),
-        "group": "together",
-        "name": p.name,
-        "nominal": float(p.nominal),
-        "range": [float(p.low), float(p.high)],
-        "scale": p.scale,
-    }
-    if p.known:
-        entry["known"] = True
-    if p.prior_mean is not None and p.prior_std is not None:
-        entry["prior"] = {"mean": float(p.prior_mean), "std": float(p.prior_std)}
-    return entry
 
 
 def _parameters(entry: Any, model: Any) -> list[Parameter]:

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Final
 
 import numpy as np
-from scipy.signal import savgol_coeffs
+import scipy
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
@@ -71,9 +71,9 @@ def base_states(
         raise InsufficientDataError(
             f"{T} samples, a base's orientation needs at least {length}; record longer"
         )
-    reference = smooth_orientation(orientation, savgol_coeffs(length, order, use="dot"))
+    reference = smooth_orientation(orientation, scipy.signal.savgol_coeffs(length, order, use="dot"))
     speed = np.gradient(joints, period_s, axis=0)
-    slope = savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
+    slope = scipy.signal.savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
     for j in range(J):
         speed[length // 2 : T - length // 2, j] = np.convolve(joints[:, j], slope[::-1], mode="valid")
     legs = leg_odometry(robot, feet, reference, gyro, joints, speed, felt)

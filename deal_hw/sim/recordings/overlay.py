@@ -141,7 +141,7 @@ def compute_overlay(
                 "the recording lacks the floating base; predictions need its IMU, and names of feet in the "
                 "robot's description"
             )
-        episode = with_sensed_base(episode, robot, trajectory)
+        episode = with_sensed_base(episode, robot, trajectory, robot.description.feet)
     windows = cut_windows(episode, length)
     row = episode.first_row + np.concatenate([windows.start[:, None], windows.samples()], axis=1)
     smooth = _smoothed_starts(trajectory, row[:, 0], smoothing_s)

@@ -37,15 +37,18 @@ def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
     return poses
 
 
-def with_sensed_base(episode: SampledEpisode, robot: RobotModel, trajectory: Trajectory) -> SampledEpisode:
+def with_sensed_base(
+    episode: SampledEpisode, robot: RobotModel, trajectory: Trajectory, feet: tuple[str, ...]
+) -> SampledEpisode:
     """Return an episode of joints with the base from the body's sensors; see ``imu_base``.
 
     Args:
         episode: The recording, from :func:`deal_hw.sim.recordings.episode.align`.
         robot: The robot.
         trajectory: The recording; it has a body.
+        feet: Sphere geoms of the feet.
     """
-    body, feet = trajectory.body, robot.description.feet
+    body = trajectory.body
     if body is None:
         raise ConfigurationError("the recording has no body's sensors")
     felt = Felt(trajectory.device_s, body.acceleration, trajectory.effort)

@@ -170,7 +170,7 @@ def identify(
     jacobian = np.asarray(result.jac, dtype=float)
     with np.errstate(all="ignore"):
         half_width = sysid.calculate_intervals(left, jacobian, alpha=alpha)[1]
-    said = [line for line in output.getvalue().splitlines() if line.startswith("Terminated")]
+    reasons = [line for line in output.getvalue().splitlines() if line.startswith("Terminated")]
     return Identified(
         theta=np.clip(vector[: len(space)], space.low, space.high),
         latency_s=bridge.latency(vector),
@@ -180,7 +180,7 @@ def identify(
         jacobian=_without(jacobian[:, : len(space)], jacobian[:, len(space) :]),
         residual=np.concatenate(left),
         iterations=len(result.extras["objective"]) - 1,
-        message=said[-1] if said else "no message",
+        message=reasons[-1] if reasons else "no message",
         steps=bridge.steps,
     )
 

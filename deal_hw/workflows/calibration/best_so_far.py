@@ -17,7 +17,7 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
-from deal_hw.workflows.say import Say, aloud, silent
+from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
@@ -43,13 +43,13 @@ def check_resume(path: Path, resume: bool) -> None:
 
 
 class BestSoFar:
-    """The best fit of a running calibration: each better fit is kept for an interrupt; clear gains are said.
+    """The best fit of a running calibration: better fits are kept for an interrupt; clear gains are reported.
 
     Args:
         space: The parameters.
         judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
         and "null"; None without held-out data.
-        say: Called with a sentence on each fit whose error is 5 % lower than the one said before.
+        say: Called with a sentence on each fit whose error is 5 % lower than the one reported before.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[N
 
             with interrupts_deferred():
                 write_result(folder, robot, best.result)
-            aloud(f"\nbest so far: {best.sentence}; written to {folder}, without intervals")
+            to_stderr(f"\nbest so far: {best.sentence}; written to {folder}, without intervals")
         raise
 
 
@@ -134,12 +134,12 @@ def saying_how_to_resume(path: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if path.exists():
-            aloud(
+            to_stderr(
                 f"\ncalibration stopped; its state is in {path}. The same command with --resume continues, "
                 "to the same result"
             )
         else:
-            aloud("\ncalibration stopped before the search; there is no state to --resume, begin again")
+            to_stderr("\ncalibration stopped before the search; there is no state to --resume, begin again")
         raise
 
 
@@ -184,5 +184,5 @@ def watching(
         if watch:
             address, page = stack.enter_context(live_viewer())
             if page:
-                aloud(f"watch the search at {page}  (this machine only)")
+                to_stderr(f"watch the search at {page}  (this machine only)")
         yield stack.enter_context(population_view(space, address=address, save=save, predict=predict)).show

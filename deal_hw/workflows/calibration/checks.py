@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+import numpy as np
+
+from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.grid import Recording
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.findings import Finding
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.joint_facts import JointFacts
@@ -21,10 +22,10 @@ if TYPE_CHECKING:
 GRAVITY_EXPLAINED, GRAVITY_LEAST, GRAVITY_ERRORS = 0.5, 0.01, 4.0
 """Gravity must explain this share of a deviation of at least this size [rad, m], or no gain is reported. A
 contradiction counts from this many standard errors on."""
-REQUIRED_CHECKS = ("size", "finite", "clock", "rate", "commands")
+REQUIRED_CHECKS = ("length", "finite", "clock", "rate", "commands")
 """Checks without which a recording has no time grid: --force does not overrule them."""
 MOTOR_CHECKS = (
-    "size",
+    "length",
     "finite",
     "clock",
     "rate",
@@ -39,7 +40,7 @@ MOTOR_CHECKS = (
 """Checks that also apply to commands that are efforts, not positions."""
 
 
-def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Recording]) -> None:
+def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Trajectory]) -> None:
     """Check that a floating robot's recordings contain the motion of its base.
 
     Raises:
@@ -53,7 +54,7 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
         if feet:
             raise ConfigurationError("--feet are for a model with a free joint; this one's base is fixed")
         return
-    without = [r for r in recordings if r.orientation is None or r.gyro is None]
+    without = [t for t in recordings if not _base_is_measured(t)]
     if without or not feet:
         lacks = "recordings of the base (orientation and gyro in the column map)" if without else "--feet"
         raise ConfigurationError(
@@ -63,6 +64,12 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
         )
     for name in feet:
         element_id(robot.model, "geom", name)
+
+
+def _base_is_measured(trajectory: Trajectory) -> bool:
+    body = trajectory.body
+    measured = () if body is None else (body.orientation, body.angular_velocity)
+    return bool(measured) and not any(np.isnan(values).all() for values in measured)
 
 
 def examine_recording(
@@ -90,7 +97,7 @@ def examine_recording(
         DatasetError: A check failed, and ``force`` is not set.
     """
     from deal_hw.data.checks.command_kind import command_kind
-    from deal_hw.data.checks.plausibility import examine, require
+    from deal_hw.data.checks.suite import examine, require
     from deal_hw.errors import DatasetError
     from deal_hw.findings import Severity
 

@@ -1,42 +1,41 @@
-"""Prepare a dataset of deal-hw for a calibration: fitted and held-out episodes."""
+"""Reads datasets for a calibration: of a robot with a driver, and with its own robot.yaml."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
-from deal_hw.calibration import listed
+from deal_hw.data.checks.spikes import SpikeSettings
 from deal_hw.data.recording.episode_info import motion_of
-from deal_hw.data.recording.spikes import SpikeSettings
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
-from deal_hw.parameters import ParameterSpace
-from deal_hw.robots import parameter_spaces
+from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
 from deal_hw.workflows.calibration.policy import recorded_policy
-from deal_hw.workflows.calibration.run import CalibrationInputs
 from deal_hw.workflows.calibration.settings import CalibrateSettings
-from deal_hw.workflows.calibration.walking import all_walk, weighed, while_walking
+from deal_hw.workflows.calibration.source import Source
+from deal_hw.workflows.calibration.space import (
+    extended,
+    named_space,
+    searched_space,
+    without_speed_limits,
+)
 from deal_hw.workflows.robot import recorded_robot
 from deal_hw.workflows.say import Say, silent
 from deal_hw.workflows.shipped import shipped_balancer
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.sim.engine.model import RobotModel
-    from deal_hw.sim.recordings.episode import SampledEpisode
 
 HELDOUT_MOTION = "chirp"
 SAMPLES_A_PERIOD = 4
 """Fitted states per control period."""
 
 
-def prepare_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> CalibrationInputs:
-    """Read a dataset of a robot of deal-hw.
+def read_driver_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> Source:
+    """Read a dataset of a robot with a driver.
 
     Args:
         settings: The settings; they name a dataset.
@@ -46,76 +45,99 @@ def prepare_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Sa
     Raises:
         DealHwError: A setting or a recording is unusable.
     """
-    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.sim.engine.model import load_model
 
-    folder = Path(str(settings.dataset))
-    dataset = Dataset.open(folder)
+    dataset, description = _opened(settings)
     robot_name = dataset.description["name"]
-    description = recorded_robot(dataset.description, folder)
-    fit, holdout = choose_episodes(dataset, settings.episodes, holdout, say)
-    robot = _model(description)
+    fit, held = choose_episodes(dataset, settings.episodes, holdout, say)
+    robot = load_model(description)
     space = named_space(robot_name, settings.space)
     if settings.recordings.parameters is not None:
-        space = _extended(space, settings.recordings.parameters, robot)
+        space = extended(space, settings.recordings.parameters, robot)
     space = settings.searched(space)
-    episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
+    episodes = {i: dataset.read(i) for i in (*fit, *held)}
     policy = None
     if search_of(settings.named()) in CLOSED_LOOP_METHODS:
-        runs = {i: episodes_read[i].metadata for i in fit}
         given = None if settings.policy is None else Path(settings.policy)
-        policy = recorded_policy(dataset, runs, description, given)
-    recordings, telemetry = sound_recordings(
-        {i: episode.trajectory for i, episode in episodes_read.items()}, folder, settings.spikes, say
+        policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
+    trajectories, telemetry = sound_recordings(
+        {i: episode.trajectory for i, episode in episodes.items()}, dataset.folder, settings.spikes, say
     )
-    space = without_speed_limits(space, description, recordings.values(), say)
-    names = {i: dataset.path(i).name for i in recordings}
-    episodes = _simulation(robot, recordings, names, settings.sample_hz)
-    walks = all_walk(robot, recordings.values())
-    if walks:
-        space = weighed(space, robot, recordings[fit[0]], say)
-    return CalibrationInputs(
+    return Source(
         robot=robot,
+        space=without_speed_limits(space, description, trajectories.values(), say),
+        fitted=[(dataset.path(i).name, trajectories[i]) for i in fit],
+        held=[(dataset.path(i).name, trajectories[i]) for i in held],
+        division=None,
+        sample_hz=settings.sample_hz or SAMPLES_A_PERIOD * description.control_rate_hz,
+        feet=description.feet,
+        telemetry=telemetry,
+        provenance=_provenance(dataset, fit) | {"holdout": list(held)},
+        advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {dataset.folder}",
+        balance=shipped_balancer(description),
+        name="" if robot.base is not None else description.name,
+        policy=policy,
+    )
+
+
+def read_own_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> Source:
+    """Read a dataset with its own robot.yaml, whose recordings are used like those of files.
+
+    Arguments and errors are those of :func:`read_driver_dataset`.
+    """
+    from deal_hw.sim.engine.compiling import compile_mjcf
+    from deal_hw.sim.engine.model import load_model
+    from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
+
+    config = settings.recordings
+    division = settings.division(holdout)
+    dataset, description = _opened(settings)
+    fit, held = choose_episodes(dataset, settings.episodes, holdout, say)
+    if held and config.holdout_part is None:
+        division = dataclasses.replace(division, share=0.0)
+    trajectories, telemetry = sound_recordings(
+        {i: dataset.read(i).trajectory for i in (*fit, *held)}, dataset.folder, settings.spikes, say
+    )
+    model = compile_mjcf(description.mjcf)
+    space = searched_space(settings, model, say)
+    timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
+    rates = sampling(1.0 / description.state_rate_hz, timestep, config.window)
+    description = dataclasses.replace(
+        description,
+        device_rate_hz=1.0 / rates.step_s,
+        control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
+    )
+    return Source(
+        robot=load_model(with_speed_limits(description, model, space), rates.step_s),
         space=space,
-        episodes=[episodes[i] for i in fit],
-        holdout=[episodes[i] for i in holdout],
-        shown=recordings[fit[0]],
+        fitted=[(dataset.path(i).name, trajectories[i]) for i in fit],
+        held=[(dataset.path(i).name, trajectories[i]) for i in held],
+        division=division,
+        sample_hz=settings.sample_hz,
+        feet=description.feet,
         telemetry=telemetry,
         provenance={
-            "dataset": str(folder),
-            "description_digest": dataset.digest,
-            "episodes": list(fit),
-            "holdout": list(holdout),
+            **_provenance(dataset, fit),
+            "holdout": list(held) or f"last {division.share:.0%} of each recording",
+            "sampling": dataclasses.asdict(rates),
         },
-        advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {folder}",
-        balance=shipped_balancer(robot.description),
-        name="" if robot.base is not None else robot.description.name,
-        policy=policy,
-        walks=walks,
+        advice="import recordings of other motion, and name their episodes with --holdout",
     )
 
 
-def without_speed_limits(
-    space: ParameterSpace, description: RobotDescription, trajectories: Iterable[Trajectory], say: Say
-) -> ParameterSpace:
-    """Return the space without the speed limits of servos whose set-points the host moves (ODrive).
+def _opened(settings: CalibrateSettings) -> tuple[Dataset, RobotDescription]:
+    from deal_hw.data.recording.dataset import Dataset
 
-    The commands to such a drive carry its own limit, which is above the range of a servo's. Its set-point
-    jumps with each command. The known value is so high that the model's does, too.
-    """
-    every = list(trajectories)
-    numbers = {joint: number for number, joint in enumerate(description.actuated)}
-    known = {}
-    for p in space:
-        if p.kind != "servo_speed_limit":
-            continue
-        columns = [numbers[joint] for joint in p.elements]
-        sent = np.concatenate([t.speed_limit[:, columns].ravel() for t in every])
-        if sent.size and np.nanmin(sent) > p.high:
-            steps = [np.abs(np.diff(t.position_target[:, columns], axis=0)).max(initial=0.0) for t in every]
-            known[p.name] = max(float(np.nanmin(sent)), description.device_rate_hz * float(np.nanmax(steps)))
-    if known:
-        say(f"{listed(list(known))}: not searched, because the host limits the speed of these set-points")
-    return space.with_known(known)
+    dataset = Dataset.open(Path(str(settings.dataset)))
+    return dataset, recorded_robot(dataset.description, dataset.folder)
+
+
+def _provenance(dataset: Dataset, fit: Sequence[int]) -> dict[str, Any]:
+    return {
+        "dataset": str(dataset.folder),
+        "description_digest": dataset.digest,
+        "episodes": list(fit),
+    }
 
 
 def sound_recordings(
@@ -135,8 +157,8 @@ def sound_recordings(
     Raises:
         InsufficientDataError: An episode cannot be used.
     """
-    from deal_hw.data.recording.spikes import without_spikes
-    from deal_hw.data.recording.telemetry_checks import check
+    from deal_hw.data.checks.spikes import without_spikes
+    from deal_hw.data.checks.suite import check
     from deal_hw.findings import Severity
 
     verdicts = {index: check(trajectory, spikes) for index, trajectory in trajectories.items()}
@@ -149,21 +171,8 @@ def sound_recordings(
             )
         for jump in [v.message for v in found if v.code == "spikes" and v.severity is Severity.WARN][:1]:
             say(f"episode {index}: {jump}")
-    told = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
-    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, told
-
-
-def named_space(robot: str, name: str = "") -> ParameterSpace:
-    """Return a parameter set of a robot; "": its first.
-
-    Raises:
-        UnknownNameError: There is no such set; the message lists them.
-    """
-    table = parameter_spaces(robot)
-    name = name or next(iter(table))
-    if name not in table:
-        raise UnknownNameError("parameter set", name, table)
-    return table[name]()
+    lines = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
+    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, lines
 
 
 def choose_episodes(
@@ -201,41 +210,8 @@ def choose_episodes(
     return fit, held
 
 
-def _model(description: RobotDescription) -> RobotModel:
-    try:
-        from deal_hw.sim.engine.model import load_model
-    except ModuleNotFoundError as err:
-        raise MissingExtraError(str(err.name), "calib") from err
-
-    return load_model(description)
-
-
-def _extended(space: ParameterSpace, file: Path, robot: RobotModel) -> ParameterSpace:
-    from deal_hw.sim.parameters import check_space
-    from deal_hw.sim.parameters.yaml_space import read_space
-
-    found = ParameterSpace([*space.parameters, *read_space(file, robot.model).parameters])
-    check_space(robot.model, found)
-    return found
-
-
 def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
     """Return whether a recording repeats the one before with a stronger motion, by their metadata."""
     same = all(one.get(key) == former.get(key) for key in ("seed", "seconds"))
     same = same and motion_of(one) == motion_of(former)
     return same and one.get("attempt", 0) == former.get("attempt", 0) + 1
-
-
-def _simulation(
-    robot: RobotModel, recordings: Mapping[int, Trajectory], names: Mapping[int, str], sample_hz: float | None
-) -> dict[int, SampledEpisode]:
-    from deal_hw.sim.recordings.episode import align, thin
-    from deal_hw.sim.recordings.standing import with_sensed_base
-
-    episodes = {}
-    for i, trajectory in recordings.items():
-        episodes[i] = align(trajectory, robot.description, names[i])
-        if robot.base is not None and trajectory.body is not None:
-            episodes[i] = while_walking(with_sensed_base(episodes[i], robot, trajectory), trajectory)
-        episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)
-    return episodes

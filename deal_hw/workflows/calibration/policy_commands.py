@@ -18,7 +18,7 @@ from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policy import PolicySpec
     from deal_hw.sim.mjcf.joint_facts import JointFacts
@@ -189,12 +189,12 @@ def _checked(
             "Another policy moved the robot, or states and commands have no common clock. Name the right "
             "policy; or take the commands out of the column map, and those of the policy are used"
         )
-    said = f"{table.name}: {name} gives {share:.0%} of the variance of the recorded commands"
+    fit = f"{table.name}: {name} gives {share:.0%} of the variance of the recorded commands"
     if -period_s <= late_s <= USUAL_DELAY_S:
-        say(f"{said}, {1e3 * late_s:.0f} ms after its states: both have one clock")
+        say(f"{fit}, {1e3 * late_s:.0f} ms after its states: both have one clock")
         return table
     say(
-        f"{said}, but {abs(late_s):.3g} s {'after' if late_s > 0 else 'before'} its states: their clocks are "
+        f"{fit}, but {abs(late_s):.3g} s {'after' if late_s > 0 else 'before'} its states: their clocks are "
         "apart. The commands are moved by that time, and the latency then counts from the policy's state"
     )
     return dataclasses.replace(table, command_s=table.command_s - late_s)

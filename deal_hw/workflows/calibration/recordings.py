@@ -1,4 +1,4 @@
-"""Prepare recording files for a calibration: read, leave parts out, grid, divide into fitted and held-out."""
+"""Tables of recordings in files or memory: read, leave parts out, put on the grid."""
 
 from __future__ import annotations
 
@@ -12,36 +12,31 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import REQUIRED_CHECKS
+from deal_hw.workflows.calibration.source import Named
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.columns import ColumnMap, JointKinds
     from deal_hw.data.importing.grid import Recording
-    from deal_hw.data.importing.table import Table
+    from deal_hw.data.table import Table
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.describe import Sampling
     from deal_hw.sim.mjcf.joint_facts import JointFacts
-    from deal_hw.sim.recordings.episode import SampledEpisode
 
-STRETCH_S = 2.5
-"""Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
-HELDOUT_STRETCH_S = 20.0
-
-
-Source = Path | str | Mapping[str, Any] | Any
+Recorded = Path | str | Mapping[str, Any] | Any
 """A recording: a file's path, or data in memory (:mod:`deal_hw.data.importing.memory_source`)."""
 
 
 def read_tables(
-    sources: Sequence[Source],
+    sources: Sequence[Recorded],
     columns: ColumnMap | None,
     facts: JointFacts,
     say: Callable[[str], None],
     name: str,
-    said: dict[str, str],
+    printed: dict[str, str],
 ) -> list[Table]:
     """Return recordings in SI units, on their own stamps; those in memory are called NAME[0], NAME[1], ...
 
-    ``said`` has the guessed column maps that were printed already; new ones are added.
+    ``printed`` has the guessed column maps that were printed already; new ones are added.
     """
     from deal_hw.data.importing.load import load_tables, tables_of
     from deal_hw.data.importing.memory_source import read_memory
@@ -50,10 +45,10 @@ def read_tables(
     joints, kinds = facts.names, kinds_of(facts)
     for number, source in enumerate(sources):
         if isinstance(source, str | Path):
-            tables += load_tables(Path(source), columns, joints, say, said, kinds)
+            tables += load_tables(Path(source), columns, joints, say, printed, kinds)
         else:
             channels = read_memory(source, f"{name}[{number}]")
-            tables += tables_of([channels], columns, joints, say, said, kinds)
+            tables += tables_of([channels], columns, joints, say, printed, kinds)
     return tables
 
 
@@ -99,7 +94,7 @@ def common_rates(
         ConfigurationError: They have different joints, or a setting cannot be used.
         DatasetError: A clock is invalid, or rates differ.
     """
-    from deal_hw.data.checks.plausibility import examine, require
+    from deal_hw.data.checks.suite import examine, require
     from deal_hw.data.importing.grid import common_period
     from deal_hw.sim.mjcf.describe import sampling
 
@@ -184,14 +179,14 @@ def _rows(table: Table, keep: Any) -> Table:
     return table.rows(keep)
 
 
-def named_on_grid(tables: Sequence[Table], robot: RobotModel, rates: Sampling) -> list[tuple[str, Recording]]:
+def named_on_grid(tables: Sequence[Table], robot: RobotModel, rates: Sampling) -> list[Named]:
     """Return recordings on the grid with their names; a table with pauses gives several."""
     found = []
     for table in tables:
         recordings = on_grid(table, robot, rates)
         for number, recording in enumerate(recordings, 1):
             part = f", part {number} of {len(recordings)}" if len(recordings) > 1 else ""
-            found.append((table.name + part, recording))
+            found.append((table.name + part, recording.trajectory))
     return found
 
 
@@ -211,69 +206,3 @@ def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]
         full = model.actuator_gear[actuators, 0] * model.actuator_gainprm[actuators, 0]
         table = dataclasses.replace(table, target=table.target / full)
     return to_trajectories(table, gains, rates.period_s)
-
-
-def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...], name: str = "") -> SampledEpisode:
-    """Return a recording on the physics grid, called NAME; a floating robot's one includes the base."""
-    from deal_hw.sim.recordings.episode import align, fill_gaps
-    from deal_hw.sim.recordings.imu_base import with_base
-
-    episode = align(recording.trajectory, robot.description, name)
-    if recording.orientation is not None and recording.gyro is not None and robot.base is not None:
-        episode = with_base(episode, robot, feet, recording.orientation, recording.gyro)
-    return fill_gaps(episode)
-
-
-def without_scraps(episodes: Sequence[SampledEpisode], say: Callable[[str], None]) -> list[SampledEpisode]:
-    """Return recordings without those too short to be smoothed, as a few samples between two gaps are.
-
-    If all are, all stay: whoever uses them says how long a recording must be.
-    """
-    from deal_hw.calib.data.noise import smoothed_samples
-
-    kept = [e for e in episodes if len(e.sample) > 1 and len(e.sample) >= smoothed_samples(e.period_s)]
-    short = len(episodes) - len(kept)
-    if not kept or not short:
-        return list(episodes)
-    samples = sum(len(e.sample) for e in episodes) - sum(len(e.sample) for e in kept)
-    say(f"left out: {short} parts between gaps, of {samples} samples in all, which are too short to be used")
-    return kept
-
-
-def divide(
-    episodes: Sequence[SampledEpisode],
-    judge: Sequence[SampledEpisode],
-    share: float,
-    fit_seconds: float,
-    window_s: float,
-    say: Callable[[str], None],
-) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
-    """Return the parts to fit and the held-out parts.
-
-    Args:
-        episodes: Recordings to fit.
-        judge: Held-out recordings.
-        share: Share of each fitted recording, its last part, that is held out as well.
-        fit_seconds: How much to fit, spread evenly [s].
-        window_s: Length of a search's longest windows [s].
-        say: Called with a sentence if not all is fitted.
-    """
-    from deal_hw.sim.recordings.parts import split_last, spread, stretches
-
-    fit, held = list(episodes), list(judge)
-    if share > 0:
-        pairs = [split_last(e, share) for e in episodes]
-        fit, held = [first for first, _ in pairs], [last for _, last in pairs]
-    parts = [p for e in fit for p in stretches(e, max(STRETCH_S, 3 * window_s))]
-    chosen = spread(parts, fit_seconds)
-    if len(chosen) < len(parts):
-        say(
-            f"fitting {sum(map(seconds_of, chosen)):.0f} s of {sum(map(seconds_of, parts)):.0f} s, in "
-            f"{len(chosen)} evenly spread parts (--fit-seconds)"
-        )
-    return chosen, [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
-
-
-def seconds_of(episode: SampledEpisode) -> float:
-    """Return the length of an episode [s]."""
-    return (len(episode.sample) - 1) * episode.period_s

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,62 +22,20 @@ from deal_hw.calibration import (
     Progress,
     ProgressCallback,
 )
-from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
+from deal_hw.errors import InsufficientDataError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.ranges import Range
-from deal_hw.types import FloatArray, Trajectory
+from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.best_so_far import SO_FAR, BestSoFar, keeping_best, saying_how_to_resume
-from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
-from deal_hw.workflows.say import Say, aloud, silent
+from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSettings
+from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldoutErrors
-    from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
-
-HELDOUT_WINDOW_S = 0.2
-"""The same as in :mod:`deal_hw.calib.validation.metrics`, which is loaded on need."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationInputs:
-    """The inputs of a calibration, read and checked.
-
-    Attributes:
-        robot: The nominal model.
-        space: The parameters to search.
-        episodes: Recordings to fit.
-        holdout: Held-out recordings, which only test the result.
-        shown: The recording that ``--watch`` shows.
-        telemetry: Verdicts on the recordings, for the report.
-        provenance: Sources of the inputs: plain JSON values.
-        advice: How to get a held-out recording if there is none.
-        balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
-        name: Name under which `deal-hw collect` records this robot; "" if it cannot.
-        walks: Whether all recordings are of a policy that walks.
-        policy: The policy that moved the robot all the time, if the method needs it.
-    """
-
-    robot: RobotModel
-    space: ParameterSpace
-    episodes: Sequence[SampledEpisode]
-    holdout: Sequence[SampledEpisode]
-    shown: Trajectory
-    telemetry: Sequence[str]
-    provenance: Mapping[str, Any]
-    advice: str
-    balance: Callable[[], Behaviour] | None = None
-    name: str = ""
-    walks: bool = False
-    policy: PopulationPolicy | None = None
-
-    @property
-    def smoothing_s(self) -> float | None:
-        """Time over which start states are smoothed [s]; None for the default."""
-        return GAIT_SMOOTHING_S if self.walks else None
+    from deal_hw.workflows.calibration.intake import CalibrationInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +49,42 @@ class CalibrateReport:
 
     result: CalibrationResult
     files: dict[str, Path]
+
+
+def calibrate_input(
+    settings: CalibrateSettings,
+    work: CalibrationInput,
+    method: str,
+    *,
+    progress: ProgressCallback | None = None,
+    say: Say = silent,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    keep: Path | None = None,
+) -> CalibrationResult:
+    """Calibrate with the settings; see :func:`calibrate_episodes`."""
+    return calibrate_episodes(
+        work.robot,
+        work.space,
+        work.episodes,
+        work.holdout,
+        method=method,
+        budget=settings.budget,
+        thorough=settings.checks == "all",
+        rng=np.random.default_rng(settings.seed),
+        latency_s=settings.latency,
+        latency_range_s=settings.latency_range,
+        threads=settings.threads,
+        progress=progress,
+        say=say,
+        checkpoint=checkpoint,
+        resume=resume,
+        keep=keep,
+        known_std=work.known_std,
+        heldout_window_s=settings.heldout_window,
+        policy=work.policy,
+        smoothing_s=work.smoothing_s,
+    )
 
 
 def calibrate_episodes(
@@ -148,8 +141,8 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays, target_changes
         from deal_hw.calib.data.noise import SMOOTHING_S
         from deal_hw.calib.data.problem import Problem
+        from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.pipeline.methods import make_method
-        from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.validation.checks import latency_alarms
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:
@@ -232,62 +225,8 @@ def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None
         raise InsufficientDataError(f"the held-out recordings are too short: {problem} (--heldout-window)")
 
 
-def residual_std(
-    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
-) -> FloatArray | None:
-    """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
-
-    Args:
-        given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
-            line as words; None or no words: none is expected.
-        robot: The robot.
-
-    Raises:
-        ConfigurationError: A number is missing, or is not above 0.
-        UnknownNameError: A joint is not known.
-    """
-    if given is None or given == ():
-        return None
-    if isinstance(given, tuple) and len(given) == 1:
-        given = _number(given[0])
-    elif isinstance(given, tuple):
-        # A last word without a number is a joint without a value.
-        found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
-        given = dict(zip(given[::2], found, strict=True))
-    names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
-    one = not isinstance(given, Mapping)
-    values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
-    for name in values:
-        if name not in names:
-            raise UnknownNameError("joint", name, names)
-    if (
-        set(values) != set(names)
-        or any(math.isnan(v) for v in values.values())
-        or (one and robot.base is not None)
-    ):
-        whole = "" if robot.base is not None else "one number, or "
-        raise ConfigurationError(
-            f"--residual-std: give {whole}a name and a number above 0 for each of {', '.join(names)}"
-        )
-    for value in values.values():
-        Range(1e-9, 1e3, "rad or m").check("--residual-std", float(value))
-    C = len(robot.coordinates)
-    std = np.ones(2 * C)
-    std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
-    if robot.base is not None:
-        std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
-    return std
-
-
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as err:
-        raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err
-
-
 def finish(
-    work: CalibrationInputs,
+    work: CalibrationInput,
     result: CalibrationResult,
     folder: Path,
     settings: Mapping[str, Any],
@@ -324,13 +263,13 @@ def finish(
             checkpoint.unlink(missing_ok=True)
             shutil.rmtree(folder / SO_FAR, ignore_errors=True)
     except KeyboardInterrupt:
-        aloud(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
+        to_stderr(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
         raise
     return CalibrateReport(result=result, files=files)
 
 
 def judged(
-    work: CalibrationInputs,
+    work: CalibrationInput,
     result: CalibrationResult,
     settings: Mapping[str, Any],
     *,

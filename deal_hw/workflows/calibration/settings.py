@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
 
 from deal_hw.calib.pipeline.methods import (
     DEFAULT_SEARCH,
@@ -16,23 +19,24 @@ from deal_hw.calib.pipeline.methods import (
     with_search,
 )
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
+from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.data.files import dataset_of
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.policy import check_policy
-from deal_hw.workflows.calibration.recordings import Source
-from deal_hw.workflows.calibration.run import (
-    HELDOUT_WINDOW_S,
-    residual_std,
-)
+from deal_hw.workflows.calibration.recordings import Recorded
+from deal_hw.workflows.calibration.source import Division
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, given, refuse
 from deal_hw.workflows.robot import carries_robot
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
+
+HELDOUT_PART = 0.25
+HELDOUT_WINDOW_S = 0.2
+"""The same as in :mod:`deal_hw.calib.validation.metrics`, which is loaded on need."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +85,7 @@ class Recordings(Checked):
     per sampling period."""
 
     force: bool = False
-    """Use recordings although a plausibility check failed."""
+    """Use recordings although a check of them failed."""
 
 
 OF_DATASETS = ("episodes", "space", "sample_hz")
@@ -198,7 +202,7 @@ class CalibrateSettings(Checked):
         if not low < high:
             raise ConfigurationError(f"--latency-range {low:g} {high:g}: give the lower one first")
 
-    def check(self, data: Sequence[Source] = ()) -> None:
+    def check(self, data: Sequence[Recorded] = ()) -> None:
         """Check the combination of settings before anything is read.
 
         Args:
@@ -253,6 +257,23 @@ class CalibrateSettings(Checked):
     def budget(self) -> Budget:
         """Budget of the method."""
         return usual_budget(self.named(), self.population, self.generations, refine=self.refine)
+
+    def division(self, holdout: Sequence[object]) -> Division:
+        """Return how recordings become parts to fit and parts that judge.
+
+        Args:
+            holdout: Recordings that only judge.
+
+        Raises:
+            ConfigurationError: A share of each recording is to be held out as well.
+        """
+        config = self.recordings
+        if holdout and config.holdout_part:
+            raise ConfigurationError("give --holdout or --holdout-part, not both")
+        share = HELDOUT_PART if config.holdout_part is None else config.holdout_part
+        return Division(
+            share=0.0 if holdout else share, fit_seconds=config.fit_seconds, window_s=config.window
+        )
 
     def known_std(self, robot: RobotModel) -> FloatArray | None:
         """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
@@ -329,3 +350,57 @@ def check_source(*, dataset: Path | str | None, model: bool, data: bool) -> None
             "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
             f"(deal-hw calibrate --model robot.xml --data rec.csv), {how}"
         )
+
+
+def residual_std(
+    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
+) -> FloatArray | None:
+    """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
+
+    Args:
+        given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
+            line as words; None or no words: none is expected.
+        robot: The robot.
+
+    Raises:
+        ConfigurationError: A number is missing, or is not above 0.
+        UnknownNameError: A joint is not known.
+    """
+    if given is None or given == ():
+        return None
+    if isinstance(given, tuple) and len(given) == 1:
+        given = _number(given[0])
+    elif isinstance(given, tuple):
+        # A last word without a number is a joint without a value.
+        found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
+        given = dict(zip(given[::2], found, strict=True))
+    names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
+    one = not isinstance(given, Mapping)
+    values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
+    for name in values:
+        if name not in names:
+            raise UnknownNameError("joint", name, names)
+    if (
+        set(values) != set(names)
+        or any(math.isnan(v) for v in values.values())
+        or (one and robot.base is not None)
+    ):
+        whole = "" if robot.base is not None else "one number, or "
+        raise ConfigurationError(
+            f"--residual-std: give {whole}a name and a number above 0 for each of {', '.join(names)}"
+        )
+    for value in values.values():
+        Range(1e-9, 1e3, "rad or m").check("--residual-std", float(value))
+    C = len(robot.coordinates)
+    std = np.ones(2 * C)
+    std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
+    if robot.base is not None:
+        std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
+    return std
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError as err:
+        raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err

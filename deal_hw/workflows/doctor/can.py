@@ -76,11 +76,11 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
         others = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])
         yield Finding("can", Severity.NOTE, f"other nodes on the bus: {others}", "they are filtered out")
     if missing := sorted(set(nodes) - set(frames)):
-        heard = ", ".join(map(str, sorted(frames)))
+        received = ", ".join(map(str, sorted(frames)))
         yield Finding(
             "can",
             Severity.WARN,
-            f"no frame from node {', '.join(map(str, missing))}; heard: {heard}",
+            f"no frame from node {', '.join(map(str, missing))}; received: {received}",
             f"give the number in the port: {transport.port.partition('?')[0]}?node=NUMBER",
         )
     if transport.error_frames:

@@ -8,7 +8,7 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -33,10 +33,10 @@ _COARSE_S: Final = 1e-5
 _LEAST_RECEIVE_BYTES: Final = 200_000
 
 
-def examine_machine() -> Iterator[Finding]:
-    """Yield the findings."""
+def examine_machine(packages: Sequence[tuple[str, str]] = PACKAGES) -> Iterator[Finding]:
+    """Yield the findings; ``packages`` are distributions and the extras that install them."""
     yield _system()
-    yield from _packages()
+    yield from _packages(packages)
     yield _scheduling()
     yield _memory()
     yield from _clock()
@@ -51,8 +51,8 @@ def _system() -> Finding:
     return Finding("system", Severity.OK, text)
 
 
-def _packages() -> Iterator[Finding]:
-    for name, extra in PACKAGES:
+def _packages(packages: Sequence[tuple[str, str]]) -> Iterator[Finding]:
+    for name, extra in packages:
         if version := _version(name):
             yield Finding("packages", Severity.OK, f"{name} {version}")
         else:

@@ -55,15 +55,15 @@ def happenings(path: File | None, *logs: Sequence[tuple[int, int, str]]) -> Iter
     if path is None:
         yield lambda: None
         return
-    told = [0] * len(logs)
+    written = [0] * len(logs)
     with Path(path).open("a", encoding="utf-8") as file:
 
         def tell() -> None:
             for number, log in enumerate(logs):
-                for entry in log[told[number] :]:
+                for entry in log[written[number] :]:
                     file.write(json.dumps(entry) + "\n")
                     file.flush()
-                told[number] = len(log)
+                written[number] = len(log)
 
         yield tell
 
@@ -133,7 +133,8 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
 
 def next_line(config: EmulateSettings, port: str) -> str:
     """Return the line that says how to reach an emulated robot."""
-    transport = f" --transport {config.transport}" if config.transport else ""
+    usual = type(config).transport
+    transport = "" if config.transport == usual else f" --transport {config.transport}"
     return f"next, in another terminal: deal-hw doctor {config.robot} --port {port}{transport}"
 
 

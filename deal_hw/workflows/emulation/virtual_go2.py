@@ -98,11 +98,11 @@ def walk(
     """
     clock = VirtualClock(_START_NS)
     watched = _Watched(Go2Device(truth))
-    told: list[Event] = []
+    wanted_events: list[Event] = []
 
     def note(velocity: FloatArray) -> None:
         loop.note(VELOCITY_EVENT, "wanted velocity", **velocity_data(velocity))
-        told.append(Event(watched.device_ns, VELOCITY_EVENT, "", velocity_data(velocity)))
+        wanted_events.append(Event(watched.device_ns, VELOCITY_EVENT, "", velocity_data(velocity)))
 
     slowed = SlowedVelocity(NotedVelocity(source, note))
     inner = PolicyBehaviour(policy, DRIVER, slowed)
@@ -128,4 +128,4 @@ def walk(
             trajectory = read_episode(file).trajectory
     rows = np.array(watched.rows)
     track = Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
-    return VirtualWalk(report, trajectory, wanted_in(told, 0, seconds), track, rows[:, 4])
+    return VirtualWalk(report, trajectory, wanted_in(wanted_events, 0, seconds), track, rows[:, 4])

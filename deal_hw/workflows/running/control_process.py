@@ -24,13 +24,13 @@ from deal_hw.control.process.realtime import (
     kill_self_after,
     parent_is_gone,
 )
-from deal_hw.control.process.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
+from deal_hw.control.process.watchdog import SUPERVISOR_SILENCE_S, SupervisorWatchdog
 
 _START_SILENCE_S = 30.0
 _ORPHAN_S = 5.0
 """Time an orphaned control process may take beyond that of repeating the passive command [s]."""
 _SUPERVISOR_SILENT = signal.SIGUSR2
-"""Sent by the vigil's thread to the main thread, which may be waiting for the robot."""
+"""Sent by the watchdog's thread to the main thread, which may be waiting for the robot."""
 
 
 class _Stopper:
@@ -41,7 +41,7 @@ class _Stopper:
         self.loop: Any = None
         self.passive_s = 0.0
         self.supervisor_silent = False
-        """Whether the vigil found so: another program may send its signal, too."""
+        """Whether the watchdog found so: another program may send its signal, too."""
         self.reason = ""
         """Of the first signal; "" before it."""
         signals.take(self._handle)
@@ -138,11 +138,11 @@ def _run(
         stopper.supervisor_silent = True
         signal.pthread_kill(main, _SUPERVISOR_SILENT)
 
-    vigil = SupervisorVigil(status, clock, supervisor_is_silent)
+    watchdog = SupervisorWatchdog(status, clock, supervisor_is_silent)
 
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)
-        for key in vigil.messages():
+        for key in watchdog.messages():
             if key == END_KEY and plan.stand:
                 end.request("ended by the operator's key")
             elif key == END_KEY:
@@ -176,7 +176,7 @@ def _run(
     if stopper.reason:
         # Its exception was lost in a callback of a library.
         loop.request_stop(stopper.reason)
-    vigil.start()
+    watchdog.start()
     return {**loop.run().to_json(), "warnings": list(granted.warnings)}
 
 

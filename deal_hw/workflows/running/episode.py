@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from deal_hw.types import Trajectory
 
 _CHECKING = "checking the recording"
-_IN_VAIN = PassiveConfig(timeout_s=1.0)
+_TRIED_AGAIN = PassiveConfig(timeout_s=1.0)
 """Time of the supervisor's own passive route after the control process failed for its whole time [s]."""
 
 
@@ -106,7 +106,7 @@ class EpisodeRun:
             module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
-            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, on_beat),
+            passive=lambda phase, already_tried: self._make_passive(phase, already_tried, on_beat),
             recorder=recorder,
             on_beat=on_beat,
             keep_fds=self._keep_fds,
@@ -187,7 +187,7 @@ class EpisodeRun:
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
         return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
 
-    def _make_passive(self, phase: str, in_vain: bool, on_beat: Callable[[Beat], None]) -> bool:
+    def _make_passive(self, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""
         untouched = (
             STARTING,
@@ -203,5 +203,5 @@ class EpisodeRun:
         def tell(text: str, silence_s: float) -> None:
             on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
 
-        config = _IN_VAIN if in_vain else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
+        config = _TRIED_AGAIN if already_tried else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
         return make_passive(self._robot, clock, config, progress=tell)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.velocity import END_KEY
-from deal_hw.workflows.say import Say, aloud
+from deal_hw.workflows.say import Say, to_stderr
 
 STOP_KEY = "\x1b"
 """Escape makes the robot passive at once."""
@@ -36,7 +36,7 @@ def check_terminal() -> None:
 
 
 @contextlib.contextmanager
-def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = aloud) -> Iterator[None]:
+def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = to_stderr) -> Iterator[None]:
     """Call ``pressed`` for each key, and ``stop`` for the one that makes the robot passive, from a thread.
 
     ``stop`` is called once: a held key repeats, and a second stop would kill the control process. It is also

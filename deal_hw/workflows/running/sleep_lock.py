@@ -43,12 +43,12 @@ class SleepLock:
 
     Args:
         before_sleep: Called in the thread when the computer is about to sleep. The computer sleeps once the
-        run has
-            ended, or after logind's time.
+            run has ended, or after logind's time.
+        answer_s: Longest wait for logind [s].
     """
 
-    def __init__(self, before_sleep: Callable[[], None]) -> None:
-        self._before_sleep = before_sleep
+    def __init__(self, before_sleep: Callable[[], None], answer_s: float = ANSWER_S) -> None:
+        self._before_sleep, self._answer_s = before_sleep, answer_s
         self._answer: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._locks: list[Any] = []
         self._connection: Any = None
@@ -57,12 +57,12 @@ class SleepLock:
         self.refused: dict[str, str] = {}
 
     def take(self) -> str:
-        """Ask for the locks, at most for :data:`ANSWER_S`; return why there is no logind, or ""."""
+        """Ask for the locks, at most for ``answer_s``; return why there is no logind, or ""."""
         threading.Thread(target=self._serve, name="sleep lock", daemon=True).start()
         try:
-            return self._answer.get(timeout=ANSWER_S)
+            return self._answer.get(timeout=self._answer_s)
         except queue.Empty:
-            return f"no answer within {ANSWER_S:g} s"
+            return f"no answer within {self._answer_s:g} s"
 
     def release(self) -> None:
         """Release the locks."""
@@ -104,16 +104,16 @@ class SleepLock:
             "/org/freedesktop/login1", "org.freedesktop.login1", "org.freedesktop.login1.Manager"
         )
         self._connection = connection = open_dbus_connection(
-            "SYSTEM", enable_fds=True, auth_timeout=2 * ANSWER_S
+            "SYSTEM", enable_fds=True, auth_timeout=2 * self._answer_s
         )
         coming = MatchRule(
             type="signal", interface=manager.interface, member="PrepareForSleep", path=manager.object_path
         )
-        unwrap_msg(connection.send_and_get_reply(message_bus.AddMatch(coming), timeout=ANSWER_S))
+        unwrap_msg(connection.send_and_get_reply(message_bus.AddMatch(coming), timeout=self._answer_s))
         for what, mode in (BLOCK, DELAY):
             asked = new_method_call(manager, "Inhibit", "ssss", (what, "deal-hw", _WHY, mode))
             try:
-                (lock,) = unwrap_msg(connection.send_and_get_reply(asked, timeout=ANSWER_S))
+                (lock,) = unwrap_msg(connection.send_and_get_reply(asked, timeout=self._answer_s))
             except DBusErrorResponse as error:
                 self.refused[mode] = str(error.data[0]) if error.data else error.name
             else:
@@ -133,14 +133,15 @@ _MEMBER: Final = 3
 
 
 @contextlib.contextmanager
-def awake(before_sleep: Callable[[], None], say: Say) -> Iterator[None]:
+def awake(before_sleep: Callable[[], None], say: Say, answer_s: float = ANSWER_S) -> Iterator[None]:
     """Keep this computer awake inside the block, or say that it cannot be kept awake.
 
     Args:
         before_sleep: Called from another thread when the computer is about to sleep all the same.
         say: Called with one line if sleep is not blocked.
+        answer_s: Longest wait for logind [s].
     """
-    lock = SleepLock(before_sleep)
+    lock = SleepLock(before_sleep, answer_s)
     missing = lock.take()
     if "block" not in lock.held:
         why = missing or lock.refused.get("block", "no lock")

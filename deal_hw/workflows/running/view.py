@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from deal_hw.control.process.channel import Beat
-from deal_hw.workflows.say import Say, aloud, silent
+from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
     from deal_hw.workflows.design_excitation import ExcitationReport
@@ -37,7 +37,7 @@ class RunView:
     @classmethod
     def of_python(cls, say: Say) -> RunView:
         """Return the view of a program with its ``say``; without one, warnings go to standard error."""
-        return cls(say, aloud if say is silent else say)
+        return cls(say, to_stderr if say is silent else say)
 
     def warn(self, text: str) -> None:
         """Show a warning to the operator."""

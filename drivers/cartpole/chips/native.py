@@ -133,19 +133,15 @@ def stm32_image(program: str = "cartpole-stm32", *, qemu: bool = False) -> Path:
         ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
     """
     sources = ("stm32/startup.c", "stm32/board.c", STM32[program], "rig.c", *CORE)
-    return _arm_build(f"{program}.elf", sources, *(("-DQEMU",) if qemu else ()))
+    return arm_build(f"{program}.elf", sources, *(("-DQEMU",) if qemu else ()))
 
 
-def qemu_core() -> Path:
-    """Return the core alone for a Cortex-M3 under QEMU (``host/qemu.c``), as an ELF file.
+def arm_build(name: str, sources: Sequence[str], *options: str) -> Path:
+    """Return C sources compiled and linked for a Cortex-M3, as an ELF file of that name.
 
     Raises:
         ConfigurationError: There is no arm-none-eabi-gcc, or it refuses the sources.
     """
-    return _arm_build("core.elf", QEMU_CORE, "-DCARTPOLE_QUEUE=32")
-
-
-def _arm_build(name: str, sources: Sequence[str], *options: str) -> Path:
     script = ("-T", str(SOURCES / "stm32" / "link.ld"))
     return build(name, (*ARM_CC, *options), sources, ARM_INSTALL, (*script, "-lgcc"))
 
@@ -177,8 +173,8 @@ def write_stm32_image(folder: Path) -> str:
         shutil.copy(stm32_image(program), elf)
         subprocess.run(["arm-none-eabi-objcopy", "-O", "binary", str(elf), str(code)], check=True)
         size = ["arm-none-eabi-size", str(elf)]
-        said = subprocess.run(size, check=True, capture_output=True, text=True).stdout
-        code_bytes, data, zero = (int(text) for text in said.splitlines()[1].split()[:3])
+        sizes = subprocess.run(size, check=True, capture_output=True, text=True).stdout
+        code_bytes, data, zero = (int(text) for text in sizes.splitlines()[1].split()[:3])
         lines.append(
             f"{code.name} for the STM32F103C8: flash {code_bytes + data} bytes of 65536, "
             f"RAM {data + zero} bytes of 20480 (the stack has the rest of the first 8192)"

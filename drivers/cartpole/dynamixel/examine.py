@@ -206,11 +206,11 @@ class Examination:
                 "has id 1, and two servos with the same id corrupt each other's answers: connect one alone, "
                 f"set its id {_WIZARD}, then connect both"
             )
-        if self._bus.heard:
+        if self._bus.received_bytes:
             raise WrongDeviceError(
-                f"{self._where}: {self._bus.heard} bytes came, but no valid answer of a Dynamixel; check "
-                f"for another device on this port, another rate than {s.baud_rate} baud, and two servos "
-                "with the same id"
+                f"{self._where}: {self._bus.received_bytes} bytes came, but no valid answer of a Dynamixel; "
+                f"check for another device on this port, another rate than {s.baud_rate} baud, and two "
+                "servos with the same id"
             )
         raise TransportTimeoutError(
             f"{self._where}: no servo answers at {s.baud_rate} baud; check their supply and the port. New "

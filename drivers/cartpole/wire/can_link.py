@@ -313,10 +313,10 @@ def _to_values(message: CanMessage, version: int) -> dict[str, int]:
         if len(kind) > 16:
             raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
         # A device of another version reports its own version.
-        told = version if message.version == protocol.VERSION else message.version
+        reported = version if message.version == protocol.VERSION else message.version
         return values | {
             "Request": message.request,
-            "Version": told,
+            "Version": reported,
             "DeviceRate": message.device_rate_hz,
             "StateRate": message.state_rate_hz,
             "Kind1": int.from_bytes(kind[:8], "little"),

@@ -33,7 +33,7 @@ from deal_hw.transport import Message
 _STREAMS: Final = 64
 """Number of streams whose newest sequences are remembered; messages of older streams are too old anyway."""
 _TOLD: Final = 8
-"""Number of streams that the status names, those heard last."""
+"""Number of streams that the status names, those received last."""
 _REQUESTS: Final = {topics.request(name): name for name in topics.SERVICES}
 
 
@@ -201,14 +201,14 @@ class Admission:
         self._heard.move_to_end(echo.stream)
         if len(self._heard) > _TOLD:
             self._heard.popitem(last=False)
-        if echo.heard.session != self._session:
+        if echo.received.session != self._session:
             raise RefusedMessageError(
                 "session",
-                "its sender has heard no state of this bridge yet"
-                if not echo.heard.session
+                "its sender has received no state of this bridge yet"
+                if not echo.received.session
                 else "it answers states of another bridge, or of this one before its restart",
             )
-        age_ns = now_ns - echo.heard.time_ns
+        age_ns = now_ns - echo.received.time_ns
         if not 0 <= age_ns <= self._age_ns:
             raise RefusedMessageError(
                 "age",

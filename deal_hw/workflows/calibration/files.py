@@ -1,0 +1,134 @@
+"""Reads recordings of any robot: its MJCF, and files or arrays of positions and commands."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.calibration.checks import examine_recording
+from deal_hw.workflows.calibration.policy_commands import with_policy_commands
+from deal_hw.workflows.calibration.recordings import (
+    Recorded,
+    at_rest_without_commands,
+    common_rates,
+    named_on_grid,
+    read_tables,
+    refuse_copies,
+    without,
+)
+from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.source import Source
+from deal_hw.workflows.calibration.space import searched_space
+from deal_hw.workflows.say import Say
+
+if TYPE_CHECKING:
+    from deal_hw.data.table import Table
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
+
+
+def read_files(
+    settings: CalibrateSettings, holdout: Sequence[Recorded], data: Sequence[Recorded], say: Say
+) -> Source:
+    """Read recordings of any robot from files or memory, with its model.
+
+    Args:
+        settings: The settings; they name a model.
+        holdout: Recordings that only judge the result.
+        data: More recordings to fit, also from memory.
+        say: Called with sentences on guesses and doubts.
+
+    Raises:
+        ConfigurationError: A setting, the model or a parameter cannot be used.
+        DatasetError: A recording cannot be read, understood or trusted.
+    """
+    from deal_hw.data.checks.suite import despiked
+    from deal_hw.sim.engine.compiling import compile_mjcf
+    from deal_hw.sim.engine.model import load_model
+    from deal_hw.sim.mjcf.describe import describe, with_speed_limits
+    from deal_hw.sim.mjcf.joint_facts import joint_facts
+
+    config, spikes = settings.recordings, settings.spikes
+    division, data = settings.division(holdout), (*config.data, *data)
+    if config.model is None or not data:
+        raise ConfigurationError("--model needs recordings to fit: --data rec.csv [more ...]")
+    _refuse_same(data, holdout)
+    model = compile_mjcf(config.model)
+    space = searched_space(settings, model, say)
+    facts = joint_facts(config.model, model)
+    fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), facts, say)
+    rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
+    description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
+    description = with_speed_limits(description, model, space)
+    parts = without(
+        config.leave_out, *([despiked(table, spikes) for table in tables] for tables in (fitted, held))
+    )
+    servo = description.actuation == "position"
+    verdicts = {
+        table.name: examine_recording(
+            table, facts, config.force, servo=servo, kept=kept, spikes=spikes, say=say
+        )
+        for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
+    }
+    robot = load_model(description, rates.step_s)
+    fitted, held = parts
+    return Source(
+        robot=robot,
+        space=space,
+        fitted=named_on_grid(fitted, robot, rates),
+        held=named_on_grid(held, robot, rates),
+        division=division,
+        sample_hz=None,
+        feet=config.feet,
+        telemetry=[
+            f"{name}: {verdict.severity} {verdict.code}: {verdict.message}"
+            for name, found in verdicts.items()
+            for verdict in found
+        ],
+        provenance={
+            "model": str(config.model),
+            "description_digest": description.digest(),
+            "recordings": [dict(table.source) for table in fitted],
+            "holdout": [dict(table.source) for table in held]
+            or f"last {division.share:.0%} of each recording",
+            "left_out": [list(entry) for entry in config.leave_out],
+            "sampling": dataclasses.asdict(rates),
+        },
+        advice="name recordings of other motion with --holdout",
+    )
+
+
+def _refuse_same(data: Sequence[Recorded], holdout: Sequence[Recorded]) -> None:
+    """Refuse a file that is both fitted and held out."""
+    files, judges = (
+        {Path(s).resolve() for s in some if isinstance(s, str | Path)} for some in (data, holdout)
+    )
+    if both := sorted(files & judges):
+        raise ConfigurationError(
+            f"{both[0]} is both fitted and held out; a held-out recording must not be fitted: remove it "
+            "from --data or --holdout"
+        )
+
+
+def _tables(
+    settings: CalibrateSettings,
+    groups: Sequence[tuple[str, Sequence[Recorded]]],
+    facts: JointFacts,
+    say: Say,
+) -> list[list[Table]]:
+    """Return each group's recordings in SI units, with the commands that their policy or rest gives."""
+    from deal_hw.data.importing.columns import read_column_map
+
+    path = settings.recordings.columns
+    columns = None if path is None else read_column_map(path)
+    printed: dict[str, str] = {}
+    found = [read_tables(sources, columns, facts, say, name, printed) for name, sources in groups]
+    if settings.policy is not None:
+        policy = Path(settings.policy)
+        found = [with_policy_commands(tables, policy, facts, say) for tables in found]
+    found = [at_rest_without_commands(tables, facts, say) for tables in found]
+    refuse_copies(list(itertools.chain(*found)))
+    return found

@@ -1,0 +1,258 @@
+"""The one way from recordings to a calibration: read, align, divide, and check what they can show.
+
+    settings -> reader -> Source -> align -> divide -> what the recordings know -> CalibrationInput
+
+Readers (`dataset.py`, `files.py`) differ in where recordings, model and parameters come from, and check what
+only they can see. All that follows is here, once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import FloatArray, Trajectory
+from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
+from deal_hw.workflows.calibration.dataset import read_driver_dataset, read_own_dataset
+from deal_hw.workflows.calibration.files import read_files
+from deal_hw.workflows.calibration.recordings import Recorded
+from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.source import Division, Source
+from deal_hw.workflows.calibration.walking import (
+    GAIT_SMOOTHING_S,
+    WALK_TELLS,
+    all_walk,
+    weighed,
+    while_walking,
+)
+from deal_hw.workflows.robot import carries_robot
+from deal_hw.workflows.say import Say, silent
+
+if TYPE_CHECKING:
+    from deal_hw.calib.data.problem import PopulationPolicy
+    from deal_hw.motions.behaviours import Behaviour
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import SampledEpisode
+
+STRETCH_S = 2.5
+"""Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
+HELDOUT_STRETCH_S = 20.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationInput:
+    """The input of a calibration, read and checked.
+
+    Attributes:
+        robot: The nominal model.
+        space: The parameters to search.
+        episodes: Recordings to fit.
+        holdout: Held-out recordings, which only test the result.
+        shown: The recording that ``--watch`` shows.
+        telemetry: Verdicts on the recordings, for the report.
+        provenance: Sources of the input: plain JSON values.
+        advice: How to get a held-out recording if there is none.
+        balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
+        name: Name under which `deal-hw collect` records this robot; "" if it cannot.
+        walks: Whether all recordings are of a policy that walks.
+        policy: The policy that moved the robot all the time, if the method needs it.
+        known_std: Expected standard deviation of the prediction error, positions then velocities, (2 C,);
+            None: the sensor noise, estimated from the recordings.
+    """
+
+    robot: RobotModel
+    space: ParameterSpace
+    episodes: Sequence[SampledEpisode]
+    holdout: Sequence[SampledEpisode]
+    shown: Trajectory
+    telemetry: Sequence[str]
+    provenance: Mapping[str, Any]
+    advice: str
+    balance: Callable[[], Behaviour] | None = None
+    name: str = ""
+    walks: bool = False
+    policy: PopulationPolicy | None = None
+    known_std: FloatArray | None = None
+
+    @property
+    def smoothing_s(self) -> float | None:
+        """Time over which start states are smoothed [s]; None for the default."""
+        return GAIT_SMOOTHING_S if self.walks else None
+
+
+def calibration_input(
+    settings: CalibrateSettings,
+    *,
+    data: Sequence[Recorded] = (),
+    holdout: Sequence[Any] | None = None,
+    say: Say = silent,
+) -> CalibrationInput:
+    """Read and check the input of a calibration, in a short time.
+
+    Args:
+        settings: The settings.
+        data: More recordings to fit, also from memory.
+        holdout: Held-out recordings, also from memory; by default those of the settings.
+        say: Called with sentences on guesses and doubts.
+
+    Raises:
+        ConfigurationError: A setting, the model or a parameter cannot be used.
+        DatasetError: A recording cannot be read, understood or trusted.
+        InsufficientDataError: The recordings are too short, do not move, or do not depend on a parameter.
+    """
+    settings.check(data)
+    with _extra("calib"):
+        source = _read(settings, data, settings.holdout if holdout is None else holdout, say)
+        return _input_of(source, settings, say)
+
+
+def _read(settings: CalibrateSettings, data: Sequence[Recorded], judges: Sequence[Any], say: Say) -> Source:
+    if settings.recordings.model is not None:
+        numbers = " ".join(str(one) for one in judges if isinstance(one, int))
+        if numbers:
+            raise ConfigurationError(
+                f"--holdout {numbers}: with --model give recordings; episode numbers go with a dataset"
+            )
+        return read_files(settings, judges, data, say)
+    wrong = [str(one) for one in judges if not isinstance(one, int)]
+    if wrong:
+        raise ConfigurationError(
+            f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
+        )
+    reader = read_own_dataset if carries_robot(settings.dataset) else read_driver_dataset
+    return reader(settings, [int(one) for one in judges], say)
+
+
+@contextlib.contextmanager
+def _extra(name: str) -> Iterator[None]:
+    """Say which extra installs a package that is missing."""
+    try:
+        yield
+    except MissingExtraError:
+        raise
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), name) from err
+
+
+def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> CalibrationInput:
+    """Align the recordings, divide them, and set what they do not show or already tell."""
+    robot, space, division = source.robot, source.space, source.division
+    trajectories = [trajectory for _, trajectory in (*source.fitted, *source.held)]
+    if division is not None:
+        require_base(robot, source.feet, trajectories)
+    known_std, provenance = settings.known_std(robot), dict(source.provenance)
+    fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
+    shown = trajectories[0]
+    walks = division is None and all_walk(robot, trajectories)
+    if walks:
+        space = weighed(space, robot, shown, say)
+    if division is not None:
+        fit, judge = divided(fit, judge, division, say)
+        warn_of_gravity(robot, space, fit, say)
+        space = sensitive_parameters(robot, space, fit, known_std, division.window_s, settings.threads, say)
+        for name, parts in (("fitted_s", fit), ("heldout_s", judge)):
+            provenance[name] = round(sum(map(seconds_of, parts)), 3)
+    return CalibrationInput(
+        robot=robot,
+        space=space,
+        episodes=fit,
+        holdout=judge,
+        shown=shown,
+        telemetry=source.telemetry,
+        provenance=provenance,
+        advice=source.advice,
+        balance=source.balance,
+        name=source.name,
+        walks=walks,
+        policy=source.policy,
+        known_std=known_std,
+    )
+
+
+def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode:
+    """Return a recording on the physics grid; a floating robot's one includes the base."""
+    from deal_hw.sim.recordings.episode import align, fill_gaps, thin
+    from deal_hw.sim.recordings.standing import with_sensed_base
+
+    robot = source.robot
+    episode = align(trajectory, robot.description, name)
+    if robot.base is not None and trajectory.body is not None:
+        episode = with_sensed_base(episode, robot, trajectory, source.feet)
+        if source.division is None:
+            episode = while_walking(episode, trajectory)
+    if source.division is not None:
+        episode = fill_gaps(episode)
+    return episode if source.sample_hz is None else thin(episode, source.sample_hz)
+
+
+def divided(
+    episodes: Sequence[SampledEpisode], judge: Sequence[SampledEpisode], division: Division, say: Say
+) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
+    """Return the parts to fit and the held-out parts.
+
+    Args:
+        episodes: Recordings to fit.
+        judge: Held-out recordings.
+        division: How parts are chosen.
+        say: Called with a sentence if not all is fitted.
+    """
+    from deal_hw.sim.recordings.parts import split_last, spread, stretches
+
+    fit, held = list(episodes), list(judge)
+    if division.share > 0:
+        pairs = [split_last(e, division.share) for e in episodes]
+        fit, held = [first for first, _ in pairs], [last for _, last in pairs]
+    parts = [p for e in fit for p in stretches(e, max(STRETCH_S, 3 * division.window_s))]
+    chosen = spread(parts, division.fit_seconds)
+    if len(chosen) < len(parts):
+        say(
+            f"fitting {sum(map(seconds_of, chosen)):.0f} s of {sum(map(seconds_of, parts)):.0f} s, in "
+            f"{len(chosen)} evenly spread parts (--fit-seconds)"
+        )
+    held = [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
+    return _without_scraps(chosen, say), _without_scraps(held, say)
+
+
+def _without_scraps(episodes: Sequence[SampledEpisode], say: Say) -> list[SampledEpisode]:
+    """Return recordings without those too short to be smoothed, as a few samples between two gaps are.
+
+    If all are, all stay: whoever uses them says how long a recording must be.
+    """
+    from deal_hw.calib.data.noise import smoothed_samples
+
+    kept = [e for e in episodes if len(e.sample) > 1 and len(e.sample) >= smoothed_samples(e.period_s)]
+    short = len(episodes) - len(kept)
+    if not kept or not short:
+        return list(episodes)
+    samples = sum(len(e.sample) for e in episodes) - sum(len(e.sample) for e in kept)
+    say(f"left out: {short} parts between gaps, of {samples} samples in all, which are too short to be used")
+    return kept
+
+
+def seconds_of(episode: SampledEpisode) -> float:
+    """Return the length of an episode [s]."""
+    return (len(episode.sample) - 1) * episode.period_s
+
+
+def usual_method(settings: CalibrateSettings, work: CalibrationInput, say: Say = silent) -> str:
+    """Return the named method, or the one that suits the recordings."""
+    if settings.method:
+        return settings.named()
+    facts = work.robot.description
+    held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
+    own = settings.recordings.model is not None or carries_robot(settings.dataset)
+    if settings.residual_std not in ((), None) or not settings.refine:
+        method = "default"
+    elif work.walks and settings.search is None:
+        say(WALK_TELLS)
+        method = "gait"
+    else:
+        # Output-error compares predictions over seconds, which are useless for a robot that falls.
+        method = "output-error" if own and work.robot.base is None and held else "default"
+    if method != "default":
+        say(f"method: {method} (alternative: --method default, which refines to the sensor noise)")
+    return settings.named(method)

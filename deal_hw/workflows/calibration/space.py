@@ -1,0 +1,124 @@
+"""The parameters that a calibration searches: of a robot with a driver, and of any model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from deal_hw.calibration import listed
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, UnknownNameError, short
+from deal_hw.parameters import ParameterSpace
+from deal_hw.robots import parameter_spaces
+from deal_hw.types import Trajectory
+from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.options import File
+from deal_hw.workflows.robot import carries_robot, recorded_robot
+from deal_hw.workflows.say import Say
+
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.model import RobotModel
+
+
+def named_space(robot: str, name: str = "") -> ParameterSpace:
+    """Return a parameter set of a robot; "": its first.
+
+    Raises:
+        UnknownNameError: There is no such set; the message lists them.
+    """
+    table = parameter_spaces(robot)
+    name = name or next(iter(table))
+    if name not in table:
+        raise UnknownNameError("parameter set", name, table)
+    return table[name]()
+
+
+def extended(space: ParameterSpace, file: Path, robot: RobotModel) -> ParameterSpace:
+    """Return a parameter set with those of a file beside it."""
+    from deal_hw.sim.parameters import check_space
+    from deal_hw.sim.parameters.yaml_space import read_space
+
+    found = ParameterSpace([*space.parameters, *read_space(file, robot.model).parameters])
+    check_space(robot.model, found)
+    return found
+
+
+def without_speed_limits(
+    space: ParameterSpace, description: RobotDescription, trajectories: Iterable[Trajectory], say: Say
+) -> ParameterSpace:
+    """Return the space without the speed limits of servos whose set-points the host moves (ODrive).
+
+    The commands to such a drive carry its own limit, which is above the range of a servo's. Its set-point
+    jumps with each command. The known value is so high that the model's does, too.
+    """
+    every = list(trajectories)
+    numbers = {joint: number for number, joint in enumerate(description.actuated)}
+    known = {}
+    for p in space:
+        if p.kind != "servo_speed_limit":
+            continue
+        columns = [numbers[joint] for joint in p.elements]
+        sent = np.concatenate([t.speed_limit[:, columns].ravel() for t in every])
+        if sent.size and np.nanmin(sent) > p.high:
+            steps = [np.abs(np.diff(t.position_target[:, columns], axis=0)).max(initial=0.0) for t in every]
+            known[p.name] = max(float(np.nanmin(sent)), description.device_rate_hz * float(np.nanmax(steps)))
+    if known:
+        say(f"{listed(list(known))}: not searched, because the host limits the speed of these set-points")
+    return space.with_known(known)
+
+
+def searched_space(settings: CalibrateSettings, model: Any, say: Say) -> ParameterSpace:
+    """Return the parameters to search of a user's model; report what is not searched as it is 0 there.
+
+    Raises:
+        ConfigurationError: The parameter file, or a change of the parameters, cannot be used.
+    """
+    from deal_hw.sim.parameters import check_space
+    from deal_hw.sim.parameters.template import left_at_zero, template
+    from deal_hw.sim.parameters.yaml_space import parse_space, read_space
+
+    if settings.recordings.parameters is None:
+        zero = [f"{kind} of {short(', '.join(names))}" for kind, names in left_at_zero(model).items()]
+        if zero:
+            say(
+                f"not searched, because they are 0 in the model: {'; '.join(zero)}. If the robot has them, "
+                "write values above 0 into the MJCF"
+            )
+        space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
+    else:
+        space = read_space(settings.recordings.parameters, model)
+    space = settings.searched(space)
+    check_space(model, space)
+    return space
+
+
+def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
+    """Write a commented parameter file for a model and return its path.
+
+    Args:
+        config: Names the file, and the model.
+        dataset: Contains the robot if no model is named.
+
+    Raises:
+        ConfigurationError: There is no model, or the file exists.
+    """
+    path, model = config.write_parameters, config.model
+    if model is None and carries_robot(dataset):
+        from deal_hw.data.recording.dataset import Dataset
+
+        model = recorded_robot(Dataset.open(Path(str(dataset))).description, Path(str(dataset))).mjcf
+    if model is None or path is None:
+        raise ConfigurationError(
+            "--write-parameters needs --model robot.xml, or a dataset with its own robot.yaml"
+        )
+    if path.exists():
+        raise ConfigurationError(f"{path} exists; name another file, or remove it")
+    from deal_hw.sim.engine.compiling import compile_mjcf
+    from deal_hw.sim.parameters.template import template
+
+    text = template(compile_mjcf(model), model.name)
+    path.write_text(text, encoding="utf-8")
+    return path
