@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from measuring import Rows, add_seeds, parser
 
+from deal_hw.bench.settings import parse_ratios
 from deal_hw.calib.paper.algorithm1 import PaperSettings, literal
 from deal_hw.calib.paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 from deal_hw.calib.pipeline.methods import PAPER_POPULATION
-from deal_hw.cli.bench import parse_ratios
 
 
 @dataclass(frozen=True, slots=True)

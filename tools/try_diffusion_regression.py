@@ -23,6 +23,7 @@ import numpy as np
 from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
+from deal_hw.bench.settings import FixedRange
 from deal_hw.calib.paper.critic import PenaltyCritic, Samples
 from deal_hw.calib.paper.diffusion_evolution import Schedule, alpha_schedule
 from deal_hw.calib.search.eki import EnsembleKalman, KalmanStep, KalmanStepper, logit
@@ -151,7 +152,8 @@ def measure(name: str, seed: int, ratio: float) -> dict[str, Any]:
             outputs.append(float(np.nanmean(found[:, -1])))
         return found
 
-    (cell,) = make_cells("fixed-range", ["cartpole"], "ideal", ["deal"], [ratio], [seed])
+    asked = FixedRange(profile="ideal", methods=("deal",), range_ratio=(ratio,), seeds=(seed,))
+    (cell,) = make_cells(asked)
     start_s = time.process_time()
     with (
         mock.patch.object(KalmanStepper, "new_ensemble", draw),

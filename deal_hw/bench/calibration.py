@@ -9,18 +9,19 @@ model. - mismatch: the same on robots with effects that no simulator here has (p
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from deal_hw.bench.figures import draw
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells
-from deal_hw.bench.tasks import DEMONSTRATION_S, TASKS, make_case
-from deal_hw.errors import DealHwError, UnknownNameError
+from deal_hw.bench.rows import Cells, Table
+from deal_hw.bench.settings import FixedRange, Mismatch
+from deal_hw.bench.tables import line, print_summary
+from deal_hw.bench.tasks import check_tasks, make_case
+from deal_hw.errors import DealHwError
 
-Protocol = Literal["fixed-range", "mismatch", "paper"]
 PAPER_NOTE = "the truth is the nominal model: its values, kept without any recording, have an error of 0 here"
 KEY = (
     "task",
@@ -42,7 +43,7 @@ class Cell:
     """One calibration of one robot by one method.
 
     Attributes:
-        protocol: Relation of truth and range.
+        protocol: Name of the bench: the relation of truth and range.
         task: Name of the task.
         space: Name of the parameter set; "" for the task's default.
         profile: Profile of the robot.
@@ -56,7 +57,7 @@ class Cell:
         seed: Seed of everything.
     """
 
-    protocol: Protocol
+    protocol: str
     task: str
     space: str
     profile: str
@@ -75,20 +76,7 @@ class Cell:
         return tuple(getattr(self, name) for name in KEY)
 
 
-def make_cells(
-    protocol: Protocol,
-    tasks: Sequence[str],
-    profile: str,
-    methods: Sequence[str],
-    range_ratios: Sequence[float],
-    seeds: Sequence[int],
-    *,
-    space: str = "",
-    refine_all: bool = False,
-    demonstration: str = "excite",
-    demonstration_s: float = DEMONSTRATION_S,
-    checkpoints: Sequence[Path | None] = (None,),
-) -> list[Cell]:
+def make_cells(settings: FixedRange | Mismatch) -> list[Cell]:
     """Return the cells of a bench, seed by seed, so that a stopped bench has complete seeds.
 
     Raises:
@@ -96,36 +84,48 @@ def make_cells(
     """
     from deal_hw.calib.pipeline.methods import check_method, is_default
 
-    for task in tasks:
-        if task not in TASKS:
-            raise UnknownNameError("task", task, TASKS)
-    for method in methods:
+    check_tasks(settings.task)
+    for method in settings.methods:
         check_method(method)
     return [
         Cell(
-            protocol=protocol,
+            protocol=settings.name,
             task=task,
-            space=space,
-            profile=profile,
-            demonstration=demonstration,
-            demonstration_s=demonstration_s,
+            space=settings.space,
+            profile=settings.profile,
+            demonstration=settings.demonstration,
+            demonstration_s=settings.demonstration_seconds,
             checkpoint="" if policy is None else policy.stem,
             policy=policy,
             method=method,
-            refined=refine_all or is_default(method),
+            refined=settings.refine_all or is_default(method),
             range_ratio=range_ratio,
             seed=seed,
         )
         for task, range_ratio, policy, seed, method in itertools.product(
-            tasks, range_ratios, checkpoints, seeds, methods
+            settings.task,
+            settings.range_ratio,
+            settings.checkpoint or (None,),
+            settings.seeds,
+            settings.methods,
         )
     ]
 
 
-def cells(chosen: Sequence[Cell], *, population: int | None, generations: int, threads: int | None) -> Cells:
-    """Return the cells with the function that runs each; see :func:`run_cell`."""
-    run = partial(run_cell, population=population, generations=generations, threads=threads)
-    return Cells(names=KEY, runs=[(cell.key, partial(run, cell)) for cell in chosen])
+def table(settings: FixedRange | Mismatch) -> Table:
+    """Return the bench: its cells by :func:`run_cell`.
+
+    Raises:
+        UnknownNameError: There is no such task or method.
+    """
+    run = partial(
+        run_cell,
+        population=settings.population,
+        generations=settings.generations,
+        threads=settings.threads,
+    )
+    cells = Cells(names=KEY, runs=[(cell.key, partial(run, cell)) for cell in make_cells(settings)])
+    return Table(cells=cells, line=line, summary=print_summary, draw=draw)
 
 
 def run_cell(cell: Cell, *, population: int | None, generations: int, threads: int | None) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.rows import Cells, Row, Table, printed
+from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget, Progress
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
@@ -191,21 +192,21 @@ REAL = frozenset({"so101", "go2-suspended"})
 """Problems with real recordings."""
 
 
-def cells(
-    problems: Sequence[str], seeds: Sequence[int], *, real: Path | None, budget: Budget, threads: int | None
-) -> Cells:
-    """Return the cells of the bench; a real robot has one truth, so it runs for the first seed only.
+def table(settings: FirstAnswer) -> Table:
+    """Return the bench; a real robot has one truth, so it runs for the first seed only.
 
     Raises:
         UnknownNameError: There is no such problem.
     """
+    problems, seeds = settings.problems or tuple(PROBLEMS), settings.seeds
     for name in problems:
         if name not in PROBLEMS:
             raise UnknownNameError("problem of first-answer", name, PROBLEMS)
 
-    run = partial(run_cell, real=real, budget=budget, threads=threads)
+    run = partial(run_cell, real=settings.real, budget=settings.budget, threads=settings.threads)
     chosen = [(name, seed) for seed in seeds for name in problems if name not in REAL or seed == seeds[0]]
-    return Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
+    cells = Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
+    return Table(cells=cells, line=line, summary=printed(summary))
 
 
 def run_cell(

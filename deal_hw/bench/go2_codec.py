@@ -6,12 +6,12 @@ import gc
 import statistics
 import timeit
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from deal_hw.bench.rows import describe_machine, write_rows
+from deal_hw.bench.settings import Go2Codec
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
@@ -23,12 +23,11 @@ TARGETS_US: Final[Mapping[str, float]] = {"encode LowCmd with CRC": 5.0, "decode
 """Budget of the control loop, medians [us]."""
 
 
-def bench_codec(out: Path | None = None, *, quiet: bool = False, batches: int = BATCHES) -> int:
-    """Measure the codec; print the figures, and write them to a file if one is given.
+def bench_codec(settings: Go2Codec, batches: int = BATCHES) -> int:
+    """Measure the codec; print the figures, and write them to a file if one is named or JSON is printed.
 
     Args:
-        out: File of the rows; None: print only.
-        quiet: Whether to print nothing.
+        settings: File of the rows, and what to print.
         batches: Number of timed batches of :data:`BATCH` calls.
 
     Returns:
@@ -36,7 +35,7 @@ def bench_codec(out: Path | None = None, *, quiet: bool = False, batches: int = 
     """
     rows = [_row(name, call, batches) for name, call in _calls().items()]
     machine = describe_machine()
-    if not quiet:
+    if not settings.quiet:
         processors, load = machine["processors"], machine["load"][0]
         print(f"{machine['platform']}, {processors} processors, load {load:.1f}, numpy {np.__version__}")
         print(f"microseconds a call, {batches} batches of {BATCH} calls")
@@ -46,10 +45,10 @@ def bench_codec(out: Path | None = None, *, quiet: bool = False, batches: int = 
                 f"{row['operation']:28} median {row['median_us']:6.2f}  lowest {row['lowest_us']:6.2f}"
                 f"  p99 {row['p99_us']:6.2f}{target}"
             )
-    if out is not None:
-        write_rows(out, rows)
-        if not quiet:
-            print(f"written: {out}")
+    if settings.json or settings.out is not None:
+        write_rows(settings.file, rows)
+        if not settings.quiet:
+            print(f"written: {settings.file}")
     return (
         1 if any(row["target_us"] is not None and row["median_us"] > row["target_us"] for row in rows) else 0
     )

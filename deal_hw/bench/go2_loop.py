@@ -16,8 +16,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, per_parameter
+from deal_hw.bench.rows import Cells, Row, Table, per_parameter, printed
 from deal_hw.bench.scores import check_truth
+from deal_hw.bench.settings import Go2Loop
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
@@ -38,30 +39,33 @@ from deal_hw.workflows.train import train_policy, udr_distribution
 
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
 WALKS: Final = 3
-STEPS: Final = 300_000
-"""Usual steps of a fine-tune."""
 NEXT_NOISE: Final = 100_000
 """Distance between the noise seeds of two walks."""
 KINDS: Final = ("stiffness", "damping")
+KEY: Final = ("profile", "seed", "steps")
 
 
-def cells(
-    profile: str, seeds: Sequence[int], steps: int, *, train: bool, folder: Path, threads: int | None
-) -> Cells:
-    """Return the cells of the bench, one per seed; see :func:`loop_row`."""
-    run = partial(loop_row, profile, steps=steps, train=train, folder=folder, threads=threads)
-    runs = [((profile, seed, steps if train else 0), partial(run, seed)) for seed in seeds]
-    return Cells(names=("profile", "seed", "steps"), runs=runs)
+def table(settings: Go2Loop) -> Table:
+    """Return the bench: a cell for each seed, by :func:`loop_row`."""
+    profile, steps = settings.profile, settings.steps if settings.train else 0
+    folder = settings.beside("runs")
+    runs = [
+        (
+            (profile, seed, steps),
+            partial(loop_row, profile, seed, steps, folder=folder, threads=settings.threads),
+        )
+        for seed in settings.seeds
+    ]
+    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
 
 
-def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, threads: int | None) -> Row:
+def loop_row(profile: str, seed: int, steps: int, *, folder: Path, threads: int | None) -> Row:
     """Run one cell; an error goes into the row, so that the other cells still run.
 
     Args:
         profile: Profile of the emulated robot.
         seed: Seed of its truth, of the search and of the training.
-        steps: Steps of each fine-tune.
-        train: Whether to fine-tune at all.
+        steps: Steps of each fine-tune; 0 for none.
         folder: Folder of recordings and policies.
         threads: Simulation threads.
     """
@@ -69,7 +73,7 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
         "bench": "go2-loop",
         "profile": profile,
         "seed": seed,
-        "steps": steps if train else 0,
+        "steps": steps,
         "error": "",
     }
     try:
@@ -81,7 +85,7 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
         found = calibrate(dataset=dataset, space="walk", holdout=1, seed=seed, threads=threads)
         row |= calibration_part(found.result, truth)
         row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
-        row |= policies_part(found.result, truth, steps, out, train=train)
+        row |= policies_part(found.result, truth, steps, out)
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"
     return row
@@ -131,8 +135,8 @@ def calibration_part(result: CalibrationResult, truth: Go2Truth) -> Row:
     return row
 
 
-def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: Path, *, train: bool) -> Row:
-    """Fine-tune the shipped policy in three ways, and let all four walk."""
+def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: Path) -> Row:
+    """Fine-tune the shipped policy in three ways, and let all four walk; without steps the shipped one."""
     space = walk_space()
     values = np.array([truth.walk_parameters()[name] for name in space.names])
     shipped = OnnxPolicy(required_policy("go2"))
@@ -143,7 +147,7 @@ def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: P
         "oracle": ParameterDistribution.point(space, values, 1e-3 * truth.latency_ms),
     }
     row: Row = {}
-    for name in POLICIES if train else POLICIES[:1]:
+    for name in POLICIES if steps else POLICIES[:1]:
         policy = shipped
         if name != "udr":
             began, file = time.process_time(), out / f"{name}.onnx"

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, per_parameter
+from deal_hw.bench.figures import draw
+from deal_hw.bench.rows import Cells, Table, per_parameter
 from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
+from deal_hw.bench.settings import Loop
+from deal_hw.bench.tables import line, print_summary
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget, CalibrationResult
@@ -31,8 +33,7 @@ from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.shipped import required_policy
 
 TASK_EPISODES = 5
-SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")
-"""Methods that run without the refinement, beside the default with everything."""
+KEY = ("profile", "seed", "method", "range_ratio")
 
 
 def calibration_row(
@@ -151,30 +152,29 @@ def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[st
     return row
 
 
-def cells(
-    profile: str,
-    methods: Sequence[str],
-    range_ratio: float,
-    seeds: Sequence[int],
-    *,
-    train: bool,
-    folder: Path,
-    threads: int | None,
-) -> Cells:
-    """Return the cells of the bench, seed by seed; see :func:`loop_row`.
+def table(settings: Loop) -> Table:
+    """Return the bench: its cells, seed by seed, by :func:`loop_row`.
 
     Raises:
         UnknownNameError: There is no such method.
     """
-    for method in methods:
+    for method in settings.methods:
         check_method(method)
-
-    run = partial(loop_row, range_ratio=range_ratio, train=train, folder=folder, threads=threads)
+    run = partial(
+        loop_row,
+        range_ratio=settings.range_ratio,
+        train=settings.train,
+        folder=settings.beside("policies"),
+        threads=settings.threads,
+    )
     runs = [
-        ((profile, seed, method, range_ratio), partial(run, profile, seed, method))
-        for seed, method in itertools.product(seeds, methods)
+        (
+            (settings.profile, seed, method, settings.range_ratio),
+            partial(run, settings.profile, seed, method),
+        )
+        for seed, method in itertools.product(settings.seeds, settings.methods)
     ]
-    return Cells(names=("profile", "seed", "method", "range_ratio"), runs=runs)
+    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw)
 
 
 def loop_row(

@@ -10,13 +10,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.figures import draw
+from deal_hw.bench.rows import Cells, Table
+from deal_hw.bench.settings import Real
+from deal_hw.bench.tables import line, print_real
 from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
@@ -27,33 +31,51 @@ from deal_hw.workflows.calibration.settings import HELDOUT_PART, CalibrateSettin
 from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
-METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
-"""Methods that run by default."""
-
 UNTOLD = frozenset({"nominal", "output-error"})
 """Methods that need no expected prediction error."""
 
 
-def prepare(source: CalibrateSettings, range_ratio: float | None, *, quiet: bool = False) -> CalibrationInput:
-    """Read and check recordings and parameters once for all cells.
-
-    Args:
-        source: Model and recordings, or a dataset, and the held-out part; as for ``deal-hw calibrate``.
-        range_ratio: Ratio of the search ranges; None: as in the parameters.
-        quiet: Print nothing.
+def calibrate_settings(settings: Real) -> CalibrateSettings:
+    """Return the settings of a calibration that reads the recordings as ``deal-hw calibrate`` does.
 
     Raises:
-        ConfigurationError: No source was named, or a setting cannot be used.
-        DatasetError: A recording cannot be used.
+        ConfigurationError: No recordings were named, or a file of parameters is to be written.
     """
-    if source.recordings.model is None and source.dataset is None:
+    if settings.recordings.write_parameters is not None:
+        raise ConfigurationError(
+            "--write-parameters: `deal-hw calibrate` writes that file; edit it, and name it here by "
+            "--parameters"
+        )
+    if settings.recordings.model is None and settings.dataset is None:
         raise ConfigurationError(
             "bench real needs --model robot.xml --data rec.csv ... or --dataset DIR, and --holdout other.csv "
             "(of a dataset episodes) or a part of each recording (--holdout-part)"
         )
-    settings = dataclasses.replace(source, range_ratio=range_ratio)
-    settings.check()
-    return calibration_input(settings, say=silent if quiet else to_stderr)
+    return CalibrateSettings(
+        dataset=settings.dataset,
+        recordings=settings.recordings,
+        holdout=tuple(int(str(one)) if str(one).isdigit() else one for one in settings.holdout),
+        heldout_window=settings.heldout_window,
+        residual_std=settings.residual_std,
+        # A file of parameters has ranges of its own.
+        range_ratio=settings.range_ratio if settings.recordings.parameters is None else None,
+        threads=settings.threads,
+    )
+
+
+def prepare(source: CalibrateSettings, *, quiet: bool = False) -> CalibrationInput:
+    """Read and check recordings and parameters once for all cells.
+
+    Args:
+        source: Model and recordings, or a dataset, and the held-out part.
+        quiet: Print nothing.
+
+    Raises:
+        ConfigurationError: A setting cannot be used.
+        DatasetError: A recording cannot be used.
+    """
+    source.check()
+    return calibration_input(source, say=silent if quiet else to_stderr)
 
 
 def split_name(source: CalibrateSettings) -> str:
@@ -84,52 +106,36 @@ def expected_std(
     return std
 
 
-def cells(
-    source: CalibrateSettings,
-    *,
-    methods: Sequence[str],
-    seeds: Sequence[int],
-    range_ratio: float,
-    refine_all: bool,
-    budget: Budget,
-    quiet: bool,
-) -> Cells:
-    """Read and check the recordings and return the cells; see :func:`run_cell`.
+def table(settings: Real) -> Table:
+    """Read and check the recordings and return the bench: its cells by :func:`run_cell`.
 
     Raises:
         UnknownNameError: There is no such method.
         ConfigurationError: No model was named, or a setting cannot be used.
         DatasetError: A recording cannot be used.
     """
-    for method in methods:
+    for method in settings.methods:
         check_method(method)
-    # A file of parameters has ranges of its own.
-    ratio = range_ratio if source.recordings.parameters is None else None
-    work = prepare(source, ratio, quiet=quiet)
-    model, threads = source.recordings.model, source.threads
+    source = calibrate_settings(settings)
+    work = prepare(source, quiet=settings.quiet)
+    model = source.recordings.model
     task = work.robot.description.name if model is None else model.stem
-    split, expected = split_name(source), expected_std(work, source.known_std(work.robot), threads)
-
-    def make(method: str, seed: int, refine: bool) -> Callable[[], Row]:
-        return lambda: run_cell(
-            work,
-            task,
-            split,
-            method,
-            seed,
-            range_ratio,
-            refine=refine,
-            std=expected(method),
-            threads=threads,
-            budget=budget,
-            window_s=source.heldout_window,
-        )
-
+    split, expected = split_name(source), expected_std(work, source.known_std(work.robot), settings.threads)
+    run = partial(
+        run_cell,
+        work,
+        task,
+        split,
+        expected=expected,
+        threads=settings.threads,
+        budget=settings.budget,
+        window_s=settings.heldout_window,
+    )
     runs = []
-    for seed, method in itertools.product(seeds, methods):
-        refine = is_default(method) or refine_all
-        runs.append(((task, split, method, refine, range_ratio, seed), make(method, seed, refine)))
-    return Cells(names=KEY, runs=runs)
+    for seed, method in itertools.product(settings.seeds, settings.methods):
+        cell = (method, is_default(method) or settings.refine_all, settings.range_ratio, seed)
+        runs.append(((task, split, *cell), partial(run, *cell)))
+    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=print_real, draw=draw)
 
 
 def run_cell(
@@ -137,12 +143,12 @@ def run_cell(
     task: str,
     split: str,
     method: str,
-    seed: int,
-    range_ratio: float,
-    *,
     refine: bool,
+    range_ratio: float,
+    seed: int,
+    *,
+    expected: Callable[[str], FloatArray | None],
     budget: Budget,
-    std: FloatArray | None,
     window_s: float,
     threads: int | None,
 ) -> dict[str, Any]:
@@ -153,11 +159,12 @@ def run_cell(
         task: Name of the robot in the row.
         split: Name of the held-out part.
         method: Name of the method.
-        seed: Seed of everything random.
-        range_ratio: Ratio of the search range, for the row.
         refine: Whether the refinement follows.
+        range_ratio: Ratio of the search range, for the row.
+        seed: Seed of everything random.
+        expected: Returns a method's expected prediction error, (2 C,); None: the sensor noise, or the
+            method's own estimate.
         budget: Limits of the search.
-        std: Expected prediction error, (2 C,); None: the sensor noise, or the method's own estimate.
         window_s: Length of held-out predictions [s].
         threads: Simulation threads.
     """
@@ -183,7 +190,7 @@ def run_cell(
             rng=np.random.default_rng(seed),
             threads=threads,
             heldout_window_s=window_s,
-            known_std=std,
+            known_std=expected(method),
             # An uncalibrated model has no latency.
             latency_s=0.0 if method == "nominal" else None,
         )

@@ -37,6 +37,28 @@ class Cells:
     runs: Sequence[tuple[tuple[Any, ...], Callable[[], Row]]]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A bench: what it runs and how it is shown.
+
+    Attributes:
+        cells: What it runs.
+        line: Returns a row as one line of text.
+        summary: Prints a summary of the rows without errors.
+        draw: Draws the rows without errors, at least one, into a file; None: there is no figure.
+    """
+
+    cells: Cells
+    line: Callable[[Row], str]
+    summary: Callable[[Sequence[Row]], None]
+    draw: Callable[[Path, Sequence[Row]], None] | None = None
+
+
+def printed(summary: Callable[[Sequence[Row]], Sequence[str]]) -> Callable[[Sequence[Row]], None]:
+    """Return a function that prints the lines of a summary."""
+    return lambda rows: print("\n".join(summary(rows)))
+
+
 def run_cells(
     cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], None], program: str = "deal-hw"
 ) -> list[Row]:

@@ -8,6 +8,7 @@ arithmetic. Beside it are the engine's seconds with constant commands, where a r
 
 from __future__ import annotations
 
+import itertools
 import os
 import statistics
 import time
@@ -17,9 +18,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deal_hw.bench.calibration import make_cells
-from deal_hw.bench.rows import Cells, Row
-from deal_hw.bench.tasks import Case, make_case
+from deal_hw.bench.rows import Cells, Row, Table, printed
+from deal_hw.bench.settings import Speed
+from deal_hw.bench.tasks import Case, check_tasks, make_case
 from deal_hw.errors import DealHwError
 from deal_hw.workflows.calibration.run import calibrate_episodes
 
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calibration import CalibrationResult
     from deal_hw.types import FloatArray
-
-METHODS: Final = ("deal-paper",)
-"""Measured if no method is named."""
 
 PAPER_SECONDS: Final = {"allegro": 3245.0, "ant": 98.0, "cartpole": 75.0, "go2": 303.0, "humanoid": 103.0}
 """DEAL on an i5-14600KF and an RTX 4060 Ti, 50 generations of 200 members (Table 3) [s]."""
@@ -40,45 +38,61 @@ REPETITIONS: Final = 5
 KEY: Final = ("task", "space", "method", "population", "generations", "seed")
 
 
-def cells(
-    tasks: Sequence[str],
-    methods: Sequence[str],
-    seeds: Sequence[int],
-    *,
-    profile: str,
-    range_ratio: float,
-    population: int | None,
-    generations: int,
-    space: str,
-    threads: int | None,
-) -> Cells:
-    """Return the cells of the bench; policies move the robots, as in the paper.
+def table(settings: Speed) -> Table:
+    """Return the bench: its cells by :func:`run_cell`; policies move the robots, as in the paper.
 
     Raises:
         UnknownNameError: There is no such task or method.
     """
-    from deal_hw.calib.pipeline.methods import usual_population
+    from deal_hw.calib.pipeline.methods import check_method, usual_population
 
-    chosen = make_cells(
-        "fixed-range", tasks, profile, methods, [range_ratio], seeds, space=space, demonstration="policy"
+    check_tasks(settings.task)
+    for method in settings.methods:
+        check_method(method)
+    run = partial(
+        run_cell, profile=settings.profile, range_ratio=settings.range_ratio, threads=settings.threads
     )
-
-    def run(task: str, method: str, seed: int, members: int) -> Row:
-        row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
-        row |= {"population": members, "generations": generations, "seed": seed, "error": ""}
-        try:
-            case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
-            row |= measure(case, method, members, generations, threads)
-        except DealHwError as err:
-            row["error"] = f"{type(err).__name__}: {err}"
-        return row
-
     runs = []
-    for cell in chosen:
-        members = population or usual_population(cell.method)
-        key = (cell.task, space, cell.method, members, generations, cell.seed)
-        runs.append((key, partial(run, cell.task, cell.method, cell.seed, members)))
-    return Cells(names=KEY, runs=runs)
+    for task, seed, method in itertools.product(settings.task, settings.seeds, settings.methods):
+        members = settings.population or usual_population(method)
+        cell = (task, settings.space, method, members, settings.generations, seed)
+        runs.append((cell, partial(run, *cell)))
+    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
+
+
+def run_cell(
+    task: str,
+    space: str,
+    method: str,
+    population: int,
+    generations: int,
+    seed: int,
+    *,
+    profile: str,
+    range_ratio: float,
+    threads: int | None,
+) -> Row:
+    """Time one search; an error goes into the row, so that the other cells still run.
+
+    Args:
+        task: Name of the task.
+        space: Name of the parameter set; "" for the task's default.
+        method: Name of the method.
+        population: Members of the search.
+        generations: Its generations.
+        seed: Seed of everything.
+        profile: Profile of the robot.
+        range_ratio: Ratio of the search range.
+        threads: Simulation threads.
+    """
+    row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
+    row |= {"population": population, "generations": generations, "seed": seed, "error": ""}
+    try:
+        case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
+        row |= measure(case, method, population, generations, threads)
+    except DealHwError as err:
+        row["error"] = f"{type(err).__name__}: {err}"
+    return row
 
 
 def measure(case: Case, method: str, population: int, generations: int, threads: int | None) -> Row:

@@ -5,7 +5,7 @@ The cart-pole is the emulated one, over its bytes in virtual time; the others ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -141,6 +141,17 @@ def make_case(
     case = TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, checkpoint, seconds))
     check_truth(case.space, dict(zip(case.space.names, case.theta, strict=True)))
     return case
+
+
+def check_tasks(tasks: Iterable[str]) -> None:
+    """Check names of tasks.
+
+    Raises:
+        UnknownNameError: There is no such task; the message lists all.
+    """
+    for task in tasks:
+        if task not in TASKS:
+            raise UnknownNameError("task", task, TASKS)
 
 
 def _cartpole(ask: _Ask) -> Case:

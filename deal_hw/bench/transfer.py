@@ -21,33 +21,22 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells, Row, describe_call
+from deal_hw.bench.rows import Cells, Row, Table, describe_call
 from deal_hw.bench.scores import error_percent, log_error_x100
-from deal_hw.bench.tasks import TASKS, Case, make_case
+from deal_hw.bench.settings import Transfer
+from deal_hw.bench.tasks import Case, check_tasks, make_case
+from deal_hw.bench.transfer_figure import draw_transfer
 from deal_hw.bench.transfer_target import WORKS, judged, speed_profile, truth_of
 from deal_hw.calib.pipeline.methods import check_method, is_default, usual_budget
 from deal_hw.data.run_folder import git_commit
-from deal_hw.errors import CalibrationError, ConfigurationError, DealHwError, PolicyError, UnknownNameError
+from deal_hw.errors import CalibrationError, ConfigurationError, DealHwError, PolicyError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import training_task
 from deal_hw.training import TrainingFiles
+from deal_hw.workflows.say import Say, silent
 from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import nominal_distribution, train_policy, udr_distribution
-
-Say = Callable[[str], None]
-
-METHODS: Final = (
-    "udr",
-    "nominal",
-    "easi",
-    "bo-critic",
-    "deal-paper",
-    "deal-paper-literal",
-    "default",
-    "oracle",
-)
-"""Those of the paper's Figure 4, and ours."""
 
 WITHOUT_DATA: Final = ("udr", "nominal", "oracle")
 """Methods that read no demonstration."""
@@ -122,65 +111,54 @@ class HiddenTarget:
     seconds: float
 
 
-def cells(
-    tasks: Sequence[str],
-    methods: Sequence[str],
-    seeds: Sequence[int],
-    *,
-    steps: int | None,
-    checkpoints: Sequence[Path],
-    folder: Path,
-    seconds: float,
-    population: int | None,
-    generations: int,
-    threads: int | None,
-    say: Say,
-) -> Cells:
-    """Return the cells of the bench, seed by seed; see :func:`transfer_row`.
-
-    Args:
-        tasks: Names of tasks.
-        methods: Names of methods.
-        seeds: Seeds of the targets, of the searches and of the trainings.
-        steps: Steps of each fine-tune; None for each task's own.
-        checkpoints: Base policies (.onnx); the bench trains those that are not named, unless one with its
-            checkpoint is shipped.
-        folder: Folder of the policies.
-        seconds: Length of the demonstration [s].
-        population: Members of a search; None for each method's own.
-        generations: Most generations of a search.
-        threads: Simulation threads of the searches.
-        say: Called with the progress.
+def table(settings: Transfer) -> Table:
+    """Return the bench: its cells, seed by seed, by :func:`transfer_row`.
 
     Raises:
         UnknownNameError: There is no such task or method.
         ConfigurationError: There are too few steps, or a base policy does not fit; raised before long work.
     """
-    for task in tasks:
-        if task not in TASKS:
-            raise UnknownNameError("task", task, TASKS)
-    for method in methods:
+    check_tasks(settings.task)
+    for method in settings.methods:
         if method not in WITHOUT_DATA:
             check_method(method)
-    given = _given(checkpoints, tasks)
-    settings = [
-        Setting(task=task, steps=steps or STEPS[task], seconds=seconds, base=given.get(task), folder=folder)
-        for task in tasks
+    given = _given(settings.checkpoint, settings.task)
+    common = [
+        Setting(
+            task=task,
+            steps=settings.steps or STEPS[task],
+            seconds=settings.demonstration_seconds,
+            base=given.get(task),
+            folder=settings.beside("policies"),
+        )
+        for task in settings.task
     ]
-    for one in settings:
+    for one in common:
         # The trainer refuses too few steps.
         training_task(one.task).trainer_and_config(steps=one.steps)
     # First, so that no other row has to train the oracle for its share, and the oracle's row again.
-    methods = sorted(methods, key=lambda method: method != "oracle")
-    run = partial(transfer_row, population=population, generations=generations, threads=threads, say=say)
+    methods = sorted(settings.methods, key=lambda method: method != "oracle")
+    budget = (settings.population, settings.generations)
+    run = partial(
+        transfer_row,
+        population=settings.population,
+        generations=settings.generations,
+        threads=settings.threads,
+        say=silent if settings.quiet else print_now,
+    )
     runs = [
         (
-            (one.task, seed, method, one.steps, one.seconds, _base_name(one), population, generations),
+            (one.task, seed, method, one.steps, one.seconds, _base_name(one), *budget),
             partial(run, one, seed, method),
         )
-        for one, seed, method in itertools.product(settings, seeds, methods)
+        for one, seed, method in itertools.product(common, settings.seeds, methods)
     ]
-    return Cells(names=KEY, runs=runs)
+    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw_transfer)
+
+
+def print_now(text: str) -> None:
+    """Print a sentence on the progress, at once: the next one may take hours."""
+    print(text, flush=True)
 
 
 def _base_name(setting: Setting) -> str:
@@ -227,7 +205,7 @@ def _trained_under_udr(task: str, path: Path) -> bool:
     return OnnxPolicy(path).spec.trained_under == udr_distribution(task).digest()
 
 
-def base_policy(setting: Setting, say: Say = lambda text: None) -> Path:
+def base_policy(setting: Setting, say: Say = silent) -> Path:
     """Return a task's base policy: the one given, else the shipped one, else one that is trained here.
 
     The shipped one needs its checkpoint beside it. A trained one is kept beside the rows; a training that was
@@ -290,7 +268,7 @@ def transfer_row(
     population: int | None,
     generations: int,
     threads: int | None,
-    say: Say = lambda text: None,
+    say: Say = silent,
 ) -> Row:
     """Run one cell; an error goes into the row, so that the other cells still run.
 

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells
+from deal_hw.bench.rows import Cells, Table, printed
 from deal_hw.bench.scores import outside_range
+from deal_hw.bench.settings import Verdict
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation.checks import MOST_CAUSES
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
@@ -49,7 +50,7 @@ NONE = "none"
 """The name of that among chosen faults."""
 
 
-def cells(
+def robots(
     seeds: Sequence[int], kinds: Sequence[str] = (), faults: Sequence[str] = ()
 ) -> list[tuple[str, str, int]]:
     """Return the robots by (kind, fault, seed), first without a fault.
@@ -77,10 +78,16 @@ def cells(
     ]
 
 
-def table(cells: Sequence[tuple[str, str, int]], *, budget: Budget, threads: int | None) -> Cells:
-    """Return the cells with the function that runs each; see :func:`run_cell`."""
-    run = partial(run_cell, budget=budget, threads=threads)
-    return Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in cells])
+def table(settings: Verdict) -> Table:
+    """Return the bench: its cells by :func:`run_cell`.
+
+    Raises:
+        UnknownNameError: There is no such robot or fault.
+    """
+    run = partial(run_cell, budget=settings.budget, threads=settings.threads)
+    chosen = robots(settings.seeds, settings.problems, settings.faults)
+    cells = Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
+    return Table(cells=cells, line=line, summary=printed(summary))
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:

@@ -217,6 +217,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         "bench": _verb(
             "bench",
             help="measure how well calibration and the whole loop work, as JSON rows",
+            config="KINDS",
             example="bench loop --profile sensor --seeds 0,1 --out loop.json",
             extra="bench",
         ),

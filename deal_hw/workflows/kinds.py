@@ -185,9 +185,10 @@ def groups(hint: Any) -> Iterator[type[Any]]:
 def field_names(settings: Any) -> frozenset[str]:
     """Return the names of all fields of settings, those of groups included."""
     names: set[str] = set()
-    for name, hint in get_type_hints(settings, include_extras=True).items():
+    hints = get_type_hints(settings, include_extras=True)
+    for name in (entry.name for entry in dataclasses.fields(settings)):
         names.add(name)
-        inner: list[Any] = list(groups(hint))
+        inner: list[Any] = list(groups(hints[name]))
         names = names.union(*map(field_names, inner))
     return frozenset(names)
 

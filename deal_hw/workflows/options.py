@@ -6,29 +6,12 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_type_hints, overload
+from typing import Annotated, Any, ParamSpec, TypeVar, overload
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Range, option
 from deal_hw.workflows.kinds import Kinds, one_kind, signature_of
-
-
-@dataclass(frozen=True, slots=True)
-class Only:
-    """Marks an option, or a group of options, of some robots or benches only.
-
-    The help shows the option if one of these names is on the command line. For other names the settings, or
-    the verb, refuse it.
-
-    Attributes:
-        names: Names of robots or benches.
-    """
-
-    names: tuple[str, ...]
-
 
 FROM_PYTHON = "from Python"
 """Marks a field that is no option: only Python can give it."""
@@ -78,31 +61,6 @@ def refuse(options: Iterable[str], reason: str) -> None:
     """
     if found := list(options):
         raise ConfigurationError(f"{', '.join(found)} would have no effect: {reason}")
-
-
-def refuse_others(settings: Any, verb: str, name: str) -> None:
-    """Refuse options that are marked as :class:`Only` for other robots or benches.
-
-    Args:
-        settings: A settings dataclass, or a marked group inside it.
-        verb: The verb, as on the command line.
-        name: The robot or bench.
-
-    Raises:
-        ConfigurationError: Such an option was given.
-    """
-    hints = get_type_hints(type(settings), include_extras=True)
-    found: dict[Only, list[str]] = {}
-    for entry in dataclasses.fields(settings):
-        factory = entry.default_factory
-        default = SimpleNamespace(
-            **{entry.name: entry.default if factory is dataclasses.MISSING else factory()}
-        )
-        for only in (part for part in get_args(hints[entry.name])[1:] if isinstance(part, Only)):
-            if name not in only.names:
-                found.setdefault(only, []).extend(given(settings, default, [entry.name]))
-    for only, names in found.items():
-        refuse(names, f"only {' and '.join(f'`{verb} {other}`' for other in only.names)} can use that")
 
 
 @overload

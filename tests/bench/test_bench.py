@@ -1,10 +1,12 @@
-"""The verb `bench`: seeds, rows, resuming."""
+"""The verb `bench`: rows, resuming, and the benches with a known truth."""
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import onnx
@@ -14,8 +16,9 @@ from onnx import numpy_helper
 from deal_hw.bench import calibration, tasks
 from deal_hw.bench.rows import write_rows
 from deal_hw.bench.scores import check_truth
+from deal_hw.bench.settings import FixedRange, Loop, Mismatch, Paper
 from deal_hw.bench.tasks import make_case
-from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
+from deal_hw.cli.bench import bench
 from deal_hw.drivers.cartpole.description import SPACES
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
@@ -48,20 +51,10 @@ FIELDS = {
 }
 
 
-def test_seeds() -> None:
-    """Numbers and ranges, and an error that shows how."""
-    assert parse_seeds("0,3, 1000-1002") == (0, 3, 1000, 1001, 1002)
-    for text in ("", "a", "3-", "5-2"):
-        with pytest.raises(ConfigurationError, match="seed"):
-            parse_seeds(text)
-
-
 def test_rows_have_the_fields_of_the_benchmark_and_are_not_run_twice(tmp_path: Path) -> None:
     """The midpoint of the range scores its own null error; a second run recomputes nothing."""
     out = tmp_path / "loop.json"
-    settings = Bench(
-        bench="loop", profile="sensor", seeds="0", methods="midpoint", out=out, threads=1, quiet=True
-    )
+    settings = Loop(profile="sensor", seeds=(0,), methods=("midpoint",), out=out, threads=1, quiet=True)
     assert bench(settings) == 0
     values = json.loads(out.read_text())
     (row,) = values["rows"]
@@ -93,7 +86,7 @@ def test_rows_name_files_but_no_folder_of_the_machine(
 def test_unknown_method_is_refused_before_anything_runs(tmp_path: Path) -> None:
     """The methods are listed."""
     with pytest.raises(UnknownNameError, match="eki"):
-        bench(Bench(bench="loop", methods="magic", out=tmp_path / "loop.json"))
+        bench(Loop(methods=("magic",), out=tmp_path / "loop.json"))
 
 
 def test_foreign_file_is_not_overwritten(tmp_path: Path) -> None:
@@ -101,29 +94,20 @@ def test_foreign_file_is_not_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "notes.json"
     out.write_text('{"a": 1}')
     with pytest.raises(DatasetError, match="cannot be read as rows of a bench"):
-        bench(Bench(bench="loop", methods="midpoint", out=out))
+        bench(Loop(methods=("midpoint",), out=out))
     assert out.read_text() == '{"a": 1}'
-
-
-def test_ratios() -> None:
-    """Numbers above one, and an error that shows how."""
-    assert parse_ratios("3, 5,20") == (3.0, 5.0, 20.0)
-    for text in ("", "a", "1", "5,0.5"):
-        with pytest.raises(ConfigurationError, match="--range-ratio"):
-            parse_ratios(text)
 
 
 @pytest.mark.slow
 def test_honest_rows_for_every_task(tmp_path: Path) -> None:
     """Cells are tasks by methods; no-data baselines score the centre's error everywhere."""
     out = tmp_path / "honest.json"
-    settings = Bench(
-        bench="fixed-range",
-        task="cartpole,ant,go2",
+    settings = FixedRange(
+        task=("cartpole", "ant", "go2"),
         profile="ideal",
-        seeds="3",
-        methods="midpoint,nominal",
-        range_ratio="3",
+        seeds=(3,),
+        methods=("midpoint", "nominal"),
+        range_ratio=(3.0,),
         out=out,
         threads=1,
         quiet=True,
@@ -142,8 +126,13 @@ def test_honest_rows_for_every_task(tmp_path: Path) -> None:
 def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> None:
     """With the target at its place the nominal row scores 0 and every row says what that means."""
     out = tmp_path / "paper.json"
-    settings = Bench(
-        bench="paper", task="ant", profile="ideal", seeds="3", methods="midpoint,nominal", out=out, quiet=True
+    settings = Paper(
+        task=("ant",),
+        profile="ideal",
+        seeds=(3,),
+        methods=("midpoint", "nominal"),
+        out=out,
+        quiet=True,
     )
     assert bench(settings) == 0
     rows = {row["method"]: row for row in json.loads(out.read_text())["rows"]}
@@ -181,14 +170,11 @@ def test_a_truth_outside_its_range_is_refused_in_every_calibration_bench(
         return draw_truth(profile, seed, range_ratio=range_ratio)
 
     monkeypatch.setattr(tasks, "draw_truth", drawn)
-    benches: tuple[tuple[calibration.Protocol, str], ...] = (
-        ("fixed-range", "ideal"),
-        ("mismatch", "realistic"),
-    )
-    for protocol, profile in benches:
-        (cell,) = calibration.make_cells(
-            protocol, ["cartpole"], profile, ["midpoint"], [5.0], [3], space="paper"
-        )
+    for settings in (
+        FixedRange(profile="ideal", methods=("midpoint",), seeds=(3,), space="paper"),
+        Mismatch(methods=("midpoint",), seeds=(3,), space="paper"),
+    ):
+        (cell,) = calibration.make_cells(settings)
         row = calibration.run_cell(cell, population=4, generations=1, threads=1)
         assert "ConfigurationError: the true" in row["error"]
         assert "outside its search range" in row["error"] and "--space" in row["error"]
@@ -218,14 +204,13 @@ def test_a_preset_that_cannot_stand_is_said() -> None:
 def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
     """On motions that excite the row says so; on the policy's own motion it runs."""
     errors = {}
+    shown: Literal["excite", "policy"]
     for shown in ("excite", "policy"):
         out = tmp_path / f"{shown}.json"
-        settings = Bench(
-            bench="fixed-range",
-            task="cartpole",
+        settings = FixedRange(
             profile="ideal",
-            seeds="3",
-            methods="deal-paper",
+            seeds=(3,),
+            methods=("deal-paper",),
             population=4,
             generations=1,
             demonstration=shown,
@@ -242,8 +227,8 @@ def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
 def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:
     """One cell's error does not stop the others, and the exit code says that one failed."""
     out = tmp_path / "mismatch.json"
-    settings = Bench(
-        bench="mismatch", task="ant,cartpole", seeds="3", methods="midpoint", out=out, threads=1, quiet=True
+    settings = Mismatch(
+        task=("ant", "cartpole"), seeds=(3,), methods=("midpoint",), out=out, threads=1, quiet=True
     )
     assert bench(settings) == 1
     errors = {row["task"]: row["error"] for row in json.loads(out.read_text())["rows"]}
@@ -253,7 +238,7 @@ def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:
 def test_an_unknown_task_is_refused(tmp_path: Path) -> None:
     """The tasks are listed."""
     with pytest.raises(UnknownNameError, match="go2"):
-        bench(Bench(bench="fixed-range", task="biped", out=tmp_path / "honest.json"))
+        bench(FixedRange(task=("biped",), out=tmp_path / "honest.json"))
 
 
 @pytest.mark.parametrize("task", ["cartpole", "ant"])
@@ -264,11 +249,12 @@ def test_a_demonstration_is_as_long_as_is_asked_and_the_held_out_motion_stays(ta
     assert seconds == pytest.approx([2.0, 4.0], abs=0.1)
 
 
-def test_a_length_of_the_demonstration_belongs_to_the_calibration_benches() -> None:
-    """Others would ignore it; a row names it, so that a bench of another length is not taken for done."""
-    with pytest.raises(ConfigurationError, match="--demonstration-seconds"):
-        Bench(bench="loop", demonstration_seconds=2.0)
-    assert "demonstration_s" in calibration.KEY
+def test_a_bench_of_another_demonstration_is_not_taken_for_done() -> None:
+    """Its length is part of what tells cells apart."""
+    (short,), (long,) = (
+        calibration.make_cells(Paper(seeds=(3,), demonstration_seconds=seconds)) for seconds in (2.0, 4.0)
+    )
+    assert short.key != long.key
 
 
 def test_a_checkpoint_demonstrates_and_names_its_rows(tmp_path: Path) -> None:
@@ -281,17 +267,13 @@ def test_a_checkpoint_demonstrates_and_names_its_rows(tmp_path: Path) -> None:
         weak = 0.5 * numpy_helper.to_array(tensor)
         tensor.CopyFrom(numpy_helper.from_array(weak.astype(np.float32), tensor.name))
     onnx.save(model, str(early))
-    cells = calibration.make_cells(
-        "paper",
-        ["cartpole"],
-        "ideal",
-        ["midpoint"],
-        [3.0],
-        [3],
-        demonstration="policy",
-        checkpoints=[None, early],
+    settings = Paper(
+        profile="ideal", methods=("midpoint",), range_ratio=(3.0,), seeds=(3,), demonstration="policy"
     )
-    assert [cell.checkpoint for cell in cells] == ["", "early"]
+    (cell,), (other,) = (
+        calibration.make_cells(dataclasses.replace(settings, checkpoint=paths)) for paths in ((), (early,))
+    )
+    assert (cell.checkpoint, other.checkpoint) == ("", "early")
     commands, shown = [], []
     for path in (None, early):
         case = make_case("cartpole", "ideal", 3, 3.0, centred=True, by_policy=True, checkpoint=path)
@@ -303,6 +285,6 @@ def test_a_checkpoint_demonstrates_and_names_its_rows(tmp_path: Path) -> None:
         shown.append(case.fit.target)
     assert abs(commands[0] - commands[1]).max() > 1e-4 < abs(shown[0] - shown[1]).max()
     with pytest.raises(ConfigurationError, match="--demonstration policy"):
-        Bench(bench="paper", checkpoint=(early,))
-    row = calibration.run_cell(cells[1], population=4, generations=1, threads=1)
+        Paper(checkpoint=(early,))
+    row = calibration.run_cell(other, population=4, generations=1, threads=1)
     assert row["error"] == "" and row["checkpoint"] == "early" and "policy" not in row

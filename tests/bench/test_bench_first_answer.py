@@ -8,10 +8,11 @@ import mujoco
 import pytest
 
 from deal_hw.bench import first_answer
-from deal_hw.bench.first_answer import FirstAnswerSettings, cells, line, run_cell, summary
+from deal_hw.bench.first_answer import FirstAnswerSettings, line, run_cell, summary
+from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget
-from deal_hw.cli.bench import Bench, bench
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.cli.bench import bench
+from deal_hw.errors import MissingExtraError, UnknownNameError
 from deal_hw.sim.recordings.sysid_adapter import require_sysid
 from deal_hw.testing.plain_robots import PlainRobot, write
 
@@ -63,7 +64,7 @@ def test_motors_of_the_torque_arm_are_as_much_stronger_as_servos_were_stiffer(
 def test_real_robots_are_skipped_with_a_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without recordings the row says what to give; with a folder that lacks some, which."""
     out = tmp_path / "first.json"
-    settings = Bench(bench="first-answer", problems="so101, go2-suspended", seeds="0,1", out=out)
+    settings = FirstAnswer(problems=("so101", "go2-suspended"), seeds=(0, 1), out=out)
     assert bench(settings) == 0
     printed = capsys.readouterr().out
     assert "so101 seed 0: skipped: no real recordings: give --real DIR" in printed and "seed 1" not in printed
@@ -85,9 +86,7 @@ def test_the_go2s_files_are_those_that_its_page_makes(tmp_path: Path) -> None:
     assert "--out go2 --parts 4" in page and "traj_0_part4.npz" in page
 
 
-def test_unknown_problems_and_foreign_options_are_refused() -> None:
-    """The problems are listed; other benches do not take these options."""
+def test_unknown_problems_are_refused() -> None:
+    """The problems are listed."""
     with pytest.raises(UnknownNameError, match="torque-arm"):
-        cells(["humanoid"], [0], real=None, budget=Budget(), threads=None)
-    with pytest.raises(ConfigurationError, match="--real would have no effect"):
-        Bench(bench="verdict", real=Path("recordings"))
+        first_answer.table(FirstAnswer(problems=("humanoid",)))

@@ -9,6 +9,7 @@ import pytest
 
 from deal_hw.bench import go2_codec
 from deal_hw.bench.go2_codec import TARGETS_US, bench_codec
+from deal_hw.bench.settings import Go2Codec
 from deal_hw.cli.main import main
 
 
@@ -17,7 +18,7 @@ def test_the_codec_bench_writes_medians_and_the_machine(
 ) -> None:
     """A row for each operation, with its target where it has one; how fast it is, is no matter of a test."""
     out = tmp_path / "codec.json"
-    bench_codec(out, batches=3)
+    bench_codec(Go2Codec(out=out), batches=3)
     values = json.loads(out.read_text())
     rows = {row["operation"]: row for row in values["rows"]}
     assert set(TARGETS_US) < set(rows)
@@ -42,5 +43,5 @@ def test_json_is_the_only_output(
 
 def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     """As with every bench."""
-    bench_codec(None, quiet=True, batches=1)
+    bench_codec(Go2Codec(quiet=True), batches=1)
     assert capsys.readouterr().out == ""

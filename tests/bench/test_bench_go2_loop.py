@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from deal_hw.bench import go2_loop
-from deal_hw.cli.bench import Bench
+from deal_hw.bench.settings import Go2Loop
 from deal_hw.drivers.go2.emulator.truth import draw_truth
-from deal_hw.errors import ConfigurationError
 
 
 def row(seed: int, udr_more: float, calibrated: float, falls: int = 0) -> dict[str, Any]:
@@ -44,14 +43,10 @@ def test_a_row_in_words_names_its_error_or_its_policies() -> None:
 
 def test_cells_are_told_apart_by_what_they_measure(tmp_path: Path) -> None:
     """A seed without training is another cell than the same with it."""
-    some: dict[str, Any] = {
-        "profile": "sensor",
-        "seeds": [0, 1],
-        "steps": 10,
-        "folder": tmp_path,
-        "threads": 1,
-    }
-    trained, plain = (go2_loop.cells(**some, train=train) for train in (True, False))
+    trained, plain = (
+        go2_loop.table(Go2Loop(steps=10, out=tmp_path / "rows.json", train=train)).cells
+        for train in (True, False)
+    )
     assert [cell for cell, _ in trained.runs] == [("sensor", 0, 10), ("sensor", 1, 10)]
     assert [cell for cell, _ in plain.runs] == [("sensor", 0, 0), ("sensor", 1, 0)]
 
@@ -61,15 +56,9 @@ def test_a_truth_outside_its_range_is_refused(tmp_path: Path, monkeypatch: pytes
     truth = draw_truth("sensor", 4)
     stiff = dataclasses.replace(truth, stiffness=tuple(10 * k for k in truth.stiffness))
     monkeypatch.setattr(go2_loop, "draw_truth", lambda *_: stiff)
-    found = go2_loop.loop_row("sensor", 4, 0, train=False, folder=tmp_path, threads=1)
+    found = go2_loop.loop_row("sensor", 4, 0, folder=tmp_path, threads=1)
     assert "lies outside its search range" in found["error"] and ".stiffness" in found["error"]
     assert not list(tmp_path.iterdir())
-
-
-def test_steps_are_of_benches_that_fine_tune() -> None:
-    """Elsewhere the option would be ignored."""
-    with pytest.raises(ConfigurationError, match="only `bench go2-loop` and `bench transfer` can use that"):
-        Bench(bench="fixed-range", steps=10)
 
 
 @pytest.mark.slow
@@ -81,7 +70,7 @@ def test_a_walk_tells_gains_payload_and_what_is_to_come(
     monkeypatch.setattr(go2_loop, "PROFILE_S", 4.0)
     monkeypatch.setattr(go2_loop, "HELDOUT_S", 4.0)
     monkeypatch.setattr(go2_loop, "WALKS", 1)
-    found = go2_loop.loop_row("realistic", 4, 0, train=False, folder=tmp_path, threads=1)
+    found = go2_loop.loop_row("realistic", 4, 0, folder=tmp_path, threads=1)
     assert found["error"] == ""
     assert found["heldout_ratio"] < 0.6
     assert found["stiffness_log_error"] < 0.5 * found["stiffness_log_error_nominal"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.cli.bench import Bench, bench
+from deal_hw.bench.settings import Real
+from deal_hw.cli.bench import bench
 from deal_hw.cli.main import main
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.settings import Recordings
@@ -57,11 +59,10 @@ def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
 ) -> None:
     """The rows say who fitted, how far off unseen motion is predicted, and what ended at a bound."""
     out = tmp_path / "real.json"
-    settings = Bench(
-        bench="real",
+    settings = Real(
         recordings=hinge,
-        methods="nominal,default",
-        seeds="0",
+        methods=("nominal", "default"),
+        seeds=(0,),
         out=out,
         heldout_window=0.5,
         population=30,
@@ -98,4 +99,11 @@ def test_a_dataset_that_carries_its_robot(hinge: Recordings, tmp_path: Path) -> 
 def test_recordings_must_be_named(tmp_path: Path) -> None:
     """Without a model the error says what to give."""
     with pytest.raises(ConfigurationError, match="--model"):
-        bench(Bench(bench="real", out=tmp_path / "real.json"))
+        bench(Real(out=tmp_path / "real.json"))
+
+
+def test_a_file_of_parameters_is_written_by_calibrate(hinge: Recordings, tmp_path: Path) -> None:
+    """A bench only reads one."""
+    asked = dataclasses.replace(hinge, write_parameters=tmp_path / "new.yaml")
+    with pytest.raises(ConfigurationError, match="`deal-hw calibrate` writes that file"):
+        bench(Real(recordings=asked, out=tmp_path / "real.json"))

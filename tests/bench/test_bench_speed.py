@@ -10,10 +10,10 @@ import pytest
 
 from deal_hw.bench import speed
 from deal_hw.bench.rows import load_rows
+from deal_hw.bench.settings import Speed
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.cli.bench import Bench, bench
-from deal_hw.errors import ConfigurationError
+from deal_hw.cli.bench import bench
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.types import FloatArray
 
@@ -21,16 +21,7 @@ from deal_hw.types import FloatArray
 def test_a_cell_is_a_search_and_the_same_steps_of_the_engine(tmp_path: Path) -> None:
     """4 members for 2 generations of 200 ticks: the ratio is that of the two times, the steps are counted."""
     out = tmp_path / "speed.json"
-    asked = Bench(
-        bench="speed",
-        profile="ideal",
-        seeds="3",
-        population=4,
-        generations=2,
-        threads=1,
-        out=out,
-        quiet=True,
-    )
+    asked = Speed(profile="ideal", seeds=(3,), population=4, generations=2, threads=1, out=out, quiet=True)
     assert bench(asked) == 0
     (row,) = load_rows(out)
     case = make_case("cartpole", "ideal", 3, 5.0, by_policy=True)
@@ -108,10 +99,3 @@ def test_rows_in_words() -> None:
     assert speed.summary(rows) == [
         "ant easi, 200 x 50: 11.0 s, 2.50 times bare physics; the paper: 98 s on a GPU"
     ]
-
-
-def test_options_that_would_do_nothing_are_refused() -> None:
-    """It times searches alone, on what a policy demonstrates."""
-    for options in ({"refine_all": True}, {"demonstration": "policy"}):
-        with pytest.raises(ConfigurationError, match=r"`bench paper` .*can use that"):
-            Bench(bench="speed", **options)

@@ -13,8 +13,9 @@ import pytest
 
 from deal_hw.bench import transfer, transfer_target
 from deal_hw.bench.rows import load_rows
+from deal_hw.bench.settings import Transfer
 from deal_hw.bench.transfer_figure import draw_transfer
-from deal_hw.cli.bench import Bench, bench
+from deal_hw.cli.bench import bench
 from deal_hw.drivers.cartpole.description import SPACES
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
@@ -57,19 +58,18 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def settings(base: Path, out: Path, **more: Any) -> Bench:
+def settings(base: Path, out: Path, **more: Any) -> Transfer:
     """Return a bench of one small target."""
     values: dict[str, Any] = {
-        "task": "cartpole",
-        "seeds": "0",
-        "methods": "udr,midpoint,oracle",
+        "seeds": (0,),
+        "methods": ("udr", "midpoint", "oracle"),
         "steps": STEPS,
         "demonstration_seconds": 1.0,
         "checkpoint": (base,),
         "threads": 1,
         "out": out,
     }
-    return Bench(bench="transfer", **{**values, **more})
+    return Transfer(**{**values, **more})
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_every_row_is_a_fine_tune_of_one_policy_and_none_is_run_twice(
 ) -> None:
     """Same steps, seed and start; the oracle trains once; a second call adds only what is missing."""
     out = tmp_path / "transfer.json"
-    assert bench(settings(base, out, methods="udr,midpoint")) == 0
+    assert bench(settings(base, out, methods=("udr", "midpoint"))) == 0
     rows = json.loads(out.read_text())["rows"]
     assert [row["method"] for row in rows] == ["udr", "midpoint"]
     for row in rows:
@@ -153,10 +153,10 @@ def test_the_shipped_walk_is_the_base_of_the_go2(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "error", "words"),
     [
-        ({"task": "cartpol"}, UnknownNameError, "cartpole"),
-        ({"methods": "udr,esi"}, UnknownNameError, "easi"),
+        ({"task": ("cartpol",)}, UnknownNameError, "cartpole"),
+        ({"methods": ("udr", "esi")}, UnknownNameError, "easi"),
         ({"steps": 500}, ConfigurationError, "more than the 1000 steps of warmup"),
-        ({"task": "ant"}, ConfigurationError, "a policy of cartpole; this bench runs ant"),
+        ({"task": ("ant",)}, ConfigurationError, "a policy of cartpole; this bench runs ant"),
         ({"checkpoint": "twice"}, ConfigurationError, "a second policy of cartpole"),
         ({"checkpoint": "alone"}, ConfigurationError, "alone.safetensors is missing"),
         ({"checkpoint": "nominal"}, ConfigurationError, "another distribution .* within a factor 5"),
@@ -184,15 +184,6 @@ def test_what_cannot_work_is_refused_before_long_work(
     assert not (tmp_path / "t.json").exists()
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("profile", "ideal"), ("space", "k11"), ("range_ratio", "3"), ("train", False)]
-)
-def test_options_of_other_benches_are_refused(option: str, value: Any) -> None:
-    """The range is that of the base policy, and targets are without noise."""
-    with pytest.raises(ConfigurationError, match="would have no effect"):
-        Bench(bench="transfer", **{option: value})
-
-
 def test_a_target_without_a_demonstration_is_said_before_searches_and_trainings(
     base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,7 +193,7 @@ def test_a_target_without_a_demonstration_is_said_before_searches_and_trainings(
     monkeypatch.setattr(transfer, "train_policy", lambda *a, **k: pytest.fail("a training has begun"))
     transfer.draw_target.cache_clear()
     out = tmp_path / "transfer.json"
-    assert bench(settings(base, out, methods="udr,midpoint", quiet=True)) == 1
+    assert bench(settings(base, out, methods=("udr", "midpoint"), quiet=True)) == 1
     for row in json.loads(out.read_text())["rows"]:
         assert "CalibrationError: cartpole, seed 0: the base policy fails after" in row["error"]
     transfer.draw_target.cache_clear()

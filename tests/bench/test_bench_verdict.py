@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.bench import verdict as bench_verdict
-from deal_hw.bench.verdict import cells, line, names, run_cell, summary
+from deal_hw.bench.verdict import line, names, robots, run_cell, summary
 from deal_hw.calibration import Budget
 from deal_hw.errors import UnknownNameError
 from deal_hw.testing import plain_robots
@@ -107,16 +107,16 @@ def test_a_fault_is_named_by_its_cause_only(
 
 def test_cells_begin_with_right_models() -> None:
     """Five robots without a fault for each seed, then each fault."""
-    found = cells([0, 1])
+    found = robots([0, 1])
     assert len(found) == 2 * len(KINDS) * (1 + len(FAULTS))
     assert {fault for _, fault, _ in found[: 2 * len(KINDS)]} == {""}
 
 
 def test_robots_and_faults_are_chosen_by_name() -> None:
     """The right model is called none."""
-    assert cells([7], ["arm"], ["none", "sign"]) == [("arm", "", 7), ("arm", "sign", 7)]
+    assert robots([7], ["arm"], ["none", "sign"]) == [("arm", "", 7), ("arm", "sign", 7)]
     with pytest.raises(UnknownNameError, match="unknown fault 'wobble'"):
-        cells([7], [], ["wobble"])
+        robots([7], [], ["wobble"])
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib
 import json
@@ -201,6 +202,10 @@ def reported(value: Any) -> str:
         return str([reported(one) for one in value])
     if isinstance(value, mujoco.MjModel):
         return f"MjModel {value.opt.timestep} {value.nq}"
+    if isinstance(value, functools.partial):
+        return f"{reported(value.func)} {reported(value.args)} {reported(value.keywords)}"
+    if closure := getattr(value, "__closure__", None):
+        return f"{value.__qualname__} {[reported(cell.cell_contents) for cell in closure]}"
     if callable(value):
         return getattr(value, "__qualname__", type(value).__name__)
     if type(value).__module__.startswith("deal_hw"):
@@ -292,11 +297,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     patch("deal_hw.calib.design.excitation_search.search_excitation")
     monkeypatch.setattr("deal_hw.calib.design.experiment_design.Experiment", note("experiment", experiment))
     patch("deal_hw.cli.bridge.Go2Bridge")
-    for bench in ("loop", "go2_loop", "transfer", "speed", "first_answer", "real"):
-        monkeypatch.setattr(f"deal_hw.bench.{bench}.cells", note(f"{bench}.cells"))
-    monkeypatch.setattr("deal_hw.bench.calibration.cells", note("calibration"))
-    monkeypatch.setattr("deal_hw.bench.verdict.table", note("verdict"))
-    patch("deal_hw.bench.rows.run_cells")
+    monkeypatch.setattr("deal_hw.bench.rows.run_cells", _note_cells(did))
     emulator = types.SimpleNamespace(
         open=lambda: "port", close=lambda: None, changes=[], report=lambda: {}, slips=0, dropped=0
     )
@@ -324,6 +325,16 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         monkeypatch.setattr(module, "realtime_priority", contextlib.nullcontext)
     patch("deal_hw.bench.go2_codec.bench_codec")
     return did
+
+
+def _note_cells(did: list[str]) -> Callable[..., Any]:
+    """Note what a bench would run, and its file; what is called after each row holds all settings."""
+
+    def run_cells(cells: Any, out: Path, after: Any) -> None:
+        did.append(f"{reported(cells)} {out}")
+        raise SeenError
+
+    return run_cells
 
 
 def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:

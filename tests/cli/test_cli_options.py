@@ -25,6 +25,7 @@ DOUBTFUL: tuple[float, ...] = (-1, 0, 1e-300, 2**63)
 FINE_AT_ZERO = {
     "node",
     "seed",
+    "seeds",
     "episodes",
     "holdout",
     "web_port",
@@ -79,7 +80,6 @@ REQUIRED: dict[str, Any] = {
     "paths": (Path("p"),),
     "path": Path("p"),
     "episode": Path("e"),
-    "bench": "loop",
     "dataset": Path("d"),
     "folder": Path("f"),
     "name": "n",
@@ -261,7 +261,6 @@ def test_words_that_do_not_parse_get_one_line(
         ("collect cartpole --port p --out o --motion chirp --excitation-level 1", "--excitation-level"),
         ("collect cartpole --port p --out o --motion hold --policy a.onnx", "--policy"),
         ("inspect e --web-port 1234", "--web-port"),
-        ("bench loop --model m.xml", "--model"),
     ],
 )
 def test_an_option_without_effect_is_refused(line: str, option: str) -> None:

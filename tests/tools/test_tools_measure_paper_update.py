@@ -7,6 +7,7 @@ import pytest
 from measure_paper_update import UPDATES, measure, printed_rows
 
 from deal_hw.bench import calibration
+from deal_hw.bench.settings import Paper
 
 pytestmark = pytest.mark.real_time
 
@@ -16,9 +17,8 @@ pytestmark = pytest.mark.real_time
 )
 def test_a_row_is_the_benchs_row_without_data(update: str, method: str) -> None:
     """The same seed, ratio and number of parameters give the same error, without a robot."""
-    (cell,) = calibration.make_cells(
-        "paper", ["cartpole"], "ideal", [method], [10.0], [3], demonstration="policy"
-    )
+    asked = Paper(profile="ideal", methods=(method,), range_ratio=(10.0,), seeds=(3,), demonstration="policy")
+    (cell,) = calibration.make_cells(asked)
     row = calibration.run_cell(cell, population=None, generations=50, threads=1)
     found = measure(update, 9, 10.0, 3)
     assert found["error_percent"] == pytest.approx(row["error_percent"], rel=1e-6)
