@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from deal_hw.workflows.robot import check_robot as check_robot
     from deal_hw.workflows.robot import new_robot as new_robot
     from deal_hw.workflows.running.report import RunReport as RunReport
+    from deal_hw.workflows.running.settings import Go2LinkOptions as Go2LinkOptions
     from deal_hw.workflows.running.settings import LegOptions as LegOptions
     from deal_hw.workflows.running.settings import LinkOptions as LinkOptions
     from deal_hw.workflows.running.simulated import SimulationOptions as SimulationOptions
@@ -56,7 +57,7 @@ _EXPORTS = {
     "workflows.replay": ("replay",),
     "workflows.robot": ("check_robot", "new_robot", "RobotCheck"),
     "workflows.running.report": ("RunReport",),
-    "workflows.running.settings": ("LinkOptions", "LegOptions"),
+    "workflows.running.settings": ("LinkOptions", "Go2LinkOptions", "LegOptions"),
     "workflows.running.simulated": ("SimulationOptions",),
     "workflows.stop": ("stop", "StopReport"),
     "workflows.train": ("train", "Training"),

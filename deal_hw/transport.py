@@ -140,19 +140,13 @@ class TransportWrapper(Transport):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WireOptions:
-    """How a topic transport reaches its peers, beyond the port."""
+class NetworkOptions:
+    """What both sides of a topic transport say of the network."""
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
     domain: int = 0
     """Number of the DDS domain."""
-    listen: bool = False
-    """Wait for peers at the port instead of connecting to them (zenoh)."""
-    mode: str = ""
-    """Zenoh session mode, peer or client; by default peer with --listen, else client. Two clients of one
-    listener receive each other's messages. Two peers do not, so another program's commands would stay
-    unnoticed."""
     insecure: bool = False
     """Allow plain TCP to another machine (zenoh)."""
     ca: Path | None = None
@@ -163,14 +157,30 @@ class WireOptions:
     """Private key of the certificate (PEM)."""
 
     def __post_init__(self) -> None:
-        if self.mode not in ("", "peer", "client"):
-            raise ConfigurationError(f"wire mode {self.mode!r}: allowed are peer and client")
         if not 0 <= self.domain <= 232:
             raise ConfigurationError(f"DDS domain {self.domain}: allowed are 0 to 232")
         if (self.certificate is None) != (self.key is None):
             raise ConfigurationError(
                 "a certificate and its private key belong together: give both or neither"
             )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireOptions(NetworkOptions):
+    """How a topic transport reaches its peers, beyond the port."""
+
+    listen: bool = False
+    """Wait for peers at the port instead of connecting to them (zenoh)."""
+    mode: str = ""
+    """Zenoh session mode, peer or client; by default peer with --listen, else client. Two clients of one
+    listener receive each other's messages. Two peers do not, so another program's commands would stay
+    unnoticed."""
+
+    def __post_init__(self) -> None:
+        # Not super(): a slotted dataclass is another class than the one of this method.
+        NetworkOptions.__post_init__(self)
+        if self.mode not in ("", "peer", "client"):
+            raise ConfigurationError(f"wire mode {self.mode!r}: allowed are peer and client")
 
     @property
     def session_mode(self) -> str:

@@ -35,21 +35,20 @@ ALARM_FOLDERS = ("calib", "deal_hw")
 
 API_NAMES = {
     "Calibrate": ("calibrate", "Calibration", "design_excitation"),
-    "Run a robot": (
-        "collect",
-        "deploy",
+    "Run a robot": ("collect", "deploy"),
+    "Replay and options of a run": (
         "replay",
         "RunReport",
         "LinkOptions",
+        "Go2LinkOptions",
         "LegOptions",
         "SimulationOptions",
         "WireOptions",
     ),
-    "Stop a robot": ("stop", "StopReport"),
-    "Emulate and check a robot": (
+    "Check and stop a robot": ("doctor", "stop", "StopReport"),
+    "Emulate and describe a robot": (
         "emulate",
         "EmulatedRobot",
-        "doctor",
         "new_robot",
         "check_robot",
         "RobotCheck",
@@ -213,9 +212,9 @@ def api_pages() -> dict[str, str]:
             of_kinds: dict[type[Any], list[str]] = {settings: []} if isinstance(settings, type) else {}
             if isinstance(settings, Kinds):
                 for word, kind in settings.table().items():
-                    of_kinds.setdefault(kind.settings, []).append(f'"{word}"')
+                    of_kinds.setdefault(kind.settings, []).append(word or "no robot")
             for one, robots in of_kinds.items():
-                of_robots = f"{heading}: {', '.join(robots)}" if robots else heading
+                of_robots = f"{heading} for {', '.join(robots)}" if robots else heading
                 lines += reference(f"{one.__module__}.{one.__qualname__}", of_robots, inherited=True)
         found[api_place(title)] = "\n".join(lines)
     for title, modules in API_MODULES.items():

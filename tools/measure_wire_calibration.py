@@ -35,7 +35,8 @@ from measuring import Rows, add_seeds, parser, read_rows
 
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate
-from deal_hw.cli.collect import Collect, collect
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
 from deal_hw.drivers.cartpole.chips.avr_device import AvrDevice
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
@@ -97,7 +98,7 @@ def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[s
     with EmulatorProcess("cartpole", *options, "--reveal-to", str(truth_file)) as emulator:
         for kind in ("rich", "chirp"):
             collect(
-                Collect(
+                COLLECT.settings(
                     robot="cartpole",
                     port=emulator.port,
                     link=LinkOptions(transport=transport),

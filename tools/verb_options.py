@@ -90,7 +90,7 @@ def _other(default: Any, kinds: set[Any]) -> tuple[str, ...] | None:
     """Return a number or choice that is not the default."""
     for kind in kinds:
         if typing.get_origin(kind) is Literal:
-            return (str(next(one for one in typing.get_args(kind) if one != default)),)
+            return tuple(str(one) for one in typing.get_args(kind) if one != default)[:1]
     if kinds <= {int, float, NoneType}:
         return ("2.5",) if float in kinds else ("2",)
     return None

@@ -106,8 +106,8 @@ def clustered(
         if length < max(SHORTEST_PART, 2 * correlation_samples) and parts > 1:
             continue
         level = _level(rows, bread, samples, parts, group)
-        settled = found is not None and not found.autocorrelated
-        if level.blocks < (ENOUGH_BLOCKS if settled else FEWEST_BLOCKS):
+        uncorrelated = found is not None and not found.autocorrelated
+        if level.blocks < (ENOUGH_BLOCKS if uncorrelated else FEWEST_BLOCKS):
             break
         found = level
     return found

@@ -42,7 +42,7 @@ START_ITERATIONS = 4
 
 def solve_contacts(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states; return the best point, its normal equations, and derivatives."""
-    best, best_cost = settle(shooting, point, START_ITERATIONS)
+    best, best_cost = fit_starts(shooting, point, START_ITERATIONS)
     bounds, waited, used = value_bounds(shooting.problem), 0, 0
     while used < iterations and waited <= PATIENCE:
         fit = Sticking(shooting, best, STRETCHES[waited % len(STRETCHES)])
@@ -53,7 +53,7 @@ def solve_contacts(shooting: Shooting, point: Point, iterations: int) -> tuple[P
         if fell > 0:
             best, best_cost = fit.best, fit.best_cost
         waited = 0 if fell > LEAST_GAIN else waited + 1
-    best, _ = settle(shooting, best, START_ITERATIONS // 2)
+    best, _ = fit_starts(shooting, best, START_ITERATIONS // 2)
     return best, shooting.normal(best), used
 
 
@@ -96,7 +96,7 @@ class Sticking:
     def _followed(self, point: Point) -> _Followed:
         """Improve the start states at a point once, and linearise."""
         normal = self._shooting.normal(point, keep=True, stretch=self._stretch)
-        point, gains = _settled(self._shooting, point, normal)
+        point, gains = _stepped(self._shooting, point, normal)
         found = _Followed(point, normal, gains, self._shooting.vector(point))
         cost = float(found.residual @ found.residual)
         if cost < self.best_cost:
@@ -104,19 +104,19 @@ class Sticking:
         return found
 
 
-def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, float]:
+def fit_starts(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, float]:
     """Fit start states alone; parameters stay, and no window's cost grows. Return the point and its cost."""
     cost = shooting.cost(point)
     for number in range(iterations):
         normal = shooting.normal(point, keep=True, stretch=STRETCHES[number % 2])
-        point, _ = _settled(shooting, point, normal)
+        point, _ = _stepped(shooting, point, normal)
         before, cost = cost, shooting.cost(point)
         if before - cost < LEAST_GAIN:
             break
     return point, cost
 
 
-def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, list[FloatArray]]:
+def _stepped(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, list[FloatArray]]:
     """Return the point after each window's best damped step, and the gains there, (W, S, P) each.
 
     A gain is the derivative of the best start states by the parameters.

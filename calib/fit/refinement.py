@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.contacts import START_ITERATIONS, settle, solve_contacts
+from deal_hw.calib.fit.contacts import START_ITERATIONS, fit_starts, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, restarted, solve
 from deal_hw.errors import InsufficientDataError
@@ -248,7 +248,7 @@ def at_parameters(
     shooting = Shooting(problem, length)
     point = shooting.start(theta, latency_s, states)
     if shooting.contacts:
-        point = settle(shooting, point, START_ITERATIONS)[0]
+        point = fit_starts(shooting, point, START_ITERATIONS)[0]
         normal = shooting.normal(point)
     else:
         point, normal = converged(shooting, point, shooting.normal(point), START_ITERATIONS)

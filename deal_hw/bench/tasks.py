@@ -187,8 +187,8 @@ def _cartpole(ask: _Ask) -> Case:
 
 def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
     """Return a case of a robot that exists only in simulators and reports its whole state."""
-    from deal_hw.drivers.simulated_motions import FAST_HZ, flail
     from deal_hw.robots import parameter_spaces, robot_description
+    from deal_hw.robots.simulated_motions import FAST_HZ, flail
 
     if ask.profile != "ideal":
         raise ConfigurationError(f"the {task} has no sensors, so no profile {ask.profile!r}; use ideal")

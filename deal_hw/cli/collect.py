@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-import tyro
-
+from deal_hw.cli.piped import Quiet, is_quiet
 from deal_hw.cli.show import Terminal
 from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.motions.excitation.behaviours import RichConfig
-from deal_hw.workflows.collect import CollectSettings, run
+from deal_hw.workflows.collect import COLLECT, CollectSettings, CollectSimulatedSettings, run
 from deal_hw.workflows.running.report import RunReport
 
-
-@dataclass(frozen=True, kw_only=True)
-class Collect(CollectSettings):
-    """Record the robot during an informative motion."""
-
-    robot: tyro.conf.Positional[str]
-
-    rich: tyro.conf.Suppress[RichConfig] = field(default_factory=RichConfig)
-
-    quiet: bool = False
-    """Print nothing but errors."""
+KINDS = COLLECT.with_options(Quiet)
 
 
-def collect(config: Collect) -> RunReport:
+def collect(config: CollectSettings | CollectSimulatedSettings) -> RunReport:
     """Run the verb; see :func:`deal_hw.workflows.collect.collect`."""
-    return run(config, Terminal(config.quiet))
+    return run(config, Terminal(is_quiet(config)))
 
 
-def collect_and_say_next(config: Collect) -> RunReport:
+def collect_and_say_next(config: CollectSettings | CollectSimulatedSettings) -> RunReport:
     """Run the verb, and print the line that calibrates from the recordings."""
     report = collect(config)
-    if report.outcome is Outcome.FINISHED and not config.quiet:
+    if report.outcome is Outcome.FINISHED and not is_quiet(config):
         print(f"next: deal-hw calibrate {report.dataset}")
     return report

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
 
 import numpy as np
-import tyro
 from rich.markup import escape
 
 from deal_hw.calibration import CalibrationResult, percent
@@ -27,7 +26,8 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
-from deal_hw.workflows.options import CARTPOLE, Only, Seed, refuse_others
+from deal_hw.workflows.kinds import InputKind, Kinds
+from deal_hw.workflows.options import Seed
 from deal_hw.workflows.running.report import RunReport
 
 if TYPE_CHECKING:
@@ -42,15 +42,11 @@ END_WIDTH = 110
 class Demo(Checked):
     """Record, calibrate, retrain, deploy and compare on an emulated robot."""
 
-    robot: tyro.conf.Positional[Literal["cartpole", "go2"]] = "cartpole"
+    robot: str = field(default="cartpole", kw_only=False)
     """cartpole balances its pole, go2 walks."""
 
     out: Path | None = None
     """Run folder, by default runs/demo (go2: runs/demo_go2). A former demo in it is deleted."""
-
-    transport: str = ""
-    """The wire. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the default) or
-    zenoh."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """Sensor effects of the emulated robot, as for `deal-hw emulate`."""
@@ -61,24 +57,45 @@ class Demo(Checked):
     episodes: Annotated[int | None, Range(1, 1000)] = None
     """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s."""
 
-    firmware: Annotated[Literal["auto", "host", "python", "avr"], CARTPOLE] = "auto"
-    """How the firmware of the cart-pole runs, as for `deal-hw emulate cartpole`."""
-
-    on_stand: Annotated[bool, Only(("go2",))] = False
-    """Calibrate from a recording with the body on a stand instead of from the walk."""
-
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps. Cart-pole: by default as many as for the shipped UDR policy. Go2: 300,000, starting
     from the shipped policy."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        refuse_others(self, "demo", self.robot)
 
     @property
     def folder(self) -> Path:
         """The run folder."""
         return self.out or Path("runs") / ("demo" if self.robot == "cartpole" else f"demo_{self.robot}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoCartpole(Demo):
+    """Record, calibrate, retrain, deploy and compare on an emulated cart-pole, which balances its pole."""
+
+    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
+    """The wire."""
+
+    firmware: Literal["auto", "host", "python", "avr"] = "auto"
+    """How the firmware of the cart-pole runs, as for `deal-hw emulate cartpole`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoGo2(Demo):
+    """Record, calibrate, retrain, deploy and compare on an emulated Go2, which walks."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """The wire."""
+
+    on_stand: bool = False
+    """Calibrate from a recording with the body on a stand instead of from the walk."""
+
+
+_TABLE = {"cartpole": InputKind(DemoCartpole), "go2": InputKind(DemoGo2)}
+KINDS = Kinds(
+    noun="robot",
+    argument="robot",
+    table=lambda: _TABLE,
+    find=lambda arguments: "cartpole" if arguments.first is None else str(arguments.first),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +215,8 @@ def demo(config: Demo) -> DemoReport:
     with folder:
         settings = ("robot", "transport", "profile", "episodes", "steps", "on_stand")
         folder.start(
-            {"kind": "demo", **{name: getattr(config, name) for name in settings}}, {"demo": config.seed}
+            {"kind": "demo", **{name: getattr(config, name, False) for name in settings}},
+            {"demo": config.seed},
         )
         done = part.run(config, folder, stages)
         summary = _summary(done, stages)

@@ -14,12 +14,15 @@ from typing import Final, Literal
 import numpy as np
 
 from deal_hw.cli.calibrate import Calibrate, calibrate
-from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_episode
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
+from deal_hw.cli.demo import DemoCartpole, Demonstrated, Measure, Stages, read_truth, show_episode
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
-from deal_hw.cli.deploy import Deploy, deploy
+from deal_hw.cli.deploy import KINDS as DEPLOY
+from deal_hw.cli.deploy import deploy
 from deal_hw.cli.piped import PipedProgress
-from deal_hw.cli.train import Train, train
+from deal_hw.cli.train import KINDS as TRAIN
+from deal_hw.cli.train import train
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.motions.excitation.level import LOWEST_LEVEL
 from deal_hw.types import FloatArray
@@ -32,12 +35,12 @@ EPISODES: Final = 3
 TRUTH_FILE: Final = "truth.json"
 
 
-def check(config: Demo) -> None:
+def check(config: DemoCartpole) -> None:
     """Check settings. See :class:`deal_hw.cli.demo.Part`."""
     required_policy("cartpole")
 
 
-def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+def run(config: DemoCartpole, folder: RunFolder, stages: Stages) -> Demonstrated:
     """Collect, calibrate, train, deploy, inspect. See :class:`deal_hw.cli.demo.Part`."""
     udr = required_policy("cartpole")
     out, episodes = config.folder, config.episodes or EPISODES
@@ -60,7 +63,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     policy = folder.policies / "calibrated.onnx"
     with stages.stage("train", "a policy under the calibrated distribution"):
         train(
-            Train(
+            TRAIN.settings(
                 robot="cartpole",
                 distribution=found.files["distribution.json"],
                 out=policy,
@@ -100,16 +103,16 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
 class _Emulated:
     """An emulated cart-pole on its wire."""
 
-    config: Demo
+    config: DemoCartpole
     port: str
 
     @property
     def _link(self) -> LinkOptions:
-        return LinkOptions(transport=_transport(self.config))
+        return LinkOptions(transport=self.config.transport)
 
     def collect(self, motion: Literal["rich", "chirp"], gentler: int) -> RunReport:
         """Record a motion, some steps gentler where there are levels."""
-        asked = Collect(
+        asked = COLLECT.settings(
             robot="cartpole",
             port=self.port,
             link=self._link,
@@ -123,7 +126,7 @@ class _Emulated:
     def deploy(self, name: str, policy: Path, episodes: int) -> RunReport:
         """Deploy a policy."""
         return deploy(
-            Deploy(
+            DEPLOY.settings(
                 robot="cartpole",
                 port=self.port,
                 link=self._link,
@@ -136,18 +139,14 @@ class _Emulated:
 
 
 @contextmanager
-def _emulated(config: Demo) -> Iterator[_Emulated]:
+def _emulated(config: DemoCartpole) -> Iterator[_Emulated]:
     """Yield the robot of the demo's seed, at rest; each time the same one."""
     hidden = ("--profile", config.profile, "--seed", str(config.seed))
-    wire = ("--transport", _transport(config), "--firmware", config.firmware)
+    wire = ("--transport", config.transport, "--firmware", config.firmware)
     truth = ("--reveal-to", str(config.folder / TRUTH_FILE))
     with EmulatorProcess("cartpole", *wire, *truth, *hidden) as emulator:
         print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {emulator.port}")
         yield _Emulated(config=config, port=emulator.port)
-
-
-def _transport(config: Demo) -> str:
-    return config.transport or "serial"
 
 
 def held(run: RunReport) -> str:

@@ -13,20 +13,23 @@ import numpy as np
 
 from deal_hw.calib.report.verdict import trust
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
-from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_episode
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
+from deal_hw.cli.demo import DemoGo2, Demonstrated, Measure, Stages, read_truth, show_episode
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
-from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.train import Train, train
+from deal_hw.cli.deploy import KINDS as DEPLOY
+from deal_hw.cli.deploy import deploy
+from deal_hw.cli.train import KINDS as TRAIN
+from deal_hw.cli.train import train
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.documentation import page
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
-from deal_hw.errors import ConfigurationError
 from deal_hw.motions.scores.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.types import FloatArray
+from deal_hw.workflows.collect import CollectGo2Settings
 from deal_hw.workflows.emulation.go2 import read_track
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.walk_script import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
@@ -40,20 +43,12 @@ STEPS: Final = 300_000
 PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
 
 
-def check(config: Demo) -> None:
+def check(config: DemoGo2) -> None:
     """Check settings. See :class:`deal_hw.cli.demo.Part`."""
     required_policy("go2")
-    if _transport(config) not in PORTS:
-        raise ConfigurationError(
-            f"--transport {config.transport}: the Go2 is reached by {' or '.join(PORTS)}"
-        )
 
 
-def _transport(config: Demo) -> str:
-    return config.transport or next(iter(PORTS))
-
-
-def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+def run(config: DemoGo2, folder: RunFolder, stages: Stages) -> Demonstrated:
     """Walk, calibrate, fine-tune, walk again, inspect. See :class:`deal_hw.cli.demo.Part`."""
     udr = required_policy("go2")
     out, episodes = config.folder, config.episodes or 1
@@ -141,7 +136,7 @@ class _Emulated:
 
     def _walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> RunReport:
         return deploy(
-            Deploy(
+            DEPLOY.settings(
                 robot="go2",
                 port=self.port,
                 link=self.link,
@@ -156,9 +151,9 @@ class _Emulated:
 
 
 @contextmanager
-def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
+def _emulated(config: DemoGo2, name: str, *options: str) -> Iterator[_Emulated]:
     """Yield the robot of the demo's seed. Its truth and its track go to files of this name."""
-    out, transport = config.folder, _transport(config)
+    out, transport = config.folder, config.transport
     track = out / f"truth_track_{name}.csv"
     wire = ("--transport", transport, "--port", PORTS[transport])
     hidden = ("--profile", config.profile, "--seed", str(config.seed))
@@ -170,7 +165,7 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
         yield _Emulated(port=emulator.port, link=link, track=track)
 
 
-def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path, Path]:
+def _on_stand(config: DemoGo2, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path, Path]:
     """Record the same robot on a stand and calibrate from that.
 
     Returns:
@@ -181,7 +176,7 @@ def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[Calibrat
     with _emulated(config, "on_stand", "--on-stand") as robot:
         with stages.stage("collect on a stand", "10 s of a multisine, and 8 s of a sweep as held-out data"):
             for excite, seconds in (("multisine", 10.0), ("chirp", 8.0)):
-                motion = Collect(
+                motion = COLLECT.settings(
                     robot="go2_on_stand",
                     port=robot.port,
                     link=robot.link,
@@ -209,12 +204,12 @@ def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[Calibrat
     return found, file, runs[0].paths[0]
 
 
-def _collected(motion: Collect, gentler: int) -> RunReport:
+def _collected(motion: CollectGo2Settings, gentler: int) -> RunReport:
     return collect(motion)
 
 
 def _fine_tuned(
-    config: Demo, folder: RunFolder, stages: Stages, found: Path, udr: Path
+    config: DemoGo2, folder: RunFolder, stages: Stages, found: Path, udr: Path
 ) -> Mapping[str, Path]:
     """Fine-tune the shipped policy under the calibration, and as long under UDR for comparison."""
     policies = {name: folder.policies / f"{_in_paths(name)}.onnx" for name in ("udr more", "calibrated")}
@@ -222,7 +217,7 @@ def _fine_tuned(
         distribution = found if name == "calibrated" else None
         with stages.stage(f"train {name}", "some more training steps of the shipped policy"):
             train(
-                Train(
+                TRAIN.settings(
                     robot="go2",
                     distribution=distribution,
                     udr=distribution is None,

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import tyro
-
+from deal_hw.cli.piped import Quiet, is_quiet
 from deal_hw.cli.show import Terminal
-from deal_hw.workflows.deploy import DeploySettings, run
+from deal_hw.workflows.deploy import DEPLOY, DeploySettings, run
 from deal_hw.workflows.running.report import RunReport
 
-
-@dataclass(frozen=True, kw_only=True)
-class Deploy(DeploySettings):
-    """Run a policy on the robot behind the safety filter, and record it."""
-
-    robot: tyro.conf.Positional[str]
-
-    quiet: bool = False
-    """Print nothing but errors."""
+KINDS = DEPLOY.with_options(Quiet)
 
 
-def deploy(config: Deploy) -> RunReport:
+def deploy(config: DeploySettings) -> RunReport:
     """Run the verb; see :func:`deal_hw.workflows.deploy.deploy`."""
-    return run(config, Terminal(config.quiet))
+    return run(config, Terminal(is_quiet(config)))

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 
-import tyro
+from deal_hw.cli.piped import PipedProgress, Quiet, is_quiet
+from deal_hw.workflows.design_excitation import DESIGN_EXCITATION, ExcitationReport, ExcitationSettings, run
 
-from deal_hw.cli.piped import PipedProgress
-from deal_hw.workflows.design_excitation import ExcitationReport, ExcitationSettings, run
-
-
-@dataclass(frozen=True, kw_only=True)
-class DesignExcitation(ExcitationSettings):
-    """Compute the most informative motion to play on a robot."""
-
-    robot: tyro.conf.Positional[str]
-
-    quiet: bool = False
-    """Print nothing but errors."""
+KINDS = DESIGN_EXCITATION.with_options(Quiet)
 
 
-def design_excitation(config: DesignExcitation) -> ExcitationReport:
+def design_excitation(config: ExcitationSettings) -> ExcitationReport:
     """Run the verb; see :func:`deal_hw.workflows.design_excitation.design_excitation`."""
-    if config.quiet or sys.stderr.isatty():
-        report = run(config, None if config.quiet else note)
+    if is_quiet(config) or sys.stderr.isatty():
+        report = run(config, None if is_quiet(config) else note)
     else:
         with PipedProgress("design-excitation") as piped:
             report = run(config, lambda done, total, text: piped.at(f"{done}/{total} {text}"))
-    if not config.quiet:
+    if not is_quiet(config):
         print_design(config.robot, report)
     return report
 

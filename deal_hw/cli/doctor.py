@@ -9,29 +9,24 @@ import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
 from deal_hw.findings import Finding, Severity
-from deal_hw.workflows.doctor.examine import DoctorReport, DoctorSettings, examine
+from deal_hw.workflows.doctor.examine import DOCTOR, DoctorReport, DoctorSettings, examine
 
 _MARKS = {Severity.OK: "ok  ", Severity.NOTE: "note", Severity.WARN: "WARN", Severity.FAIL: "FAIL"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Doctor(DoctorSettings):
-    """Check this computer, the connection and the robot; sends no command to a motor.
-
-    Without ROBOT only this computer is checked. The exit code is 1 if a check failed (FAIL), and 0 with notes
-    and warnings only.
-    """
-
-    robot: tyro.conf.Positional[str] = ""
+class JsonFile:
+    """What only the command line has."""
 
     json: Path | None = None
     """Write the findings to this file."""
 
 
-def doctor(config: Doctor) -> DoctorReport:
+KINDS = DOCTOR.with_options(JsonFile)
+
+
+def doctor(config: DoctorSettings) -> DoctorReport:
     """Run the checks and print each finding at once.
 
     Raises:
@@ -49,7 +44,7 @@ def doctor(config: Doctor) -> DoctorReport:
             print(_wrapped("        -> ", finding.do))
         found.append(finding)
     report = DoctorReport(findings=tuple(found))
-    if config.json is not None:
+    if isinstance(config, JsonFile) and config.json is not None:
         rows = [{"area": f.code, "level": f.severity.value, "message": f.seen, "remedy": f.do} for f in found]
         config.json.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     worst = [level for level in (Severity.FAIL, Severity.WARN) if any(f.severity is level for f in found)]

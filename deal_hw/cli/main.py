@@ -103,6 +103,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         "collect": _verb(
             "collect",
             help="record the robot during an informative motion",
+            config="KINDS",
             example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
             function="collect_and_say_next",
             common="port out motion policy seconds transport velocity stand quiet",
@@ -119,6 +120,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         "train": _verb(
             "train",
             help="train a policy under the calibrated distribution",
+            config="KINDS",
             example="train cartpole --distribution runs/first/calibration/distribution.json --out runs/first",
             extra="train",
             function="train_and_say_next",
@@ -127,6 +129,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         "deploy": _verb(
             "deploy",
             help="run a policy on the robot behind the safety filter",
+            config="KINDS",
             example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/policy.onnx",
             extra="deploy",
             common="port out policy seconds task transport velocity stand trust_calibration dry_run quiet",
@@ -147,18 +150,21 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         "demo": _verb(
             "demo",
             help="do all five jobs on an emulated cart-pole or Go2",
+            config="KINDS",
             example="demo --out runs/demo",
             extra="all",
         ),
         "design-excitation": _verb(
             "design-excitation",
             help="compute the most informative motion to play on a robot",
+            config="KINDS",
             example="design-excitation cartpole --out runs/first/excitation.json",
             extra="calib",
         ),
         "emulate": _verb(
             "emulate",
             help="emulate a robot on its own port, with hidden physics",
+            config="KINDS",
             example="emulate cartpole --profile realistic --seed 0",
             extra="sim",
         ),
@@ -193,17 +199,19 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         "replay": _verb(
             "replay",
             help="send a recording's commands again, through the safety filter",
+            config="KINDS",
             example="replay runs/first/dataset/episodes/000000.mcap --port /dev/ttyUSB0",
         ),
         "stop": _verb(
             "stop",
             help="make a robot passive at once, from any terminal, whoever of deal-hw commands it",
+            config="KINDS",
             example="stop go2",
-            config="StopRobot",
         ),
         "doctor": _verb(
             "doctor",
             help="check this computer, the connection and the robot",
+            config="KINDS",
             example="doctor go2 --port enp2s0",
         ),
         "bench": _verb(
@@ -287,6 +295,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """
     try:
         settings, function = parse(name, arguments)
+        if name != "doctor":
+            _name_problems()
         result = function(settings)
     except ModuleNotFoundError as err:
         package = (err.name or "").partition(".")[0]
@@ -295,6 +305,19 @@ def run(name: str, arguments: Sequence[str]) -> int:
         raise MissingExtraError(package, find(name).extra or "all") from err
     code = getattr(result, "exit_code", result)
     return code if isinstance(code, int) and not isinstance(code, bool) else EXIT_OK
+
+
+def _name_problems() -> None:
+    """Print a line for each plug-in that is left out, if the verb uses the table of robots.
+
+    ``deal-hw doctor`` shows them among its findings.
+    """
+    if "deal_hw.robots" in sys.modules:
+        from deal_hw.robots import plug_ins
+
+        for one in plug_ins():
+            if one.problem:
+                print(f"deal-hw: warning: {one.problem}", file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

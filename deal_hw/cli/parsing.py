@@ -50,9 +50,11 @@ class Rules:
     Args:
         helps: Whether a help page is made.
         common: Fields that the page explains; all where empty.
+        without: A field that the page leaves out, since the usage line has its value.
     """
 
-    def __init__(self, *, helps: bool = False, common: Collection[str] = ()) -> None:
+    def __init__(self, *, helps: bool = False, common: Collection[str] = (), without: str = "") -> None:
+        self._without = without
         self._common = common
         self._helps = helps
         self._no_options: list[Any] = []
@@ -86,6 +88,9 @@ class Rules:
         if FROM_PYTHON in parts[1:]:
             marks.append(tyro.conf.Suppress)
             self._no_options += [kind for kind in parts if dataclasses.is_dataclass(kind)]
+        elif field.name == self._without and self._helps:
+            marks.append(tyro.conf.Suppress)
+            field = dataclasses.replace(field, default="")
         elif is_positional(owner, field.name, field.type):
             marks += [tyro.conf.Positional]
             marks[0] = tyro.conf.arg(metavar=field.name.upper(), help_behavior_hint=_default)
@@ -234,7 +239,8 @@ def read_settings(
     if kinds.noun and not kinds.argument:
         words.remove(given.positional[0])
     if helps:
-        _print_help(verb, chosen, line, explains_all=HELP_ALL in arguments)
+        without = "" if chosen.usage else kinds.argument
+        _print_help(verb, chosen, line, () if HELP_ALL in arguments else verb.common, without)
 
     def having(field: str) -> list[str]:
         return [f"{name} {one}" for one, kind in kinds.table().items() if field in options_of(kind.settings)]
@@ -271,9 +277,9 @@ def _parsed(settings: type[Any], words: Sequence[str], line: str) -> Any:
         ) from None
 
 
-def _print_help(verb: Verb, kind: InputKind, line: str, *, explains_all: bool) -> NoReturn:
+def _print_help(verb: Verb, kind: InputKind, line: str, common: Collection[str], without: str) -> NoReturn:
     """Print the options of one kind of a verb's input."""
-    rules = Rules(helps=True, common=() if explains_all else verb.common)
+    rules = Rules(helps=True, common=common, without=without)
     text = inspect.cleandoc(kind.settings.__doc__ or "") or f"{verb.help[:1].upper()}{verb.help[1:]}."
     if f"deal-hw {verb.example}" not in text:
         text = f"{text}\n\nExample:  deal-hw {verb.example}"
@@ -304,5 +310,5 @@ def kinds_page(name: str, verb: Verb, kinds: Kinds) -> str:
     lines = [f"{verb.help[:1].upper()}{verb.help[1:]}.", "", f"Example:  deal-hw {verb.example}", ""]
     lines += [f"usage: deal-hw {name} {kinds.noun.upper()} [options]", ""]
     lines += [f"  {usage:<{width}}  {text}".rstrip() for usage, text in rows]
-    lines += ["", f"Options: one of these lines with --help, such as  {rows[0][0]} --help"]
+    lines += ["", f"Options: one of these lines with --help, such as  {rows[-1][0]} --help"]
     return "\n".join(lines)

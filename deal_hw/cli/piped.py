@@ -6,6 +6,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import TracebackType
 
 from deal_hw.clock import Clock, MonotonicClock
@@ -79,3 +80,16 @@ class PipedProgress:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._ended.set()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quiet:
+    """What only the command line has."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def is_quiet(settings: object) -> bool:
+    """Return whether only errors are printed."""
+    return isinstance(settings, Quiet) and settings.quiet

@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
-import tyro
-
+from deal_hw.cli.piped import Quiet, is_quiet
 from deal_hw.cli.show import Terminal
-from deal_hw.workflows.replay import ReplaySettings, run
+from deal_hw.workflows.replay import REPLAY, ReplaySettings, ReplaySimulatedSettings, run
 from deal_hw.workflows.running.report import RunReport
 
-
-@dataclass(frozen=True, kw_only=True)
-class Replay(ReplaySettings):
-    """Send a recording's commands again, through the safety filter, and record what happens."""
-
-    episode: tyro.conf.Positional[Path]
-
-    quiet: bool = False
-    """Print nothing but errors."""
+KINDS = REPLAY.with_options(Quiet)
 
 
-def replay(config: Replay) -> RunReport:
+def replay(config: ReplaySettings | ReplaySimulatedSettings) -> RunReport:
     """Run the verb; see :func:`deal_hw.workflows.replay.replay`."""
-    return run(config, Terminal(config.quiet))
+    return run(config, Terminal(is_quiet(config)))

@@ -6,36 +6,33 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from deal_hw.cli.piped import PipedProgress
+from deal_hw.cli.piped import PipedProgress, Quiet, is_quiet
 from deal_hw.documentation import page
 from deal_hw.robots import driven_robots
 from deal_hw.training import TrainingProgress, TrainingStatus
-from deal_hw.workflows.train import InterruptedTrainingError, Training, TrainSettings, run
+from deal_hw.workflows.train import TRAIN, InterruptedTrainingError, Training, TrainSettings, run
 
 SHOWN_MEASURES = 3
 """Number of a task's measures beside the progress; TensorBoard's files have all."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(TrainSettings):
-    """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
-
-    robot: tyro.conf.Positional[str] = "cartpole"
+class ShownTraining(Quiet):
+    """What only the command line has, and what it has in place of Python's."""
 
     distribution: Path | None = None
     """distribution.json of a calibration: parameters, their uncertainty, latency."""
 
-    quiet: bool = False
-    """Show no progress."""
+
+KINDS = TRAIN.with_options(ShownTraining)
 
 
-def train(config: Train) -> Training:
+def train(config: TrainSettings) -> Training:
     """Run the verb; see :func:`deal_hw.workflows.train.train`."""
     try:
-        if config.quiet or sys.stdout.isatty():
+        if is_quiet(config) or sys.stdout.isatty():
             training = _with_bar(config)
         else:
             with PipedProgress("train") as piped:
@@ -48,10 +45,10 @@ def train(config: Train) -> Training:
     return training
 
 
-def train_and_say_next(config: Train) -> Training:
+def train_and_say_next(config: TrainSettings) -> Training:
     """Train, and print the line that runs the policy."""
     training = train(config)
-    if not config.quiet and config.robot in driven_robots():
+    if not is_quiet(config) and config.robot in driven_robots():
         print(f"next: deal-hw deploy {config.robot} --port PORT --policy {training.path}")
     return training
 
@@ -70,7 +67,7 @@ def _print(training: Training) -> None:
         )
 
 
-def _with_bar(config: Train) -> Training:
+def _with_bar(config: TrainSettings) -> Training:
     bar = Progress(
         TextColumn("training"),
         BarColumn(),
@@ -79,7 +76,7 @@ def _with_bar(config: Train) -> Training:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        disable=config.quiet,
+        disable=is_quiet(config),
     )
     try:
         return run(config, _follow(bar))

@@ -192,7 +192,15 @@ class RobotEntry:
         return self.driver_description() if self.driven else self.model_description()
 
     def parameter_spaces(self) -> Mapping[str, Callable[[], ParameterSpace]]:
-        """Return the parameter sets by name; the first is the default."""
+        """Return the parameter sets by name; the first is the default.
+
+        Raises:
+            ConfigurationError: The entry has none.
+        """
+        if not self.spaces:
+            raise ConfigurationError(
+                f"robot {self.name!r} ({self.origin}) has no parameter sets; give one with --parameters FILE"
+            )
         found: Mapping[str, Callable[[], ParameterSpace]] = self.load(self.spaces)
         return found
 

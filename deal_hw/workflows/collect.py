@@ -12,14 +12,22 @@ from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.motions.excitation.level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.motions.excitation.plan import FAMILIES, read_plan
 from deal_hw.ranges import Range
-from deal_hw.workflows.options import OWN_ROBOT, File, RunSeconds, Seed, from_settings, given, refuse
+from deal_hw.workflows.options import FROM_PYTHON, File, RunSeconds, Seed, from_settings, given, refuse
+from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
-from deal_hw.workflows.running.settings import RunOptions, plan_options
+from deal_hw.workflows.running.settings import (
+    CartpoleRunOptions,
+    Go2RunOptions,
+    LegOptions,
+    RecordOptions,
+    RunOptions,
+    legs_of,
+    plan_options,
+)
 from deal_hw.workflows.running.simulated import (
     SimulationOptions,
-    check_simulation,
-    require_driver,
+    require_simulation,
     run_simulated,
 )
 from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
@@ -33,30 +41,15 @@ SHORT_S = 1.5 * SHORTEST_S
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectSettings(RunOptions):
-    """Settings of :func:`collect`."""
+class MotionOptions(RecordOptions):
+    """The motion to record, of every kind of robot."""
 
     robot: str = field(kw_only=False)
-    """The robot, such as cartpole. With --simulated a robot.yaml, or a dataset with its own robot.yaml."""
-
-    port: str = ""
-    """The robot's port: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
-    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds), or an end point such as
-    tcp/127.0.0.1:7447 (zenoh)."""
-
-    simulation: Annotated[SimulationOptions, OWN_ROBOT] = field(default_factory=SimulationOptions)
-    """Your own robot, in simulation."""
-
-    motion: Literal["rich", "chirp", "balance", "hold"] = "rich"
-    """rich: balance, then random set-points (with --simulated only set-points, with the robot's own gains);
-    chirp: a sine sweep, for held-out data; balance: the policy all the time; hold: the start pose."""
+    """The robot, such as cartpole."""
 
     excite: str = ""
     """Play this excitation instead of MOTION: multisine, chirp, optimal (computed first; needs
     deal-hw[calib]), or a file of `deal-hw design-excitation`, which also sets the length."""
-
-    policy: File | None = None
-    """Policy that balances the robot (.onnx); by default the shipped one."""
 
     seconds: RunSeconds = 4.0
     """Length of an episode [s]."""
@@ -75,16 +68,70 @@ class CollectSettings(RunOptions):
     seed: Seed = 0
     """Seed of the random set-points; episode k uses SEED + k."""
 
-    rich: RichConfig = field(default_factory=RichConfig)
+    rich: Annotated[RichConfig, FROM_PYTHON] = field(default_factory=RichConfig)
     """Settings of the motion `rich`; its length is SECONDS."""
 
 
-@from_settings(CollectSettings)
-def collect(settings: CollectSettings) -> RunReport:
+@dataclass(frozen=True, kw_only=True)
+class CollectSettings(RunOptions, MotionOptions):
+    """Record a robot during an informative motion."""
+
+    motion: Literal["rich", "chirp", "balance", "hold"] = "rich"
+    """rich: balance, then random set-points; chirp: a sine sweep, for held-out data; balance: the policy all
+    the time; hold: the start pose."""
+
+    policy: File | None = None
+    """Policy that balances the robot (.onnx); by default the shipped one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectCartpoleSettings(CartpoleRunOptions, CollectSettings):
+    """Record a cart-pole during an informative motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectLeggedSettings(CollectSettings):
+    """Record a robot with legs during an informative motion."""
+
+    legs: LegOptions = field(default_factory=LegOptions)
+    """Options of a robot with legs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectGo2Settings(Go2RunOptions, CollectLeggedSettings):
+    """Record a Go2 during an informative motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectSimulatedSettings(MotionOptions):
+    """Record your own robot in simulation, during an informative motion."""
+
+    robot: str = field(kw_only=False)
+    """Your robot: a robot.yaml, or a dataset with its own robot.yaml."""
+
+    motion: Literal["rich", "chirp", "hold"] = "rich"
+    """rich: random set-points, with the robot's own gains; chirp: a sine sweep, for held-out data; hold: the
+    start pose."""
+
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    """The simulation."""
+
+
+COLLECT = robot_kinds(
+    {"cartpole": CollectCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), CollectGo2Settings)},
+    plain=CollectSettings,
+    legged=CollectLeggedSettings,
+    file=CollectSimulatedSettings,
+)
+"""The kinds of :func:`collect`."""
+
+
+@from_settings(COLLECT)
+def collect(settings: CollectSettings | CollectSimulatedSettings) -> RunReport:
     """Record the robot during an informative motion, as ``deal-hw collect``.
 
-    :class:`CollectSettings` and ``deal-hw collect --help-all`` describe the arguments: ``collect("cartpole",
-    port="/dev/ttyUSB0", out="runs/first")``.
+    ``deal-hw collect ROBOT --help-all`` describes the arguments: ``collect("cartpole", port="/dev/ttyUSB0",
+    out="runs/first")``.
 
     Returns:
         How the episodes went, with the paths of the recordings.
@@ -97,12 +144,11 @@ def collect(settings: CollectSettings) -> RunReport:
     return run(settings, RunView.of_python(settings.say))
 
 
-def run(config: CollectSettings, view: RunView) -> RunReport:
+def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> RunReport:
     """Record episodes, as :func:`collect`, and show them."""
     _refuse_ignored(config)
-    if config.simulation.simulated:
+    if isinstance(config, CollectSimulatedSettings):
         return _rehearse(config, view)
-    require_driver(config.robot, config.port)
     policy = config.policy or shipped_policy(config.robot)
     excite, seconds = _excitation(config, view)
     if seconds * config.episodes < SHORT_S:
@@ -112,7 +158,7 @@ def run(config: CollectSettings, view: RunView) -> RunReport:
         )
     walks = config.motion == "balance" and not excite
     plan = RunPlan(
-        **plan_options(config.robot, config.link, config.legs, walks=walks),
+        **plan_options(config.robot, config.link, legs_of(config), walks=walks),
         motion="excite" if excite else config.motion,
         policy=str(policy or ""),
         seconds=seconds,
@@ -132,14 +178,14 @@ def run(config: CollectSettings, view: RunView) -> RunReport:
     )
 
 
-def _rehearse(config: CollectSettings, view: RunView) -> RunReport:
+def _rehearse(config: CollectSimulatedSettings, view: RunView) -> RunReport:
     """Record a user's robot in simulation."""
+    require_simulation(config.robot, config.simulation)
     folder = dataset_folder(config.out, config.dataset)
     excite, seconds = _excitation(config, view)
     plan = RunPlan(
         robot=config.robot,
         motion="excite" if excite else config.motion,
-        policy=str(config.policy or ""),
         seconds=seconds,
         seed=config.seed,
         rich=dataclasses.replace(config.rich, balance_s=0.0, segments=()),
@@ -158,40 +204,41 @@ def _rehearse(config: CollectSettings, view: RunView) -> RunReport:
     )
 
 
-def _refuse_ignored(config: CollectSettings) -> None:
+def _refuse_ignored(config: CollectSettings | CollectSimulatedSettings) -> None:
     """Refuse options that the motion would ignore.
 
     Raises:
         ConfigurationError: There is one.
     """
-    default = CollectSettings(robot=config.robot, port=config.port)
-    check_simulation(config, default)
-    if config.simulation.simulated:
-        refuse(given(config, default, ["policy"]), "--simulated runs no policy")
+    kind = type(config)
     if config.excite:
-        refuse(given(config, default, ["motion"]), "--excite plays its own motion; leave one of the two out")
+        refuse(given(config, kind, ["motion"]), "--excite plays its own motion; leave one of the two out")
     if config.excite or config.motion != "rich":
-        refuse(given(config, default, ["excitation_level", "attempts"]), "only --motion rich can be stronger")
-    if not config.excite and config.motion in ("chirp", "hold"):
-        refuse(given(config, default, ["policy"]), f"--motion {config.motion} runs no policy")
+        refuse(given(config, kind, ["excitation_level", "attempts"]), "only --motion rich can be stronger")
+    if isinstance(config, CollectSettings) and not config.excite and config.motion in ("chirp", "hold"):
+        refuse(given(config, kind, ["policy"]), f"--motion {config.motion} runs no policy")
 
 
-def _excitation(config: CollectSettings, view: RunView) -> tuple[str, float]:
+def _excitation(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> tuple[str, float]:
     """Return the excitation for the control process and its length [s]; an optimal one is computed here."""
     if not config.excite or config.excite in FAMILIES:
         return config.excite, config.seconds
     if config.excite != "optimal":
         path = Path(config.excite)
         plan = read_plan(path)
-        if config.seconds not in (plan.seconds, CollectSettings.seconds):
+        if config.seconds not in (plan.seconds, MotionOptions.seconds):
             refuse(["--seconds"], f"{path} sets the length, {plan.seconds:g} s; leave it out")
         return str(path), plan.seconds
     # Imported here, since the rest of this verb runs without the extras.
     from deal_hw.workflows import design_excitation
 
     path = dataset_folder(config.out, config.dataset).parent / EXCITATION_FILE
-    settings = design_excitation.ExcitationSettings(
-        config.robot, out=path, seconds=config.seconds, policy=config.policy, seed=config.seed
+    settings = design_excitation.OptimalSettings(
+        config.robot,
+        out=path,
+        seconds=config.seconds,
+        policy=getattr(config, "policy", None),
+        seed=config.seed,
     )
     report = design_excitation.run(settings, view.notify)
     view.designed(config.robot, report)

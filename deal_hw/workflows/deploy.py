@@ -5,11 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from deal_hw.documentation import page
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import File, RunSeconds, Seed, from_settings
+from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
-from deal_hw.workflows.running.settings import RunOptions, plan_options, refuse_unrecorded
+from deal_hw.workflows.running.settings import (
+    CartpoleRunOptions,
+    Go2RunOptions,
+    LegOptions,
+    RunOptions,
+    legs_of,
+    plan_options,
+    refuse_unrecorded,
+)
 from deal_hw.workflows.running.supervised import recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.shipped import shipped_policy
@@ -17,7 +27,7 @@ from deal_hw.workflows.shipped import shipped_policy
 
 @dataclass(frozen=True, kw_only=True)
 class DeploySettings(RunOptions):
-    """Settings of :func:`deploy`."""
+    """Run a policy on a robot behind the safety filter, and record it."""
 
     robot: str = field(kw_only=False)
     """The robot, such as cartpole."""
@@ -52,12 +62,39 @@ class DeploySettings(RunOptions):
         refuse_unrecorded(self, self.record)
 
 
-@from_settings(DeploySettings)
+@dataclass(frozen=True, kw_only=True)
+class DeployCartpoleSettings(CartpoleRunOptions, DeploySettings):
+    """Run a policy on a cart-pole behind the safety filter, and record it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeployLeggedSettings(DeploySettings):
+    """Run a policy on a robot with legs behind the safety filter, and record it."""
+
+    legs: LegOptions = field(default_factory=LegOptions)
+    """Options of a robot with legs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeployGo2Settings(Go2RunOptions, DeployLeggedSettings):
+    """Run a policy on a Go2 behind the safety filter, and record it."""
+
+
+DEPLOY = robot_kinds(
+    {"cartpole": DeployCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), DeployGo2Settings)},
+    plain=DeploySettings,
+    legged=DeployLeggedSettings,
+    no_file=f"; {page('how-to/add.md')} shows how to write one",
+)
+"""The kinds of :func:`deploy`."""
+
+
+@from_settings(DEPLOY)
 def deploy(settings: DeploySettings) -> RunReport:
     """Run a policy on the robot behind the safety filter, and record it, as ``deal-hw deploy``.
 
-    :class:`DeploySettings` and ``deal-hw deploy --help-all`` describe the arguments: ``deploy("cartpole",
-    port="/dev/ttyUSB0", policy="policy.onnx", out="runs/first")``.
+    ``deal-hw deploy ROBOT --help-all`` describes the arguments: ``deploy("cartpole", port="/dev/ttyUSB0",
+    policy="policy.onnx", out="runs/first")``.
 
     Returns:
         How the episodes went, with the paths of the recordings.
@@ -75,7 +112,7 @@ def run(config: DeploySettings, view: RunView) -> RunReport:
     """Run the policy, as :func:`deploy`, and show it."""
     policy = config.policy or shipped_policy(config.robot)
     plan = RunPlan(
-        **plan_options(config.robot, config.link, config.legs),
+        **plan_options(config.robot, config.link, legs_of(config)),
         motion="balance",
         policy=str(policy or ""),
         seconds=config.seconds,

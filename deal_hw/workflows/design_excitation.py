@@ -16,15 +16,15 @@ from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameErr
 from deal_hw.motions.behaviours import Behaviour
 from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
 from deal_hw.motions.excitation.plan import (
-    OF_FAMILY,
     ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
     make_plan,
 )
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.ranges import Range, check_ranges
+from deal_hw.ranges import Checked, Range
 from deal_hw.robots import is_known, robot_entry, robots
+from deal_hw.workflows.kinds import InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Threads, from_settings, given, refuse
 from deal_hw.workflows.robot import described, described_spaces
 from deal_hw.workflows.shipped import balancer
@@ -33,15 +33,12 @@ if TYPE_CHECKING:
     from deal_hw.calib.design.excitation_search import Optimum
 
 BALANCE_S = 0.6
-LIMITS = ("effort", "speed", "split")
-GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", *LIMITS)
 Notify = Callable[[int, int, str], None]
-SEARCH = ("calibration", "space", "range_ratio", "criterion", "draws", "confirm", "candidates", "rounds")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExcitationSettings:
-    """Settings of :func:`design_excitation`."""
+class ExcitationSettings(Checked):
+    """Compute a motion to play on a robot."""
 
     robot: str = field(kw_only=False)
     """The robot, such as cartpole, or a robot.yaml, or a dataset with its own robot.yaml."""
@@ -49,34 +46,19 @@ class ExcitationSettings:
     out: File
     """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
 
-    family: Literal["optimal", "multisine", "chirp", "steps", "sway"] = "optimal"
-    """optimal: the most informative of many candidates of the other families, found by simulation; multisine:
-    a sum of sines with a low peak; chirp: a sine sweep; steps: random set-points; sway: the body moves over
-    standing feet (go2)."""
-
     seconds: Annotated[float, Range(0.5, 600, "s")] = 4.0
     """Length of the recording [s]."""
 
-    amplitude: Annotated[float, Range(1e-3, 1)] = 1.0
-    """Not for optimal: amplitude, as a share of the largest one within the safety limits."""
-
-    low_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 0.3
-    """Lowest frequency of multisine, chirp and sway [Hz]."""
-
-    high_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 5.0
-    """Highest frequency of multisine, chirp and sway [Hz]."""
-
-    effort: Annotated[float, Range(1e-3, 1000)] = 1.0
-    """Not for optimal: factor on the commanded effort limit, after SPLIT."""
-
-    speed: Annotated[float, Range(1e-3, 1000)] = 1.0
-    """Not for optimal: factor on the commanded speed limit, after SPLIT."""
-
-    split: Annotated[float, Range(0, 1)] = 0.5
-    """Not for optimal: fraction of the run after which EFFORT and SPEED hold; 0: all the time."""
-
     policy: File | None = None
     """Policy that balances the robot first (.onnx); by default the shipped one, if any."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimalSettings(ExcitationSettings):
+    """The most informative of many candidates of the other families, found by simulation."""
+
+    family: Literal["optimal"] = "optimal"
+    """The family of motions."""
 
     calibration: File | None = None
     """distribution.json of a calibration, from which robots are drawn instead of the whole ranges."""
@@ -109,9 +91,117 @@ class ExcitationSettings:
     """Simulation threads; by default all CPUs."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        super().__post_init__()
+        if self.calibration is not None:
+            names = ("space", "range_ratio")
+            refuse(given(self, OptimalSettings, names), "--calibration gives the ranges")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignSettings(ExcitationSettings):
+    """A motion of one family."""
+
+    amplitude: Annotated[float, Range(1e-3, 1)] = 1.0
+    """Amplitude, as a share of the largest one within the safety limits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandOptions(Checked):
+    """Frequencies of a motion."""
+
+    low_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 0.3
+    """Lowest frequency [Hz]."""
+
+    high_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 5.0
+    """Highest frequency [Hz]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.low_hz < self.high_hz:
             raise ConfigurationError(f"--low-hz {self.low_hz:g} must be below --high-hz {self.high_hz:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitOptions(Checked):
+    """Limits that are commanded during a part of the motion."""
+
+    effort: Annotated[float, Range(1e-3, 1000)] = 1.0
+    """Factor on the commanded effort limit, after SPLIT."""
+
+    speed: Annotated[float, Range(1e-3, 1000)] = 1.0
+    """Factor on the commanded speed limit, after SPLIT."""
+
+    split: Annotated[float, Range(0, 1)] = 0.5
+    """Fraction of the run after which EFFORT and SPEED hold; 0: all the time."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.effort == LimitOptions.effort and self.speed == LimitOptions.speed:
+            refuse(
+                given(self, LimitOptions, ("split",)),
+                "it is the time after which --effort or --speed holds, and neither is given",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MultisineSettings(LimitOptions, BandOptions, DesignSettings):
+    """A sum of sines with a low peak."""
+
+    family: Literal["multisine"] = "multisine"
+    """The family of motions."""
+
+    seed: Seed = 0
+    """Seed of the phases."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChirpSettings(LimitOptions, BandOptions, DesignSettings):
+    """A sine sweep."""
+
+    family: Literal["chirp"] = "chirp"
+    """The family of motions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepsSettings(LimitOptions, DesignSettings):
+    """Random set-points."""
+
+    family: Literal["steps"] = "steps"
+    """The family of motions."""
+
+    seed: Seed = 0
+    """Seed of the set-points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SwaySettings(BandOptions, DesignSettings):
+    """The body moves over standing feet (go2)."""
+
+    family: Literal["sway"] = "sway"
+    """The family of motions."""
+
+    seed: Seed = 0
+    """Seed of the sines."""
+
+
+_SETTINGS: dict[str, type[ExcitationSettings]] = {
+    "optimal": OptimalSettings,
+    "multisine": MultisineSettings,
+    "chirp": ChirpSettings,
+    "steps": StepsSettings,
+    "sway": SwaySettings,
+}
+_TABLE = {
+    family: InputKind(settings, usage="ROBOT" if family == "optimal" else f"ROBOT --family {family}")
+    for family, settings in _SETTINGS.items()
+}
+DESIGN_EXCITATION = Kinds(
+    noun="family",
+    argument="robot",
+    table=lambda: _TABLE,
+    find=lambda arguments: str(arguments.options.get("family", "optimal")),
+)
+"""The kinds of :func:`design_excitation`: families of motions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,11 +223,11 @@ class ExcitationReport:
     refused: int = 0
 
 
-@from_settings(ExcitationSettings)
+@from_settings(DESIGN_EXCITATION)
 def design_excitation(settings: ExcitationSettings) -> ExcitationReport:
     """Compute the most informative motion to play on a robot, as ``deal-hw design-excitation``.
 
-    :class:`ExcitationSettings` and ``deal-hw design-excitation --help`` describe the arguments:
+    ``deal-hw design-excitation ROBOT --help`` describes the arguments:
     ``design_excitation("cartpole", out="excitation.json")``.
 
     Returns:
@@ -156,29 +246,9 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
         config: Settings.
         notify: Called with candidates done, candidates in total, and a text on the current step.
     """
-    default = ExcitationSettings(robot=config.robot, out=config.out)
-    if config.family == "optimal":
-        refuse(given(config, default, GIVEN_DESIGN), "--family optimal searches it; name another")
-        if config.calibration is not None:
-            refuse(given(config, default, ("space", "range_ratio")), "--calibration gives the ranges")
-    else:
-        refuse(
-            given(config, default, (*SEARCH, "threads")),
-            f"--family {config.family} is not searched; use --family optimal",
-        )
-        own = (
-            ("low_hz", "high_hz", "seed") if config.family == "sway" else (*LIMITS, *OF_FAMILY[config.family])
-        )
-        others = [name for name in (*GIVEN_DESIGN[1:], "seed") if name not in own]
-        refuse(given(config, default, others), f"--family {config.family} does not use it")
-        if config.effort == default.effort and config.speed == default.speed:
-            refuse(
-                given(config, default, ("split",)),
-                "it is the time after which --effort or --speed holds, and neither is given",
-            )
     description = described(config.robot)
     most_hz = description.control_rate_hz / 2
-    if config.family in ("multisine", "chirp", "sway") and config.high_hz > most_hz:
+    if isinstance(config, BandOptions) and config.high_hz > most_hz:
         raise ConfigurationError(
             f"--high-hz {config.high_hz:g}: {config.robot} takes {description.control_rate_hz:g} commands "
             f"per second, so a motion may have up to {most_hz:g} Hz; lower --high-hz"
@@ -186,30 +256,28 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
     balance = balancer(description, None if config.policy is None else Path(config.policy))
     balance_s = 0.0 if balance is None else min(BALANCE_S, 0.25 * config.seconds)
     path = Path(config.out)
-    if config.family == "optimal":
+    if isinstance(config, OptimalSettings):
         report = _search(config, description, balance, balance_s, notify)
-    elif config.family == "sway":
+    elif isinstance(config, SwaySettings):
         report = ExcitationReport(plan=_sway(config, description), path=path)
     else:
-        whole = config.split <= 0
-        design = ExcitationDesign(
-            family=config.family,
-            seconds=config.seconds,
-            amplitude=config.amplitude,
-            low_hz=config.low_hz,
-            high_hz=config.high_hz,
-            split=1.0 if whole else config.split,
-            effort=(config.effort, 1.0) if whole else (1.0, config.effort),
-            speed=(config.speed, 1.0) if whole else (1.0, config.speed),
-            seed=config.seed,
-            balance_s=balance_s,
-        )
-        report = ExcitationReport(plan=make_plan(description, design), path=path)
+        report = ExcitationReport(plan=make_plan(description, _design(config, balance_s)), path=path)
     report.plan.write(path)
     return report
 
 
-def _sway(config: ExcitationSettings, description: RobotDescription) -> ExcitationPlan:
+def _design(config: ExcitationSettings, balance_s: float) -> ExcitationDesign:
+    names = ("family", "amplitude", "low_hz", "high_hz", "seed")
+    own = {name: getattr(config, name) for name in names if hasattr(config, name)}
+    if isinstance(config, LimitOptions):
+        whole = config.split <= 0
+        own["split"] = 1.0 if whole else config.split
+        own["effort"] = (config.effort, 1.0) if whole else (1.0, config.effort)
+        own["speed"] = (config.speed, 1.0) if whole else (1.0, config.speed)
+    return ExcitationDesign(seconds=config.seconds, balance_s=balance_s, **own)
+
+
+def _sway(config: SwaySettings, description: RobotDescription) -> ExcitationPlan:
     entry = robot_entry(description.name) if is_known(description.name) else None
     if entry is None or not entry.sway:
         able = ", ".join(one.name for one in robots().entries() if one.sway)
@@ -233,7 +301,7 @@ def _sway(config: ExcitationSettings, description: RobotDescription) -> Excitati
 
 
 def _search(
-    config: ExcitationSettings,
+    config: OptimalSettings,
     description: RobotDescription,
     balance: Callable[[], Behaviour] | None,
     balance_s: float,
@@ -288,7 +356,7 @@ def _search(
     )
 
 
-def _knowledge(config: ExcitationSettings) -> ParameterDistribution:
+def _knowledge(config: OptimalSettings) -> ParameterDistribution:
     if config.calibration is not None:
         from deal_hw.workflows.train import read_distribution
 

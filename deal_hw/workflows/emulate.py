@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from deal_hw.workflows.emulation.process import EmulatorProcess, arguments
-from deal_hw.workflows.emulation.settings import EmulateSettings
+from deal_hw.workflows.emulation.settings import EMULATE, EmulateSettings
 from deal_hw.workflows.options import from_settings, refuse
 
 
@@ -20,7 +20,7 @@ class EmulatedRobot(EmulatorProcess):
     """
 
     def __init__(self, settings: EmulateSettings) -> None:
-        default = EmulateSettings(settings.robot)
+        default = type(settings)(settings.robot)
         super().__init__(settings.robot, "--reveal", *arguments(settings, default))
         self.robot = settings.robot
         self.truth: dict[str, Any] = {}
@@ -37,11 +37,11 @@ class EmulatedRobot(EmulatorProcess):
         return f"<emulated {self.robot}{f' on {self.port}' if self.port else ', not started'}>"
 
 
-@from_settings(EmulateSettings)
+@from_settings(EMULATE)
 def emulate(settings: EmulateSettings) -> EmulatedRobot:
     """Emulate a robot in real time on its own port, with hidden physics, as ``deal-hw emulate``.
 
-    :class:`EmulateSettings` and ``deal-hw emulate --help`` describe the arguments::
+    ``deal-hw emulate ROBOT --help`` describes the arguments::
 
         with deal_hw.emulate("cartpole", seed=1) as robot:
             deal_hw.collect("cartpole", port=robot.port, out="runs/first")

@@ -156,10 +156,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     )
     if robot is not None:
         from deal_hw.data.recording.dataset import Dataset
-        from deal_hw.sim.robots.carried import carry
+        from deal_hw.sim.robots.dataset_robot import store_robot
 
         with Dataset.create_or_open(config.out, values, say):
-            carry(robot, config.out)
+            store_robot(robot, config.out)
     noted = [{"plausibility": problems, "source": source} for source in sources]
     return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
 

@@ -109,7 +109,8 @@ class Kinds:
             signature.bind(*values, **named)
         except TypeError as error:
             raise TypeError(f"{function}(): {error}") from None
-        return chosen.settings(*values, **named)
+        fitting = {name: _fitting(chosen.settings, name, value) for name, value in named.items()}
+        return chosen.settings(*values, **fitting)
 
     def having(self, name: str) -> list[str]:
         """Return the kinds with a field of that name, in a group of options, too."""
@@ -197,6 +198,31 @@ def _joined(extra: Any, settings: Any) -> type[Any]:
     return dataclasses.make_dataclass(
         settings.__name__, (), bases=(extra, settings), namespace=body, frozen=True, kw_only=True
     )
+
+
+def _fitting(settings: Any, name: str, value: Any) -> Any:
+    """Return an argument; another group of options becomes the group that the settings take.
+
+    Raises:
+        ConfigurationError: It gives an option that this group does not have.
+    """
+    wanted: Any = settings.__dataclass_fields__[name].default_factory
+    if not (
+        isinstance(wanted, type) and dataclasses.is_dataclass(wanted) and dataclasses.is_dataclass(value)
+    ):
+        return value
+    given: Any = type(value)
+    if given is wanted:
+        return value
+    usual = given()
+    values = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+    changed = {one: new for one, new in values.items() if new != getattr(usual, one)}
+    known = [one.name for one in dataclasses.fields(wanted)]
+    if foreign := ", ".join(one for one in changed if one not in known):
+        raise ConfigurationError(
+            f"{name}={given.__name__}({foreign}=...): {wanted.__name__} goes there, with {', '.join(known)}"
+        )
+    return wanted(**changed)
 
 
 def _in_group(settings: Any, name: str) -> str:

@@ -30,11 +30,6 @@ class Only:
     names: tuple[str, ...]
 
 
-CARTPOLE = Only(("cartpole",))
-GO2 = Only(("go2", "go2_on_stand"))
-OWN_ROBOT = Only(("robot.yaml",))
-
-
 FROM_PYTHON = "from Python"
 """Marks a field that is no option: only Python can give it."""
 

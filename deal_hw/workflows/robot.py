@@ -16,7 +16,7 @@ from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.findings import Finding, Severity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Checked, Range
-from deal_hw.robots import is_known, parameter_spaces, recorded_description
+from deal_hw.robots import API_VERSION, RobotEntry, is_known, recorded_description, robot_entry
 from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.say import html_table
 
@@ -179,6 +179,23 @@ def user_robot(robot: str) -> UserRobot:
     return load_robot(dataset_of(robot) / "robot" / "robot.yaml")
 
 
+def entry_of(robot: str) -> RobotEntry:
+    """Return the entry of a robot: by its name from the table, or made of a robot.yaml or a dataset's robot.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It is a plug-in's that cannot be used.
+    """
+    if not is_user_robot(robot):
+        return robot_entry(robot)
+    return RobotEntry(
+        name=robot,
+        api_version=API_VERSION,
+        description=lambda: _described_by_file(robot),
+        spaces=lambda: {"default": lambda: default_space(_described_by_file(robot))},
+    )
+
+
 def described(robot: str) -> RobotDescription:
     """Return the description of a robot of deal-hw by its name, of a robot.yaml, or of a dataset's robot.
 
@@ -187,21 +204,21 @@ def described(robot: str) -> RobotDescription:
         ConfigurationError: The robot.yaml or its MJCF cannot be used.
         DatasetError: The dataset cannot be read, or its robot is missing or changed.
     """
-    if not is_user_robot(robot):
-        return recorded_description(robot)
+    return entry_of(robot).recorded_description()
+
+
+def described_spaces(robot: str) -> Mapping[str, Callable[[], ParameterSpace]]:
+    """Return a robot's parameter sets by name, the default first; errors as :func:`described`."""
+    return entry_of(robot).parameter_spaces()
+
+
+def _described_by_file(robot: str) -> RobotDescription:
     if Path(robot).is_dir():
         from deal_hw.data.recording.dataset import Dataset
 
         folder = dataset_of(robot)
         return recorded_robot(Dataset.open(folder).description, folder)
     return load_robot(Path(robot)).description()
-
-
-def described_spaces(robot: str) -> Mapping[str, Callable[[], ParameterSpace]]:
-    """Return a robot's parameter sets by name, the default first; errors as :func:`described`."""
-    if not is_user_robot(robot):
-        return parameter_spaces(robot)
-    return {"default": lambda: default_space(described(robot))}
 
 
 def default_space(description: RobotDescription) -> ParameterSpace:
@@ -216,7 +233,7 @@ def default_space(description: RobotDescription) -> ParameterSpace:
 
 def carries_robot(dataset: File | None) -> bool:
     """Return whether a dataset contains a user's robot."""
-    # The same as deal_hw.sim.robots.carried, which needs mujoco; this one also runs without it.
+    # The same as deal_hw.sim.robots.dataset_robot, which needs mujoco; this one also runs without it.
     return dataset is not None and (Path(dataset) / "robot" / "files.json").is_file()
 
 
@@ -246,10 +263,10 @@ def recorded_robot(values: Mapping[str, Any], dataset: Path) -> RobotDescription
     if not carries_robot(dataset) and is_ours(str(values["name"])):
         return recorded_description(str(values["name"]))
     try:
-        from deal_hw.sim.robots.carried import carried_description
+        from deal_hw.sim.robots.dataset_robot import stored_description
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "sim") from err
-    return carried_description(dataset, values)
+    return stored_description(dataset, values)
 
 
 def _sim() -> Any:

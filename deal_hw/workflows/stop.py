@@ -18,7 +18,8 @@ from deal_hw.ranges import Checked, Range
 from deal_hw.robots import claim_name, default_transport, make_robot, same_machine, wire_claim
 from deal_hw.signals import taken
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import GO2, from_settings, given, refuse, refuse_others
+from deal_hw.workflows.options import FROM_PYTHON, from_settings, given, refuse
+from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.commander import who
 from deal_hw.workflows.say import Say, silent
 
@@ -34,7 +35,12 @@ _POLL_S = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class StopSettings(Checked):
-    """Settings of :func:`stop`."""
+    """Make a robot passive at once, from any terminal: motor off, or damping. Nothing is asked.
+
+    A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
+    program then does it. It sends nothing while another program or the robot's own controller has the robot.
+    The exit code is 0 only if the robot confirmed that it is passive.
+    """
 
     robot: str = field(kw_only=False)
     """The robot, such as go2."""
@@ -44,31 +50,68 @@ class StopSettings(Checked):
     it, that robot alone, and also one that no run commands any more."""
 
     transport: str = ""
-    """Transport to the robot, such as serial, can, dds or zenoh; by default the robot's usual one."""
-
-    state_check: Annotated[Literal["strict", "length"], GO2] = "strict"
-    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
-
-    simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
-    """Simulator in place of a real Go2: unitree_mujoco."""
+    """Transport to the robot; by default the robot's usual one."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 10.0
     """How long to repeat the passive command until the robot confirms it [s]."""
 
-    wire: Annotated[WireOptions, GO2] = field(default_factory=WireOptions)
-    """Network options. Over a bridge with certificates, that of a controller."""
-
-    say: Say = silent
+    say: Annotated[Say, FROM_PYTHON] = silent
     """From Python: called with messages; ``print`` shows them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        default_transport(self.robot)
-        refuse_others(self, "stop", self.robot)
         if not self.port:
-            default = StopSettings(self.robot, port="any")
-            names = ("transport", "state_check", "simulator", "seconds", "wire")
-            refuse(given(self, default, names), "without --port only runs on this computer are stopped")
+            kind = type(self)
+            names = [
+                name for name in ("transport", "seconds", "state_check", "simulator") if hasattr(kind, name)
+            ]
+            wire = given(getattr(self, "wire", None) or WireOptions(), WireOptions())
+            refuse(
+                [*given(self, kind, names), *wire], "without --port only runs on this computer are stopped"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopCartpoleSettings(StopSettings):
+    """Make a cart-pole passive at once, from any terminal: motor off. Nothing is asked.
+
+    A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
+    program then does it. It sends nothing while another program has the robot. The exit code is 0 only if the
+    robot confirmed that it is passive.
+    """
+
+    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
+    """Transport to the cart-pole."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopGo2Settings(StopSettings):
+    """Make a Go2 passive at once, from any terminal: damping. Nothing is asked.
+
+    A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
+    program then does it. It sends nothing while another program or the robot's own controller has the robot.
+    The exit code is 0 only if the robot confirmed that it is passive.
+    """
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """Transport to the Go2."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
+
+    simulator: Literal["none", "unitree_mujoco"] = "none"
+    """Simulator in place of a real Go2: unitree_mujoco."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options. Over a bridge with certificates, that of a controller."""
+
+
+STOP = robot_kinds(
+    {"cartpole": StopCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), StopGo2Settings)},
+    plain=StopSettings,
+    legged=StopSettings,
+)
+"""The kinds of :func:`stop`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,14 +134,14 @@ class StopReport:
         return int(not self.passive)
 
 
-@from_settings(StopSettings)
+@from_settings(STOP)
 def stop(settings: StopSettings) -> StopReport:
     """Make a robot passive, as ``deal-hw stop``: motor off, or damping. Nothing is asked.
 
-    :class:`StopSettings` describes the arguments: ``stop("go2", port="enp2s0")``. A run on this computer gets
-    a request to end, and makes its robot passive itself: two writers would fight. A run that hangs is killed.
-    If no run commands the robot, this program does it, and sends nothing while another program or the robot's
-    own controller has it.
+    ``deal-hw stop ROBOT --help`` describes the arguments: ``stop("go2", port="enp2s0")``. A run on this
+    computer gets a request to end, and makes its robot passive itself: two writers would fight. A run that
+    hangs is killed. If no run commands the robot, this program does it, and sends nothing while another
+    program or the robot's own controller has it.
 
     Returns:
         Whether the robot confirmed that it is passive.
@@ -140,8 +183,12 @@ def _transport(settings: StopSettings) -> str:
     return settings.transport or default_transport(settings.robot)
 
 
+def _wire(settings: StopSettings) -> WireOptions:
+    return settings.wire if isinstance(settings, StopGo2Settings) else WireOptions()
+
+
 def _claim(settings: StopSettings) -> str:
-    return claim_name(_transport(settings), settings.port, settings.wire)
+    return claim_name(_transport(settings), settings.port, _wire(settings))
 
 
 def _stopped(settings: StopSettings, run: FoundRun, clock: Clock, say: Say) -> StopReport:
@@ -157,12 +204,13 @@ def _stopped(settings: StopSettings, run: FoundRun, clock: Clock, say: Say) -> S
             "sudo deal-hw stop"
         )
         return StopReport(robot=settings.robot, passive=False, words=words)
-    own = StopSettings(
+    wire = WireOptions.from_json(facts["wire"])
+    own = STOP.settings(
         facts["robot"],
         port=facts["port"],
         transport=facts["transport"],
-        wire=WireOptions.from_json(facts["wire"]),
         seconds=settings.seconds,
+        **({"wire": wire} if wire != WireOptions() else {}),
         **facts["settings"],
     )
     say(f"{name} has ended without a passive robot; making it passive from here")
@@ -227,13 +275,13 @@ def _directly(settings: StopSettings, clock: Clock, say: Say) -> StopReport:
     own = {
         name: getattr(settings, name)
         for name in ("state_check", "simulator")
-        if getattr(settings, name) not in ("strict", "none")
+        if getattr(settings, name, "none") not in ("strict", "none")
     }
-    robot = make_robot(settings.robot, transport, settings.port, clock, settings.wire, own)
+    robot = make_robot(settings.robot, transport, settings.port, clock, _wire(settings), own)
     try:
         with contextlib.ExitStack() as held:
             held.callback(_claimed(_claim(settings), clock).release)
-            claim = wire_claim(settings.robot, transport, settings.port, clock, who(), settings.wire)
+            claim = wire_claim(settings.robot, transport, settings.port, clock, who(), _wire(settings))
             if claim is not None:
                 claim.acquire()
                 held.callback(claim.release)

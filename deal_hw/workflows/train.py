@@ -18,9 +18,12 @@ from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import VERDICT
 from deal_hw.ranges import Checked, Range
 from deal_hw.reading import read_json, reading
+from deal_hw.robots import trained_robots
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
-from deal_hw.workflows.options import File, Seed, from_settings
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
+from deal_hw.workflows.options import FROM_PYTHON, File, Seed, from_settings
 from deal_hw.workflows.robot import described, is_user_robot
+from deal_hw.workflows.robot_kinds import FILE
 from deal_hw.workflows.say import html_table, text_table
 
 if TYPE_CHECKING:
@@ -49,22 +52,14 @@ def unseen(status: TrainingStatus) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings(Checked):
-    """Settings of :func:`train`."""
+    """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """The robot; with --env a robot.yaml, or a dataset with its own robot.yaml."""
-
-    env: str = ""
-    """A Gymnasium environment of your own, module:ENV_ID, for a robot that is a robot.yaml or a dataset that
-    carries one. Parameters are drawn into its MuJoCo model at every reset."""
+    """The robot."""
 
     distribution: File | ParameterDistribution | Calibrated | None = None
     """distribution.json of a calibration: parameters, their uncertainty, latency. From Python also a
     distribution or the return value of :func:`deal_hw.calibrate`."""
-
-    udr: bool = False
-    """Train under uniform domain randomisation (UDR) instead: every parameter within a factor 5 of its
-    nominal value (Go2, humanoid and hand: 1.75)."""
 
     nominal: bool = False
     """Train under the model's nominal values instead; latency as with --udr."""
@@ -92,8 +87,53 @@ class TrainSettings(Checked):
     seed: Seed = 0
     """Seed of all random numbers."""
 
-    progress: TrainingProgress = unseen
+    progress: Annotated[TrainingProgress, FROM_PYTHON] = unseen
     """From Python: called with the progress after each update."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRobotSettings(TrainSettings):
+    """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
+
+    udr: bool = False
+    """Train under uniform domain randomisation (UDR) instead: every parameter within a factor 5 of its
+    nominal value (Go2, humanoid and hand: 1.75)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOwnSettings(TrainSettings):
+    """Train a policy for your own robot in an environment of your own, under the calibrated distribution."""
+
+    robot: str = field(kw_only=False)
+    """A robot.yaml, or a dataset with its own robot.yaml."""
+
+    nominal: bool = False
+    """Train under the model's nominal values instead."""
+
+    env: str
+    """A Gymnasium environment of your own, module:ENV_ID. Parameters are drawn into its MuJoCo model at every
+    reset."""
+
+
+def _table() -> dict[str, InputKind]:
+    robots = {name: InputKind(TrainRobotSettings) for name in trained_robots()}
+    return {**robots, FILE: InputKind(TrainOwnSettings)}
+
+
+def _find(arguments: Arguments) -> str:
+    name = "cartpole" if arguments.first is None else str(arguments.first)
+    if not is_user_robot(name):
+        return name
+    if "env" not in arguments.options:
+        raise ConfigurationError(
+            f"{name}: deal-hw has no training environment for this robot; name your own by --env "
+            f"module:ENV_ID ({page('how-to/training.md')})"
+        )
+    return FILE
+
+
+TRAIN = Kinds(noun="robot with a training environment", argument="robot", table=_table, find=_find)
+"""The kinds of :func:`train`; without a robot it trains for the cart-pole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,11 +190,11 @@ class InterruptedTrainingError(KeyboardInterrupt):
         self.training = training
 
 
-@from_settings(TrainSettings)
+@from_settings(TRAIN)
 def train(settings: TrainSettings) -> Training:
     """Train a policy under a calibrated distribution, as ``deal-hw train``.
 
-    :class:`TrainSettings` and ``deal-hw train --help-all`` describe the arguments: ``train("cartpole",
+    ``deal-hw train ROBOT --help-all`` describes the arguments: ``train("cartpole",
     distribution=deal_hw.calibrate(...), out="runs/first")``.
 
     Returns:
@@ -211,7 +251,7 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
             progress=follow,
             files=files,
             verdict=verdict,
-            env=config.env,
+            env=config.env if isinstance(config, TrainOwnSettings) else "",
         )
     training = Training(
         policy=policy,
@@ -314,40 +354,26 @@ def _spent(record: Path) -> dict[str, float]:
 
 def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
     """Return the distribution, and the colour of its calibration; "" if it is of none."""
+    udr, own = isinstance(config, TrainRobotSettings) and config.udr, isinstance(config, TrainOwnSettings)
     wanted = {
         "--distribution": config.distribution is not None,
-        "--udr": config.udr,
+        "--udr": udr,
         "--nominal": config.nominal,
     }
     given = [name for name, is_given in wanted.items() if is_given]
     if len(given) > 1:
         raise ConfigurationError(f"{' and '.join(given)} exclude each other: keep one of them")
     if not given:
+        # Uniform domain randomisation needs ranges, and the parameters of a user's robot have none.
+        others = "or --nominal" if own else "--udr or --nominal"
         raise ConfigurationError(
-            "no distribution is named: give --distribution FILE (`deal-hw calibrate` writes it), --udr or "
-            "--nominal"
+            f"no distribution is named: give --distribution FILE (`deal-hw calibrate` writes it), {others}"
         )
     source = config.distribution
-    if is_user_robot(config.robot) and not config.env:
-        raise ConfigurationError(
-            f"{config.robot}: deal-hw has no training environment for this robot; name your own by --env "
-            f"module:ENV_ID ({page('how-to/training.md')})"
-        )
-    if config.env:
-        if config.udr:
-            raise ConfigurationError(
-                "--udr does not go with --env, whose parameters have no known ranges; use --distribution or "
-                "--nominal"
-            )
-        if not is_user_robot(config.robot):
-            raise ConfigurationError(
-                f"--env needs a robot.yaml (`deal-hw robot new robot.xml`) or a dataset that carries its "
-                f"robot, not {config.robot!r}"
-            )
-        if source is None:
-            return ParameterDistribution.point(ParameterSpace([]), np.empty(0), 0.0), ""
+    if source is None and own:
+        return ParameterDistribution.point(ParameterSpace([]), np.empty(0), 0.0), ""
     if source is None:
-        return udr_distribution(config.robot) if config.udr else nominal_distribution(config.robot), ""
+        return udr_distribution(config.robot) if udr else nominal_distribution(config.robot), ""
     if isinstance(source, ParameterDistribution):
         return source, ""
     if isinstance(source, str | Path):

@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.contacts import Sticking, settle
+from deal_hw.calib.fit.contacts import Sticking, fit_starts
 from deal_hw.calib.fit.intervals import CORRELATION_SAMPLES, MISMATCH_CHI2, correlation_time
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Shooting
@@ -40,7 +40,7 @@ def test_smoothed_start_states_settle_to_the_noise(
     space, truth = three_unknown(sensed.space, sensed.theta)
     shooting = Shooting(Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1), 20)
     before = shooting.start(truth, sensed.latency_s)
-    after, cost = settle(shooting, before, 6)
+    after, cost = fit_starts(shooting, before, 6)
     np.testing.assert_array_equal(after.value, before.value)
     windows = np.array([w for p in (before, after) for w in shooting.window_costs(p)])
     assert np.all(windows[1] <= windows[0])
@@ -81,7 +81,7 @@ def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Know
     space, truth = three_unknown(whole, whole.nominal)
     problem = Problem(robot, space, [target.episode], threads=1, fixed_latency_s=0.0)
     shooting = Shooting(problem, 20)
-    point, cost = settle(shooting, shooting.start(truth, 0.0), 6)
+    point, cost = fit_starts(shooting, shooting.start(truth, 0.0), 6)
     normal = shooting.normal(point)
     assert cost / normal.count > MISMATCH_CHI2 or correlation_time(normal.residual) > CORRELATION_SAMPLES
 

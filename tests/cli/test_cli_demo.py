@@ -9,6 +9,7 @@ import json
 import os
 import re
 import signal
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,10 +22,11 @@ import pytest
 from deal_hw.calib.pipeline import output_error_fits
 from deal_hw.calibration import percent
 from deal_hw.cli import demo_cartpole, demo_go2, demo_runs
+from deal_hw.cli import deploy as deploy_verb
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
-from deal_hw.cli.demo import Demo, Stages, demo
+from deal_hw.cli.demo import KINDS as DEMO
+from deal_hw.cli.demo import Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
-from deal_hw.cli.deploy import Deploy
 from deal_hw.cli.main import main
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.process.channel import RUNNING, Beat
@@ -54,9 +56,10 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     """Every stage leaves its file, parameters are found within 5 % on average, the table is printed."""
     monkeypatch.setattr(demo_cartpole, "calibrate", beside_in_short)
     # What a longer deployment shows of the loop, four seconds show, too.
-    monkeypatch.setattr(demo_cartpole, "Deploy", functools.partial(Deploy, seconds=4.0))
+    short = types.SimpleNamespace(settings=functools.partial(deploy_verb.KINDS.settings, seconds=4.0))
+    monkeypatch.setattr(demo_cartpole, "DEPLOY", short)
     folder = tmp_path / "demo"
-    report = demo(Demo(out=folder, profile="sensor", seed=1, episodes=1, steps=2000))
+    report = demo(DEMO.settings(out=folder, profile="sensor", seed=1, episodes=1, steps=2000))
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == json.loads(json.dumps(report.summary))
     rows = summary["parameters"].values()
@@ -112,7 +115,7 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     """A short walk over Zenoh, a few steps of training: all stages leave files, the truth stays apart."""
     walked_in_short(monkeypatch)
     folder = tmp_path / "demo"
-    report = demo(Demo(robot="go2", transport="zenoh", out=folder, profile="sensor", seed=2, steps=4800))
+    report = demo(DEMO.settings("go2", transport="zenoh", out=folder, profile="sensor", seed=2, steps=4800))
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == json.loads(json.dumps(report.summary))
     assert sum(name.endswith((".stiffness", ".damping")) for name in summary["parameters"]) == 24
@@ -300,7 +303,7 @@ def test_the_emulator_runs_only_while_the_robot_is_needed(
         raise EnoughError
 
     monkeypatch.setattr(part, "show_episode", stop)
-    config = Demo(robot=robot, out=tmp_path, seed=7, on_stand=on_stand)
+    config = DEMO.settings(robot=robot, out=tmp_path, seed=7, on_stand=on_stand)
     with pytest.raises(EnoughError):
         part.run(config, RunFolder(tmp_path), Stages())
     assert {"recorded", "deployed", "calibrate", "train"} == set(seen)
@@ -317,18 +320,18 @@ def test_the_emulator_runs_only_while_the_robot_is_needed(
 def test_what_is_another_robots_is_refused(config: dict[str, Any], words: str) -> None:
     """An option that would be ignored is refused, before anything is started."""
     with pytest.raises(ConfigurationError, match=words):
-        Demo(**config)
+        DEMO.settings(**config)
 
 
 def test_a_demo_of_the_go2_over_a_wire_that_it_has_not(tmp_path: Path) -> None:
     """The message names the wires that it has."""
     with pytest.raises(ConfigurationError, match="reached by dds or zenoh"):
-        demo(Demo(robot="go2", transport="serial", out=tmp_path / "demo"))
+        demo(DEMO.settings(robot="go2", transport="serial", out=tmp_path / "demo"))
 
 
 def test_demo_does_not_touch_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
     """Somebody else's files stay."""
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(ConfigurationError, match="name another folder"):
-        demo(Demo(out=tmp_path))
+        demo(DEMO.settings(out=tmp_path))
     assert (tmp_path / "thesis.tex").read_text() == "years of work"

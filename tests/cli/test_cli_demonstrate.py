@@ -14,7 +14,8 @@ from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Identifiability
-from deal_hw.cli.collect import Collect, collect
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -84,7 +85,7 @@ def test_a_stuck_robot_is_refused_without_any_noise_too() -> None:
 def test_collect_records_again_what_hardly_moved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In half a second no pole falls: the operator is informed, and only the repetition is fitted."""
     with EmulatorProcess("cartpole", "--nominal", "--profile", "sensor") as emulator:
-        asked = Collect(
+        asked = COLLECT.settings(
             robot="cartpole", port=emulator.port, out=tmp_path, seconds=0.4, attempts=2, quiet=True
         )
         report = collect(asked)

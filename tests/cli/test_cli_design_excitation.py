@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.cli.collect import Collect
-from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
+from deal_hw.cli.design_excitation import design_excitation
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
-from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.motions.excitation.plan import ExcitationBehaviour, read_plan
+from deal_hw.robots.so101.description import DESCRIPTION as ARM
 from deal_hw.workflows.collect import _excitation
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
@@ -39,7 +40,7 @@ def optimal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An excitation that was searched for, in no time."""
     path = tmp_path_factory.mktemp("run") / "optimal.json"
     report = design_excitation(
-        DesignExcitation(
+        DESIGN_EXCITATION.settings(
             robot="cartpole",
             out=path,
             seconds=2.0,
@@ -77,7 +78,7 @@ def test_each_excitation_keeps_the_limits(
         name = str(optimal)
     elif kind == "steps":
         name = str(tmp_path / "steps.json")
-        settings = DesignExcitation(
+        settings = DESIGN_EXCITATION.settings(
             robot="cartpole",
             out=Path(name),
             family="steps",
@@ -113,7 +114,7 @@ def test_collect_finds_what_to_play(optimal: Path) -> None:
     """A family keeps SECONDS, a file says how long it is, no excitation leaves the profile."""
 
     def found(**settings: Any) -> tuple[str, float]:
-        return _excitation(Collect(robot="cartpole", port="x", **settings), RunView())
+        return _excitation(COLLECT.settings(robot="cartpole", port="x", **settings), RunView())
 
     assert found(excite="chirp", seconds=3.0) == ("chirp", 3.0)
     assert found(excite=str(optimal)) == (str(optimal), 2.0)
@@ -135,7 +136,7 @@ def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> Non
         )
     with pytest.raises(UnknownNameError, match="k99"):
         design_excitation(
-            DesignExcitation(robot="cartpole", out=tmp_path / "x.json", space="k99", quiet=True)
+            DESIGN_EXCITATION.settings(robot="cartpole", out=tmp_path / "x.json", space="k99", quiet=True)
         )
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from deal_hw.cli import doctor as verb
-from deal_hw.cli.doctor import Doctor, doctor
+from deal_hw.cli.doctor import KINDS as DOCTOR
+from deal_hw.cli.doctor import doctor
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
@@ -38,7 +39,7 @@ def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[
 def test_this_computer_is_examined(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Every area is looked at, the file has the same findings, and what is wrong has a remedy."""
     out = tmp_path / "findings.json"
-    report = doctor(Doctor(json=out))
+    report = doctor(DOCTOR.settings(json=out))
     areas = {f.code for f in report.findings}
     assert areas >= {"system", "packages", "scheduling", "memory", "clock", "network", "interfaces"}
     assert json.loads(out.read_text()) == [
@@ -56,8 +57,8 @@ def test_nothing_heavy_is_loaded() -> None:
     """It runs on the robot's own computer: neither torch nor mujoco, and no DDS where none is asked for."""
     code = (
         "import sys\n"
-        "from deal_hw.cli.doctor import Doctor, doctor\n"
-        "doctor(Doctor())\n"
+        "from deal_hw.cli.doctor import KINDS as DOCTOR, doctor\n"
+        "doctor(DOCTOR.settings())\n"
         "heavy = ('torch', 'mujoco', 'scipy', 'rerun', 'cyclonedds', 'zenoh')\n"
         "print([m for m in heavy if m in sys.modules])\n"
     )
@@ -88,9 +89,9 @@ def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[st
     for robot, transport, port in (
         ("go2", "zenoh", "tcp/127.0.0.1:1"),
         ("go2", "dds", "nope0"),
-        ("cartpole", "", "/dev/ttyNONE7"),
+        ("cartpole", "serial", "/dev/ttyNONE7"),
     ):
-        report = doctor(Doctor(robot=robot, transport=transport, port=port))
+        report = doctor(DOCTOR.settings(robot=robot, transport=transport, port=port))
         assert report.exit_code == 1
         assert levels(report.findings, "link") == {Severity.FAIL}
         assert port in capsys.readouterr().out
@@ -98,12 +99,12 @@ def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[st
 
 def test_settings_that_do_not_fit_are_refused() -> None:
     """A robot needs a port, an unknown one is named."""
-    with pytest.raises(ConfigurationError, match="or neither"):
-        Doctor(robot="go2")
+    with pytest.raises(TypeError, match=r"missing a required (keyword-only )?argument: 'port'"):
+        DOCTOR.settings(robot="go2")
     with pytest.raises(ConfigurationError, match=r"allowed are 0.5 to 600 s"):
-        Doctor(seconds=0.0)
+        DOCTOR.settings("go2", port="lo", seconds=0.0)
     with pytest.raises(UnknownNameError, match="go2"):
-        doctor(Doctor(robot="gotwo", port="lo"))
+        doctor(DOCTOR.settings(robot="gotwo", port="lo"))
 
 
 def test_a_cable_that_is_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,6 +169,6 @@ def test_what_is_printed_fits_the_terminal(
     long = Finding("states", Severity.FAIL, "word " * 40, "remedy " * 30)
     monkeypatch.setattr(verb, "examine", lambda config: iter([long]))
     monkeypatch.setenv("COLUMNS", "80")
-    assert doctor(Doctor()).exit_code == 1
+    assert doctor(DOCTOR.settings()).exit_code == 1
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80 and len(lines) == 1 + 3 + 3

@@ -9,7 +9,8 @@ import subprocess
 import can
 import pytest
 
-from deal_hw.cli.doctor import Doctor, doctor
+from deal_hw.cli.doctor import KINDS as DOCTOR
+from deal_hw.cli.doctor import doctor
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.cartpole.emulator.can_emulator import can_devices
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults
@@ -98,7 +99,7 @@ def test_whatever_ip_says_is_survived(monkeypatch: pytest.MonkeyPatch, printed: 
 def test_the_emulated_cart_pole_on_can_is_well() -> None:
     """Bus, robot, states and link, as a user runs it."""
     with EmulatorProcess("cartpole", "--transport", "can", "--profile", "ideal", "--nominal") as emulator:
-        report = doctor(Doctor(robot="cartpole", transport="can", port=emulator.port, seconds=0.5))
+        report = doctor(DOCTOR.settings(robot="cartpole", transport="can", port=emulator.port, seconds=0.5))
     reported = {f.code: f for f in report.findings if f.code in ("can", "link", "states")}
     assert set(reported) == {"can", "link", "states"}
     assert all(f.severity is Severity.OK for f in reported.values())

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from verb_options import Option, dataclasses_of, options
+from verb_options import Option, dataclasses_of, kind_of, options
 
 from deal_hw.cli.main import VERBS, parse
 from deal_hw.clock import VirtualClock
@@ -76,7 +76,7 @@ def cases() -> Iterator[Any]:
         verb, *words = line.split()
         config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
         values = {**VALUES, "stand": ("True",)} if "go2_on_stand" in line else VALUES
-        for option in options(config, values):
+        for option in options(kind_of(config, *words), values):
             if option.name not in TOLD_ELSEWHERE and not {option.flag, *option.words[:1]} & set(words):
                 yield pytest.param(line, option, id=f"{line} {option.name}")
 
@@ -137,8 +137,8 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return iter(())
 
     class Listener:
-        def __init__(self, link: Any, clock: Any, *others: Any) -> None:
-            did.append(others)
+        def __init__(self, link: Any, clock: Any, seconds: float, **others: Any) -> None:
+            did.append((seconds, sorted(others.items())))
 
         def run(self) -> Iterator[Any]:
             return iter(())

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
-from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
+from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
+from deal_hw.cli.design_excitation import design_excitation
 from deal_hw.clock import VirtualClock
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.safety.safety import Safety
@@ -203,7 +204,7 @@ def test_swaying_is_planned_for_the_driven_robot_and_keeps_its_limits(tmp_path: 
     """The file fits the robot on the wire; feet would slip if joints were scaled one by one."""
     path = tmp_path / "sway.json"
     design_excitation(
-        DesignExcitation(robot="go2", out=path, family="sway", seconds=3.0, high_hz=3.0, quiet=True)
+        DESIGN_EXCITATION.settings(robot="go2", out=path, family="sway", seconds=3.0, high_hz=3.0, quiet=True)
     )
     plan = read_plan(path)
     plan.check_fits(DRIVER)
@@ -218,14 +219,18 @@ def test_only_the_go2_sways(tmp_path: Path) -> None:
     """A suspended robot has no standing feet."""
     with pytest.raises(ConfigurationError, match="for go2, which stands"):
         design_excitation(
-            DesignExcitation(robot="go2_on_stand", out=tmp_path / "x.json", family="sway", quiet=True)
+            DESIGN_EXCITATION.settings(
+                robot="go2_on_stand", out=tmp_path / "x.json", family="sway", quiet=True
+            )
         )
 
 
 def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
     """The robot's computer reads a table."""
     path = tmp_path / "sway.json"
-    design_excitation(DesignExcitation(robot="go2", out=path, family="sway", seconds=1.0, quiet=True))
+    design_excitation(
+        DESIGN_EXCITATION.settings(robot="go2", out=path, family="sway", seconds=1.0, quiet=True)
+    )
     code = (
         "import json, sys\n"
         "from deal_hw.workflows.running.plan import RunPlan, make_behaviour\n"

@@ -179,8 +179,11 @@ def test_help_lists_the_kinds_and_then_the_options_of_one(
         pages.append(capsys.readouterr().out)
     plain, cart, dog = pages
     assert "  deal-hw move cart        Move a robot.\n" in plain and "a robot with legs" in plain
-    assert "deal-hw move ROBOT.yaml  Move a robot of a file." in plain and "deal-hw move cart --help" in plain
-    assert "--speed" in cart and "--stride" not in cart and "--say" not in cart and "ROBOT" in cart
+    assert (
+        "deal-hw move ROBOT.yaml  Move a robot of a file." in plain
+        and "deal-hw move ROBOT.yaml --help" in plain
+    )
+    assert "--speed" in cart and "--stride" not in cart and "--say" not in cart and "ROBOT" not in cart
     assert "--stride" in dog and "--gentle, --no-gentle" in dog and "--quiet" in dog
 
 

@@ -147,7 +147,7 @@ def test_train(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(train, "run", run)
     monkeypatch.setattr(train, "_print", lambda training: None)
-    train.train(train.Train())
+    train.train(train.KINDS.settings())
     assert reported == ["train: 10 s, 500/2000 steps, return 12.3 velocity_error_m_s 0.25"]
 
 
@@ -161,7 +161,7 @@ def test_design_excitation(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(design_excitation, "run", run)
     monkeypatch.setattr(design_excitation, "print_design", lambda robot, report: None)
-    design_excitation.design_excitation(design_excitation.DesignExcitation(robot="cartpole", out=Path("o")))
+    design_excitation.design_excitation(design_excitation.KINDS.settings(robot="cartpole", out=Path("o")))
     assert reported == ["design-excitation: 10 s, 3/60 42.0 nats"]
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.cli.collect import Collect, collect
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.types import Status, Trajectory
@@ -27,7 +28,7 @@ def record(folder: Path, seconds: float, *faults: str) -> tuple[EpisodeReport, T
     profile = ("--nominal", "--profile", "sensor")
     with EmulatorProcess("cartpole", "--transport", "dynamixel", *profile, *faults) as emulator:
         report = collect(
-            Collect(
+            COLLECT.settings(
                 robot="cartpole",
                 port=emulator.port + PATIENT,
                 link=LINK,

@@ -21,9 +21,12 @@ import pytest
 from fakes.faulty_policy import RARE_M_S, faulty_policy
 from fakes.linear_policy import CARTPOLE_GAINS, feedback_spec
 
-from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.replay import Replay, replay
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
+from deal_hw.cli.deploy import KINDS as DEPLOY
+from deal_hw.cli.deploy import deploy
+from deal_hw.cli.replay import KINDS as REPLAY
+from deal_hw.cli.replay import replay
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.process.channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
@@ -157,7 +160,7 @@ def assert_whole(folder: Path, at_least: int = AT_BEAT - 5) -> None:
 def test_collect_records_a_whole_episode(emulator: Emulator, tmp_path: Path) -> None:
     """Two episodes under one roof: loop_timing in the index, all commands in the file, a passive robot."""
     report = collect(
-        Collect(
+        COLLECT.settings(
             robot="cartpole",
             port=emulator.port,
             out=tmp_path,
@@ -180,7 +183,9 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     """The asked targets of the replay are those of the recording, command by command."""
     run(emulator, tmp_path / "a", seconds=0.5)
     first = Dataset.open(tmp_path / "a")
-    report = replay(Replay(episode=first.path(0), port=emulator.port, dataset=tmp_path / "b", quiet=True))
+    report = replay(
+        REPLAY.settings(episode=first.path(0), port=emulator.port, dataset=tmp_path / "b", quiet=True)
+    )
     assert report.outcome is Outcome.FINISHED
     asked = [d.read(0).trajectory.requested_position for d in (first, Dataset.open(tmp_path / "b"))]
     assert asked[0].shape == (25, 1)
@@ -400,7 +405,9 @@ def test_a_second_collector_is_refused_and_disturbs_nobody(emulator: Emulator, t
 def test_no_such_port_and_a_wrong_device_are_refused_before_anything_is_made(tmp_path: Path) -> None:
     """The port that does not exist, and one on which something else answers."""
     with pytest.raises(PortNotFoundError, match="no serial port '/dev/ttyNOPE'"):
-        collect(Collect(robot="cartpole", port="/dev/ttyNOPE", dataset=tmp_path / "a", motion="hold"))
+        collect(
+            COLLECT.settings(robot="cartpole", port="/dev/ttyNOPE", dataset=tmp_path / "a", motion="hold")
+        )
     master, slave = os.openpty()
     done = threading.Event()
 
@@ -412,7 +419,11 @@ def test_no_such_port_and_a_wrong_device_are_refused_before_anything_is_made(tmp
     thread.start()
     try:
         with pytest.raises(WrongDeviceError, match="no answer to hello"):
-            collect(Collect(robot="cartpole", port=os.ttyname(slave), dataset=tmp_path / "a", motion="hold"))
+            collect(
+                COLLECT.settings(
+                    robot="cartpole", port=os.ttyname(slave), dataset=tmp_path / "a", motion="hold"
+                )
+            )
     finally:
         done.set()
         thread.join()
@@ -449,7 +460,7 @@ def test_deploy_balances_with_a_policy_file(emulator: Emulator, tmp_path: Path) 
     """The same loop with another policy and purpose."""
     policy = write_policy(tmp_path / "p.onnx")
     report = deploy(
-        Deploy(
+        DEPLOY.settings(
             robot="cartpole",
             port=emulator.port,
             policy=policy,
@@ -489,24 +500,24 @@ def test_policies_that_do_not_fit_are_refused_before_the_robot_is_touched(tmp_pa
     port = "/dev/ttyNOPE"
     other = write_policy(tmp_path / "other.onnx", robot="go2")
     with pytest.raises(PolicyMismatchError, match="robot: policy has 'go2', robot has 'cartpole'"):
-        deploy(Deploy(robot="cartpole", port=port, policy=other))
+        deploy(DEPLOY.settings(robot="cartpole", port=port, policy=other))
     with pytest.raises(PolicyError, match="no such policy file"):
-        deploy(Deploy(robot="cartpole", port=port, policy=tmp_path / "missing.onnx"))
+        deploy(DEPLOY.settings(robot="cartpole", port=port, policy=tmp_path / "missing.onnx"))
     (tmp_path / "junk.onnx").write_text("not a network")
     with pytest.raises(PolicyError, match="not an ONNX network"):
-        deploy(Deploy(robot="cartpole", port=port, policy=tmp_path / "junk.onnx"))
+        deploy(DEPLOY.settings(robot="cartpole", port=port, policy=tmp_path / "junk.onnx"))
 
 
 def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:
     """Where the data should go, how long, how often."""
     with pytest.raises(ConfigurationError, match="not both"):
-        collect(Collect(robot="cartpole", port="x", out=tmp_path, dataset=tmp_path, motion="hold"))
+        collect(COLLECT.settings("cartpole", port="x", out=tmp_path, dataset=tmp_path, motion="hold"))
     with pytest.raises(ConfigurationError, match="give --out RUN"):
-        collect(Collect(robot="cartpole", port="x", motion="hold"))
+        collect(COLLECT.settings("cartpole", port="x", motion="hold"))
     with pytest.raises(ConfigurationError, match="--seconds"):
-        collect(Collect(robot="cartpole", port="x", out=tmp_path, motion="hold", seconds=math.nan))
+        collect(COLLECT.settings("cartpole", port="x", out=tmp_path, motion="hold", seconds=math.nan))
     with pytest.raises(ConfigurationError, match="--episodes 0: allowed are 1 to 10000"):
-        collect(Collect(robot="cartpole", port="x", out=tmp_path, motion="hold", episodes=0))
+        collect(COLLECT.settings("cartpole", port="x", out=tmp_path, motion="hold", episodes=0))
 
 
 def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy() -> None:

@@ -12,7 +12,7 @@ from firmware_inputs import CAN, IntegerServo, outputs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.cli.emulate import Emulate
+from deal_hw.cli.emulate import KINDS as EMULATE
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole.chips import native
 from deal_hw.drivers.cartpole.chips.controller import Controller, Firmware, Mode
@@ -481,10 +481,10 @@ def test_the_chip_without_can_is_no_firmware_here() -> None:
         odrive_device(nominal_truth(), OdriveSettings(), firmware="avr")
     for wire in ("can", "odrive"):
         with pytest.raises(ConfigurationError, match="the ATmega328P has no CAN controller"):
-            Emulate(robot="cartpole", transport=wire, firmware="avr")
-        Emulate(robot="cartpole", transport=wire, firmware="host")
+            EMULATE.settings(robot="cartpole", transport=wire, firmware="avr")
+        EMULATE.settings(robot="cartpole", transport=wire, firmware="host")
     with pytest.raises(ConfigurationError, match="`can` and `odrive` have this firmware"):
-        Emulate(robot="cartpole", transport="dynamixel", firmware="host")
+        EMULATE.settings(robot="cartpole", transport="dynamixel", firmware="host")
 
 
 def test_an_emulated_node_runs_the_core_where_it_can(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,9 @@ import can
 import numpy as np
 import pytest
 
-from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.emulate import Emulate
+from deal_hw.cli.collect import KINDS as COLLECT
+from deal_hw.cli.collect import collect
+from deal_hw.cli.emulate import KINDS as EMULATE
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
@@ -411,8 +412,8 @@ def test_two_ways_to_write_a_port_are_one_robot(transport: str, short: str, whol
 def test_options_of_a_bus_need_one() -> None:
     """On the serial wire they would be ignored."""
     with pytest.raises(ConfigurationError, match="--node would have no effect"):
-        Emulate(robot="cartpole", can=CanFaults(node=3))
-    Emulate(robot="cartpole", transport="can", can=CanFaults(node=3))
+        EMULATE.settings(robot="cartpole", can=CanFaults(node=3))
+    EMULATE.settings(robot="cartpole", transport="can", can=CanFaults(node=3))
 
 
 @pytest.mark.real_time
@@ -421,7 +422,7 @@ def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     """Two processes, an inherited adapter, the emulator as a third: every state is there, none torn."""
     with EmulatorProcess("cartpole", "--transport", transport, "--profile", "ideal", "--nominal") as emulator:
         report = collect(
-            Collect(
+            COLLECT.settings(
                 robot="cartpole",
                 port=emulator.port,
                 link=LinkOptions(transport=transport),

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.cli.emulate import KINDS as EMULATE
+from deal_hw.cli.emulate import emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
@@ -217,23 +218,23 @@ def test_a_link_is_made_replaced_and_removed(tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     """Unknown names list the table, negative times and impossible rates are refused."""
     with pytest.raises(UnknownNameError, match="known: cartpole"):
-        Emulate(robot="spot")
+        EMULATE.settings(robot="spot")
     with pytest.raises(UnknownNameError, match="known: serial"):
-        Emulate(transport="smoke")
+        EMULATE.settings(transport="smoke")
     with pytest.raises(ConfigurationError, match=r"--vanish-after-s -1\.0 s"):
-        Emulate(vanish_after_s=-1.0)
+        EMULATE.settings(vanish_after_s=-1.0)
     with pytest.raises(ConfigurationError, match="--return-after-s needs"):
-        Emulate(vanish_after_s=1.0, return_after_s=1.0)
+        EMULATE.settings(vanish_after_s=1.0, return_after_s=1.0)
     with pytest.raises(ConfigurationError, match="exclude each other"):
-        Emulate(nominal=True, truth_from=Path("truth.json"))
+        EMULATE.settings(nominal=True, truth_from=Path("truth.json"))
     with pytest.raises(ConfigurationError, match=r"--corrupt 1\.5: allowed are 0 to 1"):
-        emulate(Emulate(nominal=True, corrupt=1.5))
+        emulate(EMULATE.settings(nominal=True, corrupt=1.5))
 
 
 def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It prints the port first and the truth last, writes the same truth, and takes it back."""
     revealed = tmp_path / "truth.json"
-    config = Emulate(profile="sensor", seed=5, duration_s=0.0, reveal=True, reveal_to=revealed)
+    config = EMULATE.settings(profile="sensor", seed=5, duration_s=0.0, reveal=True, reveal_to=revealed)
     assert emulate(config) == 0
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
     lines = capsys.readouterr().out.splitlines()
@@ -241,7 +242,7 @@ def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.Ca
     reported = json.loads(lines[-1])
     assert reported == json.loads(revealed.read_text())
     assert (reported["changes"], reported["last_mode"], reported["received_bytes"]) == ([], "idle", 0)
-    assert emulate(Emulate(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
+    assert emulate(EMULATE.settings(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
     again = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert CartpoleTruth.from_json(again) == CartpoleTruth.from_json(reported)
 

@@ -15,9 +15,6 @@ import pytest
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.ant import model as ant_model
-from deal_hw.drivers.ant.description import DEFAULT, PAPER
-from deal_hw.drivers.humanoid import model as humanoid_model
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.robots import (
@@ -26,6 +23,9 @@ from deal_hw.robots import (
     robot_description,
     robots,
 )
+from deal_hw.robots.ant import model as ant_model
+from deal_hw.robots.ant.description import DEFAULT, PAPER
+from deal_hw.robots.humanoid import model as humanoid_model
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.sim.parameters import KIND_TABLE, check_space

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from fakes.memory_wire import MemoryWire
 
-from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.cli.emulate import KINDS as EMULATE
+from deal_hw.cli.emulate import emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
@@ -176,19 +177,17 @@ def test_the_summary_says_what_happened() -> None:
 
 def test_wrong_options_are_refused_before_anything_opens() -> None:
     """Unknown wires, options of the other robot and contradictions are named."""
-    with pytest.raises(UnknownNameError, match="transport to emulate on 'serial'; known: dds, zenoh"):
-        Emulate(robot="go2", transport="serial")
+    with pytest.raises(UnknownNameError, match="unknown transport 'serial'; known: dds, zenoh"):
+        EMULATE.settings(robot="go2", transport="serial")
     with pytest.raises(UnknownNameError, match="robot to emulate 'spot'; known: cartpole, go2"):
-        Emulate(robot="spot")
-    with pytest.raises(ConfigurationError, match=r"--port, --on-stand, --push .*only `emulate go2`"):
-        Emulate(go2=Go2Options(on_stand=True, faults=Go2Faults(push=5.0)), port="lo")
-    with pytest.raises(ConfigurationError, match=r"--link, --vanish-after-s .*only `emulate cartpole`"):
-        Emulate(robot="go2", link=Path("x"), vanish_after_s=1.0)
+        EMULATE.settings(robot="spot")
+    with pytest.raises(UnknownNameError, match=r"settings cartpole 'go2'; .*`settings go2` has it"):
+        EMULATE.settings(go2=Go2Options(on_stand=True, faults=Go2Faults(push=5.0)))
     with pytest.raises(ConfigurationError, match="--tick-start-ms -1 ms: allowed are 0 to 4294967295 ms"):
         Go2Options(tick_start_ms=-1)
     contradiction = Go2Options(no_remote=True, remote_script=Path("x"))
     with pytest.raises(ConfigurationError, match="--no-remote and --remote-script exclude each other"):
-        emulate(Emulate(robot="go2", transport="zenoh", go2=contradiction))
+        emulate(EMULATE.settings(robot="go2", transport="zenoh", go2=contradiction))
 
 
 @pytest.mark.parametrize(
@@ -201,7 +200,7 @@ def test_a_file_that_holds_no_truth_is_refused(tmp_path: Path, text: str, messag
     path.write_text(text)
     for robot in ("go2", "cartpole"):
         with pytest.raises(ConfigurationError, match=message):
-            emulate(Emulate(robot=robot, truth_from=path))
+            emulate(EMULATE.settings(robot=robot, truth_from=path))
 
 
 def test_a_free_port_is_found() -> None:
@@ -268,7 +267,7 @@ def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
     assert report["commands"]["accepted"] > 0
     assert report["requests_answered"] > 0
     assert report["stiffness"]["FL_hip_joint"] != 1.0
-    again = Emulate(
+    again = EMULATE.settings(
         robot="go2", transport="zenoh", port="tcp/127.0.0.1:0", truth_from=revealed, duration_s=0.0
     )
     assert emulate(again) == 0

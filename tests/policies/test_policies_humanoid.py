@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.drivers.humanoid.description import GEAR_NM
-from deal_hw.drivers.humanoid.model import joint_type
 from deal_hw.errors import ConfigurationError, PolicyError
 from deal_hw.policies.humanoid_env import HumanoidEnv, StrideTask, stride_spec
 from deal_hw.policies.onnx_export import export_network
@@ -19,6 +17,8 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.vector_env import Mirror
 from deal_hw.policy import ObservationTerm
 from deal_hw.robots import robot_description
+from deal_hw.robots.humanoid.description import GEAR_NM
+from deal_hw.robots.humanoid.model import joint_type
 from deal_hw.types import FloatArray
 from deal_hw.workflows.train import nominal_distribution
 

@@ -14,7 +14,8 @@ import pytest
 
 import deal_hw.cli.main as cli
 import deal_hw.cli.train as train_module
-from deal_hw.cli.train import Train, train
+from deal_hw.cli.train import KINDS as TRAIN
+from deal_hw.cli.train import train
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
@@ -22,7 +23,7 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import VERDICT
 from deal_hw.robots import driver_description
 from deal_hw.training import TrainingProgress, TrainingStatus
-from deal_hw.workflows.train import read_distribution, udr_distribution
+from deal_hw.workflows.train import TrainSettings, read_distribution, udr_distribution
 
 STEPS = 1_200
 """Enough for a few updates."""
@@ -38,7 +39,9 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
     )
     file = tmp_path / "distribution.json"
     file.write_text(json.dumps(distribution.to_json() | {"verdict": "amber"}), encoding="utf-8")
-    training = train(Train(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True))
+    training = train(
+        TRAIN.settings(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True)
+    )
     assert training.status is not None and training.first_return is not None
     now, first = training.status.mean_return, training.first_return
     reported = (
@@ -64,7 +67,7 @@ def test_the_next_line_runs_the_policy(
 ) -> None:
     """Of a robot that has a driver; a robot of the simulator alone cannot be deployed to."""
     monkeypatch.setattr(train_module, "train", lambda config: types.SimpleNamespace(path=Path("p.onnx")))
-    train_module.train_and_say_next(Train(robot=robot, udr=True))
+    train_module.train_and_say_next(TRAIN.settings(robot=robot, udr=True))
     line = f"next: deal-hw deploy {robot} --port PORT --policy p.onnx\n"
     assert capsys.readouterr().out == (line if reported else "")
 
@@ -81,17 +84,23 @@ def test_udr_covers_a_factor_of_five_and_30_ms() -> None:
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        (Train(), r"no distribution is named: give --distribution FILE .*, --udr or --nominal"),
-        (Train(udr=True, distribution=Path("x.json")), "--distribution and --udr exclude each other"),
-        (Train(udr=True, nominal=True), "--udr and --nominal exclude each other"),
+        (TRAIN.settings(), r"no distribution is named: give --distribution FILE .*, --udr or --nominal"),
         (
-            Train(udr=True, resume=True, start=Path("x.safetensors")),
+            TRAIN.settings(udr=True, distribution=Path("x.json")),
+            "--distribution and --udr exclude each other",
+        ),
+        (TRAIN.settings(udr=True, nominal=True), "--udr and --nominal exclude each other"),
+        (
+            TRAIN.settings(udr=True, resume=True, start=Path("x.safetensors")),
             "--start and --resume exclude each other",
         ),
-        (Train(udr=True, resume=True, out=Path("none")), r"nothing to resume: none/policies/policy\.safe"),
+        (
+            TRAIN.settings(udr=True, resume=True, out=Path("none")),
+            r"nothing to resume: none/policies/policy\.safe",
+        ),
     ],
 )
-def test_settings_that_contradict_each_other_are_refused(config: Train, words: str) -> None:
+def test_settings_that_contradict_each_other_are_refused(config: TrainSettings, words: str) -> None:
     """The message says what to give or to leave out."""
     with pytest.raises(ConfigurationError, match=words):
         train(config)
@@ -111,7 +120,7 @@ def test_a_signal_before_the_first_step_ends_at_once(
     monkeypatch.setattr("deal_hw.workflows.train.train_policy", load)
     before = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(KeyboardInterrupt):
-        train(Train(udr=True, out=tmp_path, quiet=True))
+        train(TRAIN.settings(udr=True, out=tmp_path, quiet=True))
     assert not after and not list(tmp_path.iterdir())
     assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
 
@@ -151,7 +160,7 @@ def test_a_go2_is_trained_stopped_and_resumed(
 
     monkeypatch.setattr(train_module, "_follow", follow)
     # Two updates of 24 ticks of 4 robots.
-    config = Train(robot="go2", nominal=True, out=tmp_path, steps=192, members=4, quiet=True)
+    config = TRAIN.settings(robot="go2", nominal=True, out=tmp_path, steps=192, members=4, quiet=True)
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         train(config)
@@ -208,4 +217,4 @@ def test_an_unknown_robot_is_refused_by_name() -> None:
         UnknownNameError,
         match=r"unknown robot with a training environment 'go3'; known: allegro, ant, cartpole, ",
     ):
-        train(Train(robot="go3", udr=True, quiet=True))
+        train(TRAIN.settings(robot="go3", udr=True, quiet=True))

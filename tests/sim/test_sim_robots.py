@@ -18,7 +18,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.robots.carried import FOLDER, carried_description, carry
+from deal_hw.sim.robots.dataset_robot import FOLDER, store_robot, stored_description
 from deal_hw.sim.robots.holding import hold
 from deal_hw.sim.robots.robot_file import (
     ActuatorEntry,
@@ -297,8 +297,8 @@ def test_a_dataset_keeps_what_the_model_needs(spread: Path, tmp_path: Path) -> N
     dataset = tmp_path / "dataset"
     dataset.mkdir()
     assert not carries_robot(dataset)
-    carry(robot, dataset)
-    carry(robot, dataset)
+    store_robot(robot, dataset)
+    store_robot(robot, dataset)
     assert carries_robot(dataset) and not [path for path in dataset.iterdir() if path.name != FOLDER]
     kept = sorted(str(p.relative_to(dataset / FOLDER)) for p in (dataset / FOLDER).rglob("*") if p.is_file())
     assert kept == ["files.json", "meshes/lump.obj", "mjcf/arm.xml", "mjcf/more.xml", "robot.yaml"]
@@ -306,7 +306,7 @@ def test_a_dataset_keeps_what_the_model_needs(spread: Path, tmp_path: Path) -> N
     values = json.loads(json.dumps(description.to_json()))
     digest = description.digest()
     (tmp_path / "source").rename(tmp_path / "moved")
-    found = carried_description(dataset, values)
+    found = stored_description(dataset, values)
     assert found.digest() == digest and found.limits == description.limits
     assert load_model(found).model.nmesh == 1
     assert read_robot(dataset / FOLDER / "robot.yaml").description().digest() == digest
@@ -326,19 +326,19 @@ def test_a_robot_that_was_moved_or_changed(
 ) -> None:
     """The file that is expected is named, and what to do."""
     robot = read_robot(spread)
-    carry(robot, tmp_path)
+    store_robot(robot, tmp_path)
     spoil(tmp_path / FOLDER)
     with pytest.raises(DatasetError, match=words) as raised:
-        carried_description(tmp_path, robot.description().to_json())
+        stored_description(tmp_path, robot.description().to_json())
     assert "import the recordings again with --robot robot.yaml" in str(raised.value)
 
 
 def test_another_robot_is_not_put_over_it(model: Path, tmp_path: Path) -> None:
     """A dataset has one robot."""
-    carry(read_robot(written(model)), tmp_path)
+    store_robot(read_robot(written(model)), tmp_path)
     other = derive_robot(model, control_rate_hz=60.0)
     with pytest.raises(DatasetError, match=r"holds another robot: robot.yaml differ; name another folder"):
-        carry(other, tmp_path)
+        store_robot(other, tmp_path)
 
 
 def test_an_absolute_path_is_refused(spread: Path, tmp_path: Path) -> None:
@@ -349,7 +349,7 @@ def test_an_absolute_path_is_refused(spread: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "dataset"
     dataset.mkdir()
     with pytest.raises(ConfigurationError, match="by an absolute path, so the dataset cannot hold a copy"):
-        carry(read_robot(spread), dataset)
+        store_robot(read_robot(spread), dataset)
     assert not list(dataset.iterdir())
 
 

@@ -14,8 +14,9 @@ from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.robots import robot_entry
 from deal_hw.testing.plain_robots import make_robot, write
-from deal_hw.workflows.robot import described, load_robot
+from deal_hw.workflows.robot import described, entry_of, load_robot
 from deal_hw.workflows.running.supervised import InterruptedRunError
 
 
@@ -49,6 +50,15 @@ def test_from_two_files_to_an_inspected_calibration(made: Path, capsys: pytest.C
     shown = deal_hw.inspect(episode, calibration=made / "run" / "calibration")
     nominal, calibrated = (sum(v for v in row.values() if isinstance(v, float)) for row in shown.rows())
     assert shown.description.name == "swing" and calibrated < nominal
+
+
+def test_files_and_names_become_entries_of_one_type(made: Path) -> None:
+    """A robot.yaml and a dataset's robot have no wires; they are simulated and calibrated as any other."""
+    for robot in (made / "robot.yaml", made / "run" / "dataset"):
+        entry = entry_of(str(robot))
+        assert (entry.recorded_description().name, entry.driven) == ("swing", False)
+        assert len(entry.parameter_spaces()["default"]()) > 0
+    assert entry_of("cartpole") is robot_entry("cartpole")
 
 
 CART = """<mujoco model="cart"><option timestep="0.002" integrator="implicitfast"/><worldbody>
@@ -212,22 +222,16 @@ REFUSED: list[tuple[str, str]] = [
         "collect {made}/robot.yaml --simulated --out r --excite chirp",
         "is unknown, so no excitation can be planned; write its position_range",
     ),
-    ("collect cartpole --simulated --out r", "--simulated takes a robot.yaml"),
     (
-        "collect {made}/robot.yaml --simulated --port p --out r",
-        "--port would have no effect: --simulated needs no",
-    ),
-    (
-        "collect cartpole --port p --truth-seed 1 --out r",
-        "--truth-seed would have no effect: only with --simulated",
+        "collect cartpole --simulated --out r",
+        "--simulated: `deal-hw collect cartpole` has no such option; `collect robot.yaml` has it",
     ),
     ("collect nosuch --out r", "unknown robot 'nosuch'; known: "),
-    ("collect cartpole --out r", "no port is given: name the robot's port"),
+    ("collect cartpole --out r", "`deal-hw collect cartpole` needs --port; --port is: The robot's port"),
     (
         "replay {made}/run/dataset/episodes/000000.mcap --port p",
         "deal-hw has no driver for this robot; record its simulation with --simulated",
     ),
-    ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a simulated"),
     (
         "deploy {made}/robot.yaml --port p",
         "docs/how-to/add.md shows how to write one",

@@ -18,7 +18,7 @@ from deal_hw.transport import WireOptions
 from deal_hw.types import Trajectory
 from deal_hw.workflows import replay
 from deal_hw.workflows.running.plan import RunPlan
-from deal_hw.workflows.running.settings import LegOptions, LinkOptions, plan_options
+from deal_hw.workflows.running.settings import Go2LinkOptions, LegOptions, LinkOptions, plan_options
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_what_is_given_wins() -> None:
     plan = RunPlan(
         **plan_options(
             "go2",
-            LinkOptions(transport="zenoh", record_wire=False, wire=wire),
+            Go2LinkOptions(transport="zenoh", record_wire=False, wire=wire),
             LegOptions(
                 stand=True,
                 velocity="remote",
@@ -73,11 +73,12 @@ def test_a_robot_without_a_driver_is_refused() -> None:
 
 def test_the_drivers_own_settings_are_carried_where_they_were_given() -> None:
     """As the driver's keyword arguments; a robot whose driver knows no such setting refuses them."""
-    options = plan_options("go2", LinkOptions(state_check="length"), LegOptions(support_check=False))
+    options = plan_options("go2", Go2LinkOptions(state_check="length"), LegOptions(support_check=False))
     settings = options["robot_settings"]
     assert settings == {"support_check": False, "state_check": "length"}
     clock = VirtualClock()
-    simulated = plan_options("go2", LinkOptions(simulator="unitree_mujoco"), LegOptions())["robot_settings"]
+    link = Go2LinkOptions(simulator="unitree_mujoco")
+    simulated = plan_options("go2", link, LegOptions())["robot_settings"]
     assert simulated == {"simulator": "unitree_mujoco"}
     assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, simulated).notice
     assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, settings).info is None  # type: ignore[attr-defined]

@@ -24,7 +24,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT
 from deal_hw.workflows.emulation.common import next_line
 from deal_hw.workflows.emulation.process import arguments
-from deal_hw.workflows.emulation.settings import EmulateSettings, Go2Options
+from deal_hw.workflows.emulation.settings import EmulateCartpoleSettings, EmulateGo2Settings, Go2Options
 from deal_hw.workflows.running import supervised
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
@@ -126,17 +126,17 @@ def test_an_emulator_that_does_not_start_says_why(tmp_path: Path) -> None:
 
 def test_an_emulator_says_how_to_reach_it() -> None:
     """The line can be pasted into another terminal."""
-    settings = EmulateSettings("cartpole", transport="can")
+    settings = EmulateCartpoleSettings("cartpole", transport="can")
     line = next_line(settings, "/dev/pts/3").partition(": ")[2]
     assert line == "deal-hw doctor cartpole --port /dev/pts/3 --transport can"
 
 
 def test_settings_become_options_of_the_command_line() -> None:
     """What differs from the defaults, switches that are off among it, and groups inside."""
-    settings = EmulateSettings(
+    settings = EmulateCartpoleSettings(
         "cartpole", transport="can", seed=2, nominal=True, can=CanFaults(node=3, no_acknowledge=True)
     )
-    assert arguments(settings, EmulateSettings("cartpole")) == [
+    assert arguments(settings, EmulateCartpoleSettings("cartpole")) == [
         "--transport",
         "can",
         "--seed",
@@ -146,8 +146,8 @@ def test_settings_become_options_of_the_command_line() -> None:
         "3",
         "--no-acknowledge",
     ]
-    go2 = EmulateSettings("go2", go2=Go2Options(remote_script=Path("r.json")))
-    assert arguments(go2, EmulateSettings("go2")) == ["--remote-script", "r.json"]
+    go2 = EmulateGo2Settings("go2", go2=Go2Options(remote_script=Path("r.json")))
+    assert arguments(go2, EmulateGo2Settings("go2")) == ["--remote-script", "r.json"]
     link = deal_hw.LinkOptions(record_wire=False)
     assert arguments(link, deal_hw.LinkOptions()) == ["--no-record-wire"]
 

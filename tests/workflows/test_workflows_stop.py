@@ -20,7 +20,7 @@ from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import ConfigurationError, PortBusyError, UnknownNameError
 from deal_hw.workflows import stop as module
 from deal_hw.workflows.emulation.process import EmulatorProcess
-from deal_hw.workflows.stop import StopSettings, _claimed, stop
+from deal_hw.workflows.stop import _claimed, stop
 
 pytestmark = pytest.mark.real_time
 
@@ -167,8 +167,8 @@ def test_what_cannot_work_is_refused() -> None:
         stop("go3")
     with pytest.raises(ConfigurationError, match="--transport would have no effect: without --port"):
         stop("go2", transport="zenoh")
-    with pytest.raises(ConfigurationError, match="--state-check"):
-        StopSettings("cartpole", port="x", state_check="length")
+    with pytest.raises(ConfigurationError, match="--state-check would have no effect: without --port"):
+        stop("go2", state_check="length")
 
 
 def test_a_killed_run_may_take_its_time_to_die() -> None:

@@ -112,6 +112,17 @@ def read_episode(path: Path) -> Episode:
         raise _unreadable(path, error) from error
 
 
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Return the values given to an episode's recorder, without its samples; errors as :func:`read_wire`."""
+    try:
+        for found in _records(path):
+            if isinstance(found.record, Metadata) and found.record.name == METADATA_NAME:
+                return read_json(dict[str, Any], found.record.metadata["metadata"])
+    except (KeyError, ValueError, ProtocolError) as error:
+        raise _unreadable(path, error) from error
+    return {}
+
+
 def read_wire(path: Path) -> Iterator[Message]:
     """Yield the raw messages of an episode in order; channels as the robot named them.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.errors import DealHwError
 from deal_hw.findings import Finding, Severity
 from deal_hw.ranges import Checked, Range
 from deal_hw.robots import (
@@ -16,54 +16,95 @@ from deal_hw.robots import (
     make_topic_transport,
     on_this_computer,
     other_wires,
+    plug_ins,
     reached_over,
 )
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.doctor.robot import examine_robot
-from deal_hw.workflows.options import GO2, from_settings, given, refuse, refuse_others
-from deal_hw.workflows.robot import is_user_robot
+from deal_hw.workflows.options import from_settings, given, refuse
+from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.say import html_table
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorSettings(Checked):
-    """Settings of :func:`doctor`."""
+    """Check this computer only; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
 
     robot: str = field(default="", kw_only=False)
-    """The robot to listen to, such as go2."""
+    """The robot to listen to, such as go2; without it only this computer is checked."""
 
-    port: str = ""
-    """The robot's port: a network interface (dds), an end point (zenoh), a serial port or a CAN bus."""
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorRobotSettings(DoctorSettings):
+    """Check this computer, the connection and the robot; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+    port: str
+    """The robot's port, such as a serial port or an end point of a network."""
 
     transport: str = ""
-    """Transport to the robot, such as serial, can, dds or zenoh; by default the robot's usual one."""
-
-    state_check: Annotated[Literal["strict", "length"], GO2] = "strict"
-    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
-
-    simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
-    """Simulator in place of a real Go2: unitree_mujoco."""
+    """Transport to the robot; by default the robot's usual one."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
     """How long to listen to the robot [s]."""
 
-    wire: Annotated[WireOptions, GO2] = field(default_factory=WireOptions)
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorCartpoleSettings(DoctorRobotSettings):
+    """Check this computer, the connection and a cart-pole; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+    port: str
+    """The cart-pole's port: a serial port or a CAN bus."""
+
+    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
+    """Transport to the cart-pole."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorGo2Settings(DoctorRobotSettings):
+    """Check this computer, the connection and a Go2; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+    port: str
+    """The Go2's port: a network interface (dds) or an end point (zenoh)."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """Transport to the Go2."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
+
+    simulator: Literal["none", "unitree_mujoco"] = "none"
+    """Simulator in place of a real Go2: unitree_mujoco."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
     """Network options."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if is_user_robot(self.robot):
-            raise ConfigurationError(
-                f"{self.robot}: deal-hw has no driver for this robot, so there is no connection to check; "
-                "`deal-hw robot check robot.yaml` checks its description"
-            )
-        if bool(self.robot) != bool(self.port):
-            raise ConfigurationError(
-                "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"
-            )
-        if self.robot:
-            refuse_others(self, "doctor", self.robot)
+        if self.simulator != "none":
+            refuse(given(self, DoctorGo2Settings, ("state_check",)), f"{self.simulator} has no checksums")
+
+
+DOCTOR = robot_kinds(
+    {"cartpole": DoctorCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), DoctorGo2Settings)},
+    plain=DoctorRobotSettings,
+    legged=DoctorRobotSettings,
+    nothing=DoctorSettings,
+    no_file=", so there is no connection to check; `deal-hw robot check robot.yaml` checks its description",
+)
+"""The kinds of :func:`doctor`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,12 +127,12 @@ class DoctorReport:
         return int(any(finding.severity is Severity.FAIL for finding in self.findings))
 
 
-@from_settings(DoctorSettings)
+@from_settings(DOCTOR)
 def doctor(settings: DoctorSettings) -> DoctorReport:
     """Check this computer, the connection and the robot, as ``deal-hw doctor``.
 
-    :class:`DoctorSettings` describes the arguments: ``doctor("go2", port="enp2s0")``. Without a robot only
-    this computer is checked. No command is sent to a motor.
+    ``deal-hw doctor ROBOT --help`` describes the arguments: ``doctor("go2", port="enp2s0")``. Without a robot
+    only this computer is checked. No command is sent to a motor.
 
     Raises:
         UnknownNameError: There is no such robot.
@@ -104,12 +145,13 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
     """Yield each finding at once; see :func:`doctor`."""
     from deal_hw.workflows.doctor.can import list_adapters
 
-    name = _transport(config)
     yield from examine_machine()
+    yield from list_plug_ins()
     yield from list_adapters()
-    yield from judge_interfaces(config.port)
-    if not config.robot:
+    yield from judge_interfaces(config.port if isinstance(config, DoctorRobotSettings) else "")
+    if not isinstance(config, DoctorRobotSettings):
         return
+    name = config.transport or default_transport(config.robot)
     clock = MonotonicClock()
     try:
         yield from _examine_link(config, name, clock)
@@ -118,42 +160,36 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
         yield from other_wires(config.robot, config.port, name, clock)
 
 
-def _examine_link(config: DoctorSettings, name: str, clock: Clock) -> Iterator[Finding]:
+def _examine_link(config: DoctorRobotSettings, name: str, clock: Clock) -> Iterator[Finding]:
     """Yield findings on a robot and its wire; what is looked at beside the robot is the wire's."""
     from deal_hw.drivers.transports.can_transport import open_can
     from deal_hw.workflows.doctor.can import listen_to_bus
 
     entry, wire = reached_over(config.robot, name)
+    network, own = WireOptions(), dict[str, str]()
+    if isinstance(config, DoctorGo2Settings):
+        network, own = config.wire, {"state_check": config.state_check, "simulator": config.simulator}
     if wire.doctor:
-        link = make_topic_transport(wire.transport, config.port, clock, config.wire)
-        doctor = entry.load(wire.doctor)
-        yield from doctor(link, clock, config.seconds, config.state_check, config.simulator).run()
+        link = make_topic_transport(wire.transport, config.port, clock, network)
+        yield from entry.load(wire.doctor)(link, clock, config.seconds, **own).run()
         return
     if wire.bus:
         bus, nodes = entry.load(wire.bus)(config.port)
         yield from listen_to_bus(open_can(bus, clock), clock, min(1.0, config.seconds), *nodes)
     if wire.examine:
         yield from entry.load(wire.examine)(config.port, clock)
-    robot = make_robot(config.robot, name, config.port, clock, config.wire)
+    robot = make_robot(config.robot, name, config.port, clock)
     local = on_this_computer(name, config.port)
     yield from examine_robot(config.robot, robot, clock, config.seconds, local)
 
 
-def _transport(config: DoctorSettings) -> str:
-    """Return the name of the transport; "" without a robot.
-
-    Raises:
-        ConfigurationError: An option would have no effect.
-    """
-    default = DoctorSettings()
-    if not config.robot:
-        options = ("transport", "state_check", "simulator", "seconds", "wire")
-        refuse(given(config, default, options), "without a robot only this computer is checked")
-        return ""
-    name = config.transport or default_transport(config.robot)
-    if config.simulator != "none":
-        refuse(given(config, default, ("state_check",)), f"{config.simulator} has no checksums")
-    return name
+def list_plug_ins() -> Iterator[Finding]:
+    """Yield the installed plug-ins, and why those are left out that cannot be used."""
+    for one in plug_ins():
+        if one.problem:
+            yield Finding("plug-ins", Severity.WARN, one.problem)
+        else:
+            yield Finding("plug-ins", Severity.OK, f"{one.kind} {one.name} ({one.origin})")
 
 
 def judge_interfaces(port: str) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ from deal_hw.workflows.emulation.settings import (
     CARTPOLE_RANGE_RATIO,
     ON_CAN,
     WITH_FIRMWARE,
-    EmulateSettings,
+    EmulateCartpoleSettings,
 )
 from deal_hw.workflows.say import Say, silent
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def emulate_cartpole(
-    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
+    config: EmulateCartpoleSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
 ) -> None:
     """Run the emulator until a stop, the given time or the end of its port.
 
@@ -43,7 +43,7 @@ def emulate_cartpole(
         say: Called with a summary at the end.
     """
     entry = robot_entry(config.robot)
-    wire = entry.wire(config.transport or entry.emulated_on[0])
+    wire = entry.wire(config.transport)
     try:
         make = entry.load(wire.emulator)
     except ModuleNotFoundError as error:
@@ -86,14 +86,14 @@ def emulate_cartpole(
     )
 
 
-def _truth(config: EmulateSettings) -> CartpoleTruth:
+def _truth(config: EmulateCartpoleSettings) -> CartpoleTruth:
     from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
     from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 
     return choose_truth(config, nominal_truth, draw_truth, CartpoleTruth.from_json, CARTPOLE_RANGE_RATIO)
 
 
-def _hazards(config: EmulateSettings) -> Hazards:
+def _hazards(config: EmulateCartpoleSettings) -> Hazards:
     import numpy as np
 
     from deal_hw.testing.faults import FaultRates, FrameFaults

@@ -133,7 +133,8 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
 
 def next_line(config: EmulateSettings, port: str) -> str:
     """Return the line that says how to reach an emulated robot."""
-    transport = f" --transport {config.transport}" if config.transport else ""
+    usual = type(config).transport
+    transport = "" if config.transport == usual else f" --transport {config.transport}"
     return f"next, in another terminal: deal-hw doctor {config.robot} --port {port}{transport}"
 
 

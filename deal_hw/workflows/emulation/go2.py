@@ -28,7 +28,7 @@ from deal_hw.workflows.emulation.common import (
     reveal,
     run_until,
 )
-from deal_hw.workflows.emulation.settings import EmulateSettings
+from deal_hw.workflows.emulation.settings import EmulateGo2Settings
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
 
 
 def emulate_go2(
-    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
+    config: EmulateGo2Settings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
 ) -> None:
     """Run the emulator until a stop or the given time.
 
@@ -64,7 +64,7 @@ def emulate_go2(
     device = _device(config, truth)
     transport = own_wire.name
     port = free_port(config.port or own_wire.emulator_port)
-    wire = make_topic_transport(transport, port, MonotonicClock(), config.go2.wire(transport))
+    wire = make_topic_transport(transport, port, MonotonicClock(), config.wire.on(transport))
     emulator = Go2Emulator(device, wire)
     gc.collect()
     gc.freeze()
@@ -174,13 +174,13 @@ def free_port(port: str) -> str:
         return f"{found['host']}:{probe.getsockname()[1]}"
 
 
-def _truth(config: EmulateSettings) -> Go2Truth:
+def _truth(config: EmulateGo2Settings) -> Go2Truth:
     from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Go2Truth, draw_truth, nominal_truth
 
     return choose_truth(config, nominal_truth, draw_truth, Go2Truth.from_json, DEFAULT_RANGE_RATIO)
 
 
-def _device(config: EmulateSettings, truth: Go2Truth) -> Go2Device:
+def _device(config: EmulateGo2Settings, truth: Go2Truth) -> Go2Device:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
-from deal_hw.robots import emulated_robots, robot_entry
-from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import CARTPOLE, File, Only, Ratio, Seed, Share, given, refuse, refuse_others
+from deal_hw.robots import emulated_robots
+from deal_hw.transport import NetworkOptions, WireOptions
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
+from deal_hw.workflows.options import File, Ratio, Seed, Share, given, refuse
 from deal_hw.workflows.robot import is_user_robot
-
-GO2 = Only(("go2",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,38 +47,26 @@ class Go2Options(Checked):
     """Write the true position of the base to this CSV file, at 100 Hz: time_s (the robot's clock), x, y [m],
     heading [rad]."""
 
-    domain: Annotated[int, Range(0, 232)] = 0
-    """DDS domain."""
+    faults: Go2Faults = field(default_factory=Go2Faults)
+    """Faults of the Go2. Their times count from the first stiff command."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EmulatorWireOptions(NetworkOptions):
+    """How an emulated Go2 joins its network, beyond the port."""
 
     mode: Literal["peer", "client"] = "peer"
     """Zenoh: peer waits for peers at the port, client connects to the router there."""
 
-    insecure: bool = False
-    """Zenoh: allow plain TCP beyond this machine."""
+    def __post_init__(self) -> None:
+        NetworkOptions.__post_init__(self)
+        check_ranges(self)
 
-    ca: Path | None = None
-    """Zenoh over TLS: the authority that signed the peers' certificates (PEM)."""
-
-    certificate: Path | None = None
-    """Zenoh over TLS: this side's certificate (PEM)."""
-
-    key: Path | None = None
-    """Zenoh over TLS: its private key (PEM)."""
-
-    faults: Go2Faults = field(default_factory=Go2Faults)
-    """Faults of the Go2. Their times count from the first stiff command."""
-
-    def wire(self, transport: str) -> WireOptions:
-        """Return how the emulator joins the wire."""
-        return WireOptions(
-            domain=self.domain,
-            listen=transport == "zenoh" and self.mode == "peer",
-            mode="" if transport == "dds" and self.mode == Go2Options.mode else self.mode,
-            insecure=self.insecure,
-            ca=self.ca,
-            certificate=self.certificate,
-            key=self.key,
-        )
+    def on(self, transport: str) -> WireOptions:
+        """Return the options of a transport."""
+        shared = {one.name: getattr(self, one.name) for one in fields(NetworkOptions)}
+        mode = "" if transport == "dds" and self.mode == "peer" else self.mode
+        return WireOptions(**shared, listen=transport == "zenoh" and self.mode == "peer", mode=mode)
 
 
 ON_CAN = ("can", "odrive")
@@ -90,19 +77,14 @@ CARTPOLE_RANGE_RATIO = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class EmulateSettings:
-    """Settings of :func:`deal_hw.emulate`."""
+class EmulateSettings(Checked):
+    """Emulate a robot in real time on its own port, with hidden physics."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """The robot to emulate: cartpole or go2."""
+    """The robot to emulate."""
 
-    transport: str | None = None
-    """The wire. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a pseudo-terminal.
-    Go2: "dds" (the default) or "zenoh"."""
-
-    port: Annotated[str | None, GO2] = None
-    """Go2: network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one).
-    By default reachable on this machine only."""
+    transport: str = ""
+    """The wire; by default the robot's usual one."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
@@ -120,14 +102,6 @@ class EmulateSettings:
 
     truth_from: File | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
-
-    firmware: Annotated[Literal["auto", "host", "python", "avr"], CARTPOLE] = "auto"
-    """Cart-pole on serial or CAN, and an ODrive's pole encoder: the firmware's C core compiled for this
-    computer (host), a copy in Python, or the image for the ATmega328P under simavr (avr, serial only). auto:
-    host, or python without a C compiler."""
-
-    link: Annotated[File | None, CARTPOLE] = None
-    """Make a symbolic link to the port here."""
 
     reveal: bool = False
     """At the end print the truth and the events as one line of JSON."""
@@ -157,13 +131,6 @@ class EmulateSettings:
     cut_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
     """How long the wire is cut [s]."""
 
-    vanish_after_s: Annotated[float | None, Range(0, 1e7, "s"), CARTPOLE] = None
-    """The port vanishes this long after the first arming of the motor, as when its cable is pulled [s]."""
-
-    return_after_s: Annotated[float | None, Range(0, 1e7, "s"), CARTPOLE] = None
-    """The port comes back under --link this long after it vanished [s]; by default the emulator ends when the
-    port vanishes."""
-
     events_to: File | None = None
     """Append each received command to this file at once: lines of JSON with device time [ms], host time [ns]
     and the command."""
@@ -171,54 +138,95 @@ class EmulateSettings:
     parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent. For programs that start an emulator."""
 
-    can: Annotated[CanFaults, CARTPOLE] = field(default_factory=CanFaults)
-    """The CAN bus of a cart-pole."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nominal and self.truth_from is not None:
+            raise ConfigurationError("--nominal and --truth-from exclude each other")
 
-    servo: Annotated[ServoFaults, CARTPOLE] = field(default_factory=ServoFaults)
-    """The servos of a cart-pole."""
 
-    go2: Annotated[Go2Options, GO2] = field(default_factory=Go2Options)
-    """Options of the Go2 alone."""
+@dataclass(frozen=True, kw_only=True)
+class EmulateCartpoleSettings(EmulateSettings):
+    """Emulate a cart-pole in real time on its own port, with hidden physics."""
+
+    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
+    """The wire; each is on a pseudo-terminal."""
+
+    firmware: Literal["auto", "host", "python", "avr"] = "auto"
+    """On serial or CAN, and an ODrive's pole encoder: the firmware's C core compiled for this computer
+    (host), a copy in Python, or the image for the ATmega328P under simavr (avr, serial only). auto: host, or
+    python without a C compiler."""
+
+    link: File | None = None
+    """Make a symbolic link to the port here."""
+
+    vanish_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The port vanishes this long after the first arming of the motor, as when its cable is pulled [s]."""
+
+    return_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The port comes back under --link this long after it vanished [s]; by default the emulator ends when the
+    port vanishes."""
+
+    can: CanFaults = field(default_factory=CanFaults)
+    """The CAN bus."""
+
+    servo: ServoFaults = field(default_factory=ServoFaults)
+    """The servos."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
-        if is_user_robot(self.robot):
-            raise ConfigurationError(
-                f"{self.robot}: deal-hw has no driver for this robot, so there is nothing to emulate; "
-                "`deal-hw collect robot.yaml --simulated` records its simulation"
-            )
-        wires = emulated_wires(self.robot)
-        if self.transport is not None and self.transport not in wires:
-            raise UnknownNameError("transport to emulate on", self.transport, wires)
-        refuse_others(self, "emulate", self.robot)
-        wire = self.transport or wires[0]
-        if wire not in ON_CAN:
+        super().__post_init__()
+        if self.transport not in ON_CAN:
             refuse(given(self.can, CanFaults()), "only `--transport can` and `odrive` have a CAN bus")
-        if wire != "dynamixel":
+        if self.transport != "dynamixel":
             refuse(given(self.servo, ServoFaults()), "only `--transport dynamixel` has servos")
-        if wire not in WITH_FIRMWARE:
+        if self.transport not in WITH_FIRMWARE:
             refuse(
-                given(self, EmulateSettings, ["firmware"]),
+                given(self, EmulateCartpoleSettings, ["firmware"]),
                 "only `--transport serial`, `can` and `odrive` have this firmware",
             )
-        if wire in ON_CAN and self.firmware == "avr":
+        if self.transport in ON_CAN and self.firmware == "avr":
             raise ConfigurationError(
                 "the ATmega328P has no CAN controller; use --firmware host or python, or --transport serial"
             )
-        if self.nominal and self.truth_from is not None:
-            raise ConfigurationError("--nominal and --truth-from exclude each other")
         if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
             raise ConfigurationError(
                 "--return-after-s needs --vanish-after-s and --link: the new port has another name"
             )
 
 
-def emulated_wires(robot: str) -> tuple[str, ...]:
-    """Return the wires on which a robot can be emulated; the first is the default.
+@dataclass(frozen=True, kw_only=True)
+class EmulateGo2Settings(EmulateSettings):
+    """Emulate a Go2 in real time on its own network, with hidden physics."""
 
-    Raises:
-        UnknownNameError: It has no emulator.
-    """
-    if robot not in (known := emulated_robots()):
-        raise UnknownNameError("robot to emulate", robot, known)
-    return robot_entry(robot).emulated_on
+    transport: Literal["dds", "zenoh"] = "dds"
+    """The wire."""
+
+    port: str | None = None
+    """Network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one). By
+    default reachable on this machine only."""
+
+    go2: Go2Options = field(default_factory=Go2Options)
+    """Options of the Go2 alone."""
+
+    wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
+    """How it joins its network."""
+
+
+_SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettings, "go2": EmulateGo2Settings}
+
+
+def _table() -> dict[str, InputKind]:
+    return {name: InputKind(_SETTINGS.get(name, EmulateSettings)) for name in emulated_robots()}
+
+
+def _find(arguments: Arguments) -> str:
+    name = "cartpole" if arguments.first is None else str(arguments.first)
+    if is_user_robot(name):
+        raise ConfigurationError(
+            f"{name}: deal-hw has no driver for this robot, so there is nothing to emulate; "
+            "`deal-hw collect robot.yaml --simulated` records its simulation"
+        )
+    return name
+
+
+EMULATE = Kinds(noun="robot to emulate", argument="robot", table=_table, find=_find)
+"""The kinds of :func:`deal_hw.emulate`; without a robot it emulates a cart-pole."""

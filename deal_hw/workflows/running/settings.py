@@ -6,28 +6,21 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from deal_hw.description import RobotDescription
-from deal_hw.documentation import page
-from deal_hw.errors import ConfigurationError
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.ranges import Checked, option
 from deal_hw.robots import default_transport, driver_description
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import GO2, File, given, refuse
-from deal_hw.workflows.robot import is_user_robot
+from deal_hw.workflows.options import FROM_PYTHON, File, given, refuse
 from deal_hw.workflows.say import Say, silent
 
 
 @dataclass(frozen=True, kw_only=True)
-class LegOptions:
+class StandOptions:
     """Options of a robot with legs."""
 
     stand: bool | None = None
     """Whether to stand up first and lie down at the end; by default True if the robot has a rest pose. A
     recording that did both is replayed without."""
-
-    velocity: str = "0,0,0"
-    """Requested velocity of a walking policy: ahead, left, turn, such as 0.3,0,0 [m/s, m/s, rad/s]; or remote
-    (the robot's own), keyboard, or a CSV file with the columns time_s,x,y,yaw."""
 
     hand_back: bool = False
     """Return the robot to its own controller at the end (Go2: the sport service)."""
@@ -44,42 +37,55 @@ class LegOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LegOptions(StandOptions):
+    """Options of a robot with legs that may walk."""
+
+    velocity: str = "0,0,0"
+    """Requested velocity of a walking policy: ahead, left, turn, such as 0.3,0,0 [m/s, m/s, rad/s]; or remote
+    (the robot's own), keyboard, or a CSV file with the columns time_s,x,y,yaw."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class LinkOptions(Checked):
     """The connection to the robot, beyond the port."""
 
     transport: str = ""
-    """The transport. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the default) or
-    zenoh."""
-
-    state_check: Annotated[Literal["strict", "length"], GO2] = "strict"
-    """How to check a Go2's state messages: strict (length, head and checksum), or length alone, for firmware
-    or simulators with another head or checksum. With length alone corrupted states are not detected."""
-
-    simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
-    """The simulator that runs in place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and
-    battery. A real robot is then refused."""
+    """The transport; by default the robot's usual one."""
 
     record_wire: bool = True
     """Also record the raw bytes."""
 
-    wire: Annotated[WireOptions, GO2] = field(default_factory=WireOptions)
+
+@dataclass(frozen=True, kw_only=True)
+class CartpoleLinkOptions(LinkOptions):
+    """The connection to a cart-pole, beyond the port."""
+
+    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
+    """The transport."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Go2LinkOptions(LinkOptions):
+    """The connection to a Go2, beyond the port."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """The transport."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """How to check a Go2's state messages: strict (length, head and checksum), or length alone, for firmware
+    or simulators with another head or checksum. With length alone corrupted states are not detected."""
+
+    simulator: Literal["none", "unitree_mujoco"] = "none"
+    """The simulator that runs in place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and
+    battery. A real robot is then refused."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
     """Network options."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(Checked):
-    """Options of every verb that runs a robot."""
-
-    port: str
-    """The robot's port: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
-    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds), or an end point such as
-    tcp/127.0.0.1:7447 (zenoh)."""
-
-    link: LinkOptions = field(default_factory=LinkOptions)
-    """The connection to the robot, beyond the port."""
-
-    legs: Annotated[LegOptions, GO2] = field(default_factory=LegOptions)
-    """Options of a robot with legs."""
+class RecordOptions(Checked):
+    """Where a run is recorded."""
 
     out: File | None = None
     """Run folder; the episodes go to OUT/dataset. `collect` needs it, or --dataset. By default `deploy`
@@ -88,9 +94,50 @@ class RunOptions(Checked):
     dataset: File | None = None
     """Dataset folder instead of OUT/dataset; new episodes are added to it."""
 
-    say: Say = silent
+    say: Annotated[Say, FROM_PYTHON] = silent
     """From Python: called with messages; ``print`` shows them. By default only warnings are printed, on
     standard error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(RecordOptions):
+    """Options of every verb that runs a robot."""
+
+    port: str
+    """The robot's port, such as a serial port or an end point of a network."""
+
+    link: LinkOptions = field(default_factory=LinkOptions)
+    """The connection to the robot, beyond the port."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CartpoleRunOptions(RunOptions):
+    """Options of every verb that runs a cart-pole."""
+
+    port: str
+    """The robot's port: a serial port such as /dev/ttyUSB0, or a CAN bus such as can0 or
+    slcan:/dev/ttyACM0?bitrate=500000&node=1."""
+
+    link: CartpoleLinkOptions = field(default_factory=CartpoleLinkOptions)
+    """The connection to the robot, beyond the port."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Go2RunOptions(RunOptions):
+    """Options of every verb that runs a Go2."""
+
+    port: str
+    """The robot's port: a network interface such as enp2s0 (dds), or an end point such as
+    tcp/127.0.0.1:7447 (zenoh)."""
+
+    link: Go2LinkOptions = field(default_factory=Go2LinkOptions)
+    """The connection to the robot, beyond the port."""
+
+
+def legs_of(options: RunOptions) -> StandOptions | None:
+    """Return the options of a robot with legs; None for a robot without."""
+    legs: StandOptions | None = getattr(options, "legs", None)
+    return legs
 
 
 def refuse_unrecorded(options: RunOptions, record: bool) -> None:
@@ -101,64 +148,63 @@ def refuse_unrecorded(options: RunOptions, record: bool) -> None:
     """
     if not record:
         names = [name for name in ("out", "dataset") if getattr(options, name) is not None]
-        wire = given(options.link, LinkOptions(), ["record_wire"])
+        wire = given(options.link, LinkOptions, ["record_wire"])
         refuse([*map(option, names), *wire], "--no-record writes no file")
 
 
-def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:
+def plan_options(
+    robot: str, link: LinkOptions, legs: StandOptions | None = None, *, walks: bool = True
+) -> dict[str, Any]:
     """Return the fields of a :class:`~deal_hw.workflows.running.plan.RunPlan` that follow from the options.
 
     Args:
         robot: The robot's name.
         link: The connection.
-        legs: Options of a robot with legs.
+        legs: Options of a robot with legs; None for a robot without.
         walks: Whether a policy runs that takes a requested velocity.
 
     Raises:
         UnknownNameError: There is no such robot.
         ConfigurationError: It has a description, but no driver; or an option would have no effect.
     """
-    if is_user_robot(robot):
-        raise ConfigurationError(
-            f"{robot}: deal-hw has no driver for this robot; {page('how-to/add.md')} shows how to write one"
-        )
     description = driver_description(robot)
+    options = {
+        "robot": robot,
+        "transport": link.transport or default_transport(robot),
+        "record_wire": link.record_wire,
+        "robot_settings": _settings(link, legs),
+    }
+    if isinstance(link, Go2LinkOptions):
+        options["wire"] = link.wire
+    if legs is None:
+        return {**options, "stand": False}
     stands = _stands(description) if legs.stand is None else legs.stand
-    if not description.rest_position:
-        refuse(given(legs, LegOptions()), f"only for robots with legs, and robot {robot!r} has none")
-    if not walks:
-        refuse(given(legs, LegOptions(), ["velocity"]), "no walking policy runs here")
-    if link.simulator != "none":
+    if isinstance(legs, LegOptions):
+        if not walks:
+            refuse(given(legs, LegOptions(), ["velocity"]), "no walking policy runs here")
+        options["velocity"] = legs.velocity
+    if isinstance(link, Go2LinkOptions) and link.simulator != "none":
         refuse(
-            [*given(link, LinkOptions(), ["state_check"]), *given(legs, LegOptions(), ["hand_back"])],
+            [*given(link, Go2LinkOptions(), ["state_check"]), *given(legs, StandOptions(), ["hand_back"])],
             f"{link.simulator} has neither checksums nor a controller of its own",
         )
     if not stands:
-        refuse(given(legs, LegOptions(), ["posture"]), "the robot neither stands up nor lies down")
-    return {
-        "robot": robot,
-        "transport": link.transport or default_transport(robot),
-        "wire": link.wire,
-        "record_wire": link.record_wire,
-        "stand": stands,
-        "velocity": legs.velocity,
-        "hand_back": legs.hand_back,
-        "posture": legs.posture,
-        "robot_settings": _settings(link, legs),
-    }
+        refuse(given(legs, StandOptions(), ["posture"]), "the robot neither stands up nor lies down")
+    return {**options, "stand": stands, "hand_back": legs.hand_back, "posture": legs.posture}
 
 
-def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
+def _settings(link: LinkOptions, legs: StandOptions | None) -> dict[str, Any]:
     """Return the given settings of the driver; a driver without such a setting refuses it."""
-    own = (
-        (legs, LegOptions, ("stop_buttons", "support_check")),
-        (link, LinkOptions, ("state_check", "simulator")),
+    own: tuple[tuple[Any, Any, tuple[str, ...]], ...] = (
+        (legs, StandOptions, ("stop_buttons", "support_check")),
+        (link, Go2LinkOptions, ("state_check", "simulator")),
     )
     return {
         name: getattr(options, name)
-        for options, default, names in own
+        for options, settings, names in own
+        if isinstance(options, settings)
         for name in names
-        if getattr(options, name) != getattr(default, name)
+        if getattr(options, name) != getattr(settings, name)
     }
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import signal
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
@@ -17,10 +17,10 @@ from deal_hw.data.recording.record import CycleRecord
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.ranges import Checked, Range
-from deal_hw.robots import driver_description
 from deal_hw.version import __version__
-from deal_hw.workflows.options import File, Ratio, Seed, given, refuse
-from deal_hw.workflows.robot import default_space, is_user_robot, user_robot
+from deal_hw.workflows.options import File, Ratio, Seed
+from deal_hw.workflows.robot import default_space, user_robot
+from deal_hw.workflows.robot_kinds import NO_DRIVER
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.supervised import InterruptedRunError, play_episodes
@@ -54,49 +54,14 @@ class SimulationOptions(Checked):
     """Simulated: write the hidden truth to this JSON file."""
 
 
-class Simulable(Protocol):
-    """Settings of a verb that runs a robot or its simulation."""
-
-    @property
-    def port(self) -> str:
-        """The robot's port."""
-        ...
-
-    @property
-    def simulation(self) -> SimulationOptions:
-        """Whether the robot is simulated."""
-        ...
-
-
-def check_simulation(config: Simulable, default: Simulable) -> None:
-    """Refuse options of a real robot in a simulation, and the reverse.
+def require_simulation(robot: str, options: SimulationOptions) -> None:
+    """Check that the simulation of a user's robot is asked for: the robot itself has no driver.
 
     Raises:
-        ConfigurationError: An option would have no effect.
+        ConfigurationError: It is not.
     """
-    if config.simulation.simulated:
-        refuse(["--port"] if config.port else [], "--simulated needs no wire")
-        refuse(given(config, default, ("link", "legs")), "--simulated needs no wire and has no legs")
-    else:
-        refuse(given(config.simulation, SimulationOptions()), "only with --simulated")
-
-
-def require_driver(robot: str, port: str) -> None:
-    """Check that a robot has a driver and a port.
-
-    Raises:
-        UnknownNameError: There is no such robot.
-        ConfigurationError: It is a user's robot, without a driver, or no port was given.
-    """
-    if is_user_robot(robot):
-        raise ConfigurationError(
-            f"{robot}: deal-hw has no driver for this robot; record its simulation with --simulated, or "
-            "import recordings of it: deal-hw data import"
-        )
-    # An unknown name is reported before a missing port.
-    driver_description(robot)
-    if not port:
-        raise ConfigurationError("no port is given: name the robot's port, such as --port /dev/ttyUSB0")
+    if not options.simulated:
+        raise ConfigurationError(f"{robot}: {NO_DRIVER}")
 
 
 def run_simulated(
@@ -129,7 +94,7 @@ def run_simulated(
     try:
         from deal_hw.data.recording.dataset import Dataset
         from deal_hw.sim.engine.model import load_model
-        from deal_hw.sim.robots.carried import carry
+        from deal_hw.sim.robots.dataset_robot import store_robot
         from deal_hw.sim.robots.simulated import SimulatedRobot, draw_truth
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "sim") from err
@@ -143,7 +108,7 @@ def run_simulated(
     make_behaviour(plan, description)
     reports: list[EpisodeReport] = []
     with Dataset.create_or_open(dataset, description, view.warn) as store:
-        carry(own, dataset)
+        store_robot(own, dataset)
 
         def run_one(episode: RunPlan, number: int, attempt: int) -> EpisodeReport:
             clock = VirtualClock(_START_NS)

@@ -28,7 +28,7 @@ INDEX: Final = "files.json"
 AGAIN: Final = "copy the folder back, or import the recordings again with --robot robot.yaml"
 
 
-def carry(robot: UserRobot, dataset: Path) -> None:
+def store_robot(robot: UserRobot, dataset: Path) -> None:
     """Copy a robot into a dataset; an existing one must be the same.
 
     Raises:
@@ -54,7 +54,7 @@ def carry(robot: UserRobot, dataset: Path) -> None:
         raise DatasetError(f"{dataset / FOLDER} cannot be written: {error.strerror}") from error
 
 
-def carried_description(dataset: Path, values: Mapping[str, Any]) -> RobotDescription:
+def stored_description(dataset: Path, values: Mapping[str, Any]) -> RobotDescription:
     """Return the description of a dataset's recordings, with the dataset's MJCF.
 
     Args:

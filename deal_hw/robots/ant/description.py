@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.drivers.ant.model import ANKLE_HOME_RAD, GEAR_NM, LEG_NUMBERS, MODEL, STEP_S
-from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.robots.ant.model import ANKLE_HOME_RAD, GEAR_NM, LEG_NUMBERS, MODEL, STEP_S
+from deal_hw.robots.prepared import simulated_limits
 
 JOINTS: Final = tuple(f"{part}_{i}" for i in LEG_NUMBERS for part in ("hip", "ankle"))
 HIPS: Final = tuple(f"hip_{i}" for i in LEG_NUMBERS)

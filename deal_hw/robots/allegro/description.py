@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.robots.prepared import simulated_limits
 
 FINGERS: Final = ("index", "middle", "ring", "thumb")
 NUMBERS: Final = range(4)
@@ -42,7 +42,7 @@ THUMB_MASS_KG: Final = (0.018, 0.012, 0.038, 0.060)
 FRICTION: Final = 1.0
 RESTITUTION: Final = 0.04
 """Table 10 has 0.01, which cannot be distinguished from 0.002 (see
-``drivers.ant.description.paper_space``)."""
+``deal_hw.robots.ant.description.paper_space``)."""
 PAPER_RESTITUTION: Final = 0.01
 
 DESCRIPTION: Final = RobotDescription(

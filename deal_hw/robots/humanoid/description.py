@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.drivers.humanoid.model import FEET, FIELDS, JOINTS, MODEL, STEP_S, joint_type
-from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.robots.humanoid.model import FEET, FIELDS, JOINTS, MODEL, STEP_S, joint_type
+from deal_hw.robots.prepared import simulated_limits
 
 GEAR_NM: Final[Mapping[str, float]] = {
     **dict.fromkeys(("abdomen_y", "abdomen_z", "abdomen_x", "hip_x", "hip_z", "elbow"), 40.0),
@@ -38,7 +38,7 @@ TABLE_11: Final[Mapping[str, tuple[float, float, float, float]]] = {
 """DEAL, Table 11: dry friction [N·m], damping [N·m·s/rad], armature [kg·m²], stiffness [N·m/rad]."""
 FRICTION: Final = 1.0
 RESTITUTION: Final = 0.04
-"""Table 11 has 0.01; motion does not distinguish 0.002 (``drivers.ant.description.paper_space``)."""
+"""Table 11 has 0.01; motion does not distinguish 0.002 (``deal_hw.robots.ant.description.paper_space``)."""
 PAPER_RESTITUTION: Final = 0.01
 KINDS: Final = {
     "frictionloss": ("dof_frictionloss", "N·m"),

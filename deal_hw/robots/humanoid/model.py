@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from deal_hw.drivers.prepared import PublishedModel, find
+from deal_hw.robots.prepared import PublishedModel, find
 
 STEP_S: Final = 0.005
 HOME_HEIGHT_M: Final = 1.29

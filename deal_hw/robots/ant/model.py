@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from typing import Final
 
-from deal_hw.drivers.prepared import PublishedModel, find, package_file
+from deal_hw.robots.prepared import PublishedModel, find, package_file
 
 LEG_NUMBERS: Final = (1, 2, 3, 4)
 STEP_S: Final = 0.005

@@ -1,0 +1,82 @@
+"""``deal-hw emulate`` of a robot whose emulator a plug-in brings: how it runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from deal_hw.robots import reached_over, robot_entry
+from deal_hw.robots.emulation import Emulation, EmulatorRequest
+from deal_hw.testing.faults import FaultRates
+from deal_hw.workflows.emulation.common import (
+    happenings,
+    next_line,
+    read_truth,
+    realtime_priority,
+    reveal,
+    run_until,
+)
+from deal_hw.workflows.emulation.settings import EmulateSettings
+from deal_hw.workflows.say import Say, silent
+
+
+def emulate_plug_in(
+    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say
+) -> None:
+    """Run the emulator until a stop, the given time or the end of its port.
+
+    Args:
+        config: What to emulate.
+        stop: Ends it.
+        cut: Cuts the wire.
+        announce: Called with the port first, and with the truth at the end.
+
+    Raises:
+        ConfigurationError: The robot has no emulator on this wire.
+    """
+    wire = config.transport or robot_entry(config.robot).emulated_on[0]
+    entry, chosen = reached_over(config.robot, wire)
+    emulation: Emulation = entry.load(chosen.emulator)(_request(config, wire))
+    try:
+        port = emulation.open()
+        announce(f"port {port}")
+        announce(f"profile {config.profile}, seed {config.seed}; Ctrl-C ends")
+        announce(next_line(config, port))
+        with realtime_priority(), happenings(config.events_to, emulation.changes) as tell:
+
+            def step() -> bool:
+                if cut.is_set():
+                    cut.clear()
+                    emulation.cut()
+                going_on = emulation.step()
+                tell()
+                return going_on
+
+            run_until(step, stop, config.duration_s, config.parent)
+    finally:
+        emulation.close()
+        reveal(emulation.report(), announce if config.reveal else silent, _path(config.reveal_to))
+
+
+def _request(config: EmulateSettings, wire: str) -> EmulatorRequest:
+    truth: Mapping[str, Any] | None = None
+    if config.truth_from is not None:
+        truth = read_truth(Path(config.truth_from), dict)
+    return EmulatorRequest(
+        wire=wire,
+        profile=config.profile,
+        seed=config.seed,
+        range_ratio=config.range_ratio,
+        nominal=config.nominal,
+        truth=truth,
+        rates=FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate),
+        freeze_after_s=config.freeze_after_s,
+        cut_after_s=config.cut_after_s,
+        cut_s=config.cut_s,
+    )
+
+
+def _path(path: Path | str | None) -> Path | None:
+    return None if path is None else Path(path)

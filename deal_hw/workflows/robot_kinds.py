@@ -1,0 +1,84 @@
+"""The kinds of a verb that takes a robot: those with settings of their own, plug-ins, and a robot.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.robots import driven_robots, driver_description
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
+from deal_hw.workflows.robot import is_user_robot
+
+FILE = "robot.yaml"
+"""The kind of a robot.yaml, and of a dataset that carries its robot."""
+
+
+NO_DRIVER = (
+    "deal-hw has no driver for this robot; record its simulation with --simulated, or import recordings of "
+    "it: deal-hw data import"
+)
+
+
+def robot_kinds(
+    own: Mapping[str, type[Any]],
+    *,
+    plain: type[Any],
+    legged: type[Any],
+    file: type[Any] | None = None,
+    no_file: str = "",
+    nothing: type[Any] | None = None,
+) -> Kinds:
+    """Return the kinds of a verb whose first argument is a robot.
+
+    Args:
+        own: Robots with settings of their own -> the settings.
+        plain: Settings of another robot, such as one of a plug-in.
+        legged: Those of another robot with legs.
+        file: Those of a robot.yaml; None where the verb takes none.
+        no_file: What such a robot is told then, behind "deal-hw has no driver for this robot".
+        nothing: Settings without a robot; None where the verb needs one.
+    """
+
+    def table() -> Mapping[str, InputKind]:
+        found = {} if nothing is None else {"": InputKind(nothing)}
+        for name in driven_robots():
+            found[name] = InputKind(own.get(name) or (legged if has_legs(name) else plain))
+        return found if file is None else {**found, FILE: InputKind(file)}
+
+    def find(arguments: Arguments) -> str:
+        if file is not None and "port" in arguments.options and is_user_robot(str(arguments.first or "")):
+            raise ConfigurationError(f"{arguments.first}: {NO_DRIVER}")
+        return robot_kind("" if arguments.first is None else str(arguments.first), file is not None, no_file)
+
+    return Kinds(noun="robot", argument="robot", table=table, find=find)
+
+
+def robot_kind(name: str, files: bool, no_file: str = "") -> str:
+    """Return the kind of a robot.
+
+    Args:
+        name: The robot: a name, a robot.yaml, or a dataset; empty if none is given.
+        files: Whether the verb takes a robot.yaml.
+        no_file: See :func:`robot_kinds`.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver; or it is a file that the verb does not take.
+    """
+    if is_user_robot(name):
+        if not files:
+            raise ConfigurationError(f"{name}: deal-hw has no driver for this robot{no_file}")
+        return FILE
+    if name and name not in driven_robots():
+        driver_description(name)
+    return name
+
+
+def has_legs(name: str) -> bool:
+    """Return whether a robot has a rest pose, from which it stands up."""
+    try:
+        return bool(driver_description(name).rest_position)
+    except DealHwError:
+        # A plug-in that cannot be imported is reported where it is used.
+        return False

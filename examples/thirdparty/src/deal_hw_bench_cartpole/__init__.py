@@ -1,0 +1,1 @@
+"""A bench cart-pole of others as a robot of deal-hw."""

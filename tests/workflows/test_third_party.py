@@ -1,0 +1,152 @@
+"""The package of examples/thirdparty, installed beside deal-hw: its robot and its transport in every verb."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import tty
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deal_hw.workflows.emulation.process import EmulatorProcess
+
+pytestmark = pytest.mark.real_time
+
+SOURCE = Path(__file__).resolve().parents[2] / "examples" / "thirdparty"
+ROBOT = "bench_cartpole"
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Install the package into a folder on the path of child processes; this process does not see it."""
+    folder = tmp_path_factory.mktemp("installed")
+    # A copy: building writes beside the sources.
+    copy = shutil.copytree(SOURCE, folder / "source", ignore=shutil.ignore_patterns("build", "*.egg-info"))
+    target = folder / "packages"
+    options = ["--no-build-isolation", "--no-deps", "--no-index", "--quiet", "--target", str(target)]
+    command = [sys.executable, "-m", "pip", "install", *options, str(copy)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(target), os.environ.get("PYTHONPATH", "")]))
+        yield target
+
+
+def deal_hw(*words: object) -> str:
+    """Run a verb in its own process and return what it prints; it must succeed."""
+    command = [sys.executable, "-m", "deal_hw", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A dataset of the robot, and the emulator's report of the same run."""
+
+    dataset: Path
+    truth: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def recorded(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Emulate the robot, and record it with the real control process."""
+    out = tmp_path_factory.mktemp("run")
+    with EmulatorProcess(ROBOT, "--seed", "1", "--reveal") as emulator:
+        checked = deal_hw("doctor", ROBOT, "--port", emulator.port, "--seconds", 0.5)
+        assert f"{ROBOT} answers" in checked and "states a second of 50" in checked
+        assert f"robot {ROBOT} (deal-hw-bench-cartpole 0.1.0)" in checked
+        motion = ["--excite", "multisine", "--seconds", 6]
+        deal_hw("collect", ROBOT, "--port", emulator.port, "--out", out, *motion)
+        output, _ = emulator.stop()
+    return Recorded(out / "dataset", json.loads(output.splitlines()[-1]))
+
+
+def test_it_is_emulated_examined_and_recorded(recorded: Recorded) -> None:
+    """The emulated motor followed the commands and was switched off; the recording holds the run."""
+    modes = [what for _, _, what in recorded.truth["changes"]]
+    assert modes[0] == "homing" and "armed" in modes
+    assert recorded.truth["last_mode"] == "idle"
+    shown = deal_hw("data", "info", recorded.dataset)
+    assert ROBOT in shown
+
+
+@pytest.mark.slow
+def test_its_recording_is_calibrated(recorded: Recorded) -> None:
+    """Mass and friction of the cart are those that the emulator had hidden."""
+    deal_hw("calibrate", recorded.dataset, "--threads", 1)
+    result = json.loads((recorded.dataset.parent / "calibration" / "result.json").read_text())
+    found = {name: entry["estimate"] for name, entry in result["parameters"].items()}
+    assert found["cart.damping"] == pytest.approx(recorded.truth["friction"], rel=0.05)
+    assert found["cart.mass"] == pytest.approx(recorded.truth["cart_kg"], rel=0.1)
+
+
+def test_its_transport_reaches_the_robot(installed: Path, tmp_path: Path) -> None:
+    """The same bytes through TCP; the control process goes on with the connection that its parent opened."""
+    with EmulatorProcess(ROBOT, "--seed", "2") as emulator, forwarded(emulator.port) as port:
+        wire = ["--transport", "tcp", "--port", port]
+        assert f"{ROBOT} answers" in deal_hw("doctor", ROBOT, *wire, "--seconds", 0.5)
+        deal_hw("collect", ROBOT, *wire, "--out", tmp_path, "--motion", "hold", "--seconds", 1)
+    assert [path.name for path in (tmp_path / "dataset" / "episodes").iterdir()] == ["000000.mcap"]
+
+
+@pytest.mark.slow
+def test_its_own_tests_pass(installed: Path) -> None:
+    """They inherit deal-hw's contract suites."""
+    command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--import-mode=importlib"]
+    command += ["-p", "no:cacheprovider", "--rootdir", str(SOURCE), str(SOURCE / "tests")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@contextlib.contextmanager
+def forwarded(serial_port: str) -> Iterator[str]:
+    """Serve a serial port on TCP, one connection after the other, as a serial server does."""
+    fd = os.open(serial_port, os.O_RDWR | os.O_NOCTTY)
+    tty.setraw(fd)
+    end, wake = socket.socketpair()
+    with socket.create_server(("127.0.0.1", 0)) as listener, end, wake:
+
+        def serve() -> None:
+            link: socket.socket | None = None
+            while True:
+                sources: list[Any] = [end, listener, fd, *([link] if link else [])]
+                ready = select.select(sources, [], [])[0]
+                if end in ready:
+                    break
+                if listener in ready:
+                    link = listener.accept()[0]
+                if fd in ready and (data := os.read(fd, 4096)) and link is not None:
+                    with contextlib.suppress(OSError):
+                        link.sendall(data)
+                if link is not None and link in ready:
+                    received = b""
+                    with contextlib.suppress(OSError):
+                        received = link.recv(4096)
+                    if received:
+                        os.write(fd, received)
+                    else:
+                        link.close()
+                        link = None
+            if link is not None:
+                link.close()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield f"127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            wake.send(b"x")
+            thread.join()
+            os.close(fd)
