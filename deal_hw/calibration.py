@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.errors import ConfigurationError, shown
 from deal_hw.findings import Finding
 from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterDistribution, ParameterSpace
-from deal_hw.reading import number, numbers, object_of, read_json, reading, texts
-from deal_hw.schema import from_values
+from deal_hw.reading import number, numbers, read_json, reading
+from deal_hw.schema import OPEN, from_values
 from deal_hw.types import FloatArray
 
 LATENCY_RANGE_S = (0.0, 0.04)
@@ -224,56 +225,96 @@ class CalibrationResult:
             ConfigurationError: A field is of another kind or shape; the message names it.
         """
         if values.get("format") != RESULT_FORMAT:
-            found = shown(values.get("format"))
-            raise ConfigurationError(f"not a calibration result: format is {found}, not {RESULT_FORMAT!r}")
-        space = ParameterSpace.from_json(values["space"])
+            given = shown(values.get("format"))
+            raise ConfigurationError(f"not a calibration result: format is {given}, not {RESULT_FORMAT!r}")
+        found = from_values(_ResultFile, values)
+        space = ParameterSpace(found.space)
         K = len(space)
-        rows = [object_of(values["parameters"][name], f"parameter {shown(name)}") for name in space.names]
-        covariance = values["covariance"]
-        verdicts = tuple(row["verdict"] for row in rows) if rows and rows[0]["verdict"] else ()
-        if unknown := [v for v in verdicts if v not in get_args(Identifiability)]:
-            raise UnknownNameError("verdict", shown(unknown[0]), get_args(Identifiability))
-        low_s, high_s = numbers(values["latency_interval_s"], "latency_interval_s", (2,), finite=False)
+        if missing := [name for name in space.names if name not in found.parameters]:
+            raise ConfigurationError(f"field parameters.{missing[0]} is missing")
+        rows = [found.parameters[name] for name in space.names]
+        bounds = [[row.low, row.high] for row in rows] if K else np.empty((0, 2))
+        low_s, high_s = numbers(found.latency_interval_s, "latency_interval_s", (2,), finite=False)
         return cls(
-            method=texts([values["method"]], "method")[0],
+            method=found.method,
             space=space,
-            estimate=numbers([row["estimate"] for row in rows], "estimate", (K,)),
-            interval=numbers([[row["low"], row["high"]] for row in rows], "interval", (K, 2), finite=False)
-            if rows
-            else np.empty((0, 2)),
+            estimate=numbers([row.estimate for row in rows], "estimate", (K,)),
+            interval=numbers(bounds, "interval", (K, 2), finite=False),
             covariance=None
-            if covariance is None
-            else numbers(covariance, "covariance", (K, K), finite=False),
-            verdicts=verdicts,
-            null_directions=texts(values["null_directions"], "null_directions"),
-            latency_s=number(values["latency_s"], "latency_s", 0.0, LONGEST_LATENCY_S),
+            if found.covariance is None
+            else numbers(found.covariance, "covariance", (K, K), finite=False),
+            verdicts=tuple(row.verdict for row in rows if row.verdict is not None),
+            null_directions=found.null_directions,
+            latency_s=number(found.latency_s, "latency_s", 0.0, LONGEST_LATENCY_S),
             latency_interval_s=(float(low_s), float(high_s)),
-            chi2=float(numbers(values["chi2"], "chi2", (), finite=False)),
-            alarms=_alarms(values["alarms"]),
-            biased=from_values(dict[str, dict[str, str]], {"biased": values.get("biased", {})})["biased"],
-            advice=tuple(object_of(row, "advice") for row in values.get("advice", ())),
-            heldout_nrmse={
-                name: float(numbers(value, "heldout_nrmse", (), finite=False))
-                for name, value in object_of(values["heldout_nrmse"], "heldout_nrmse").items()
-            },
-            steps=int(number(values["steps"], "steps", 0.0)),
-            seconds=number(values["seconds"], "seconds", 0.0),
-            provenance=object_of(values["provenance"], "provenance"),
+            chi2=_number(found.chi2),
+            alarms=tuple(Finding.alarm(alarm.seen, alarm.means, alarm.do) for alarm in found.alarms),
+            biased=found.biased,
+            advice=found.advice,
+            heldout_nrmse={name: _number(value) for name, value in found.heldout_nrmse.items()},
+            steps=int(number(found.steps, "steps", 0.0)),
+            seconds=number(found.seconds, "seconds", 0.0),
+            provenance=found.provenance,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class _AlarmText:
-    """An alarm as result.json has it."""
+class _Row:
+    """A parameter of a result's file; a number is null where it is not finite."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
+
+    estimate: float
+    low: float | None
+    high: float | None
+    verdict: Identifiability | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Alarm:
+    """An alarm of a result's file."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
     seen: str
     means: str
     do: str
 
+    def __post_init__(self) -> None:
+        Finding.alarm(self.seen, self.means, self.do)
 
-def _alarms(values: Any) -> tuple[Finding, ...]:
-    found = from_values(dict[str, list[_AlarmText]], {"alarms": values})["alarms"]
-    return tuple(Finding.alarm(a.seen, a.means, a.do) for a in found)
+
+@dataclass(frozen=True, slots=True)
+class _ResultFile:
+    """A result as its file has it."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
+
+    method: str
+    space: tuple[Parameter, ...]
+    parameters: dict[str, _Row]
+    covariance: list[list[float | None]] | None
+    null_directions: tuple[str, ...]
+    latency_s: float
+    latency_interval_s: tuple[float | None, float | None]
+    chi2: float | None
+    alarms: tuple[_Alarm, ...]
+    heldout_nrmse: dict[str, float | None]
+    steps: float
+    seconds: float
+    provenance: dict[str, Any]
+    biased: dict[str, str] = field(default_factory=dict)
+    # Results from before advice existed have none.
+    advice: tuple[dict[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        told = [name for name, row in self.parameters.items() if row.verdict is not None]
+        if told and len(told) < len(self.parameters):
+            raise ConfigurationError("some of the parameters have a verdict and others have none")
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def read_result(path: Path) -> CalibrationResult:

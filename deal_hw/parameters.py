@@ -18,7 +18,7 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
 from deal_hw.reading import numbers
-from deal_hw.schema import FINITE, from_values
+from deal_hw.schema import FINITE, OPEN, from_values
 from deal_hw.types import FloatArray
 
 Scale = Literal["log", "linear"]
@@ -353,18 +353,20 @@ class ParameterDistribution:
             ConfigurationError: A field cannot give draws that are finite; the message names it.
         """
         if values.get("format") != FORMAT:
-            found = shown(values.get("format"))
-            raise ConfigurationError(f"not a parameter distribution: format is {found}, not {FORMAT!r}")
-        space = ParameterSpace.from_json(values["space"])
+            given = shown(values.get("format"))
+            raise ConfigurationError(f"not a parameter distribution: format is {given}, not {FORMAT!r}")
+        found = from_values(_DistributionFile, values)
+        space = ParameterSpace(found.space)
         K = len(space)
-        covariance = values["covariance"]
-        low_s, high_s = numbers(values["latency_s"], "latency_s", (2,))
+        low_s, high_s = found.latency_s
         if not 0 <= low_s <= high_s <= LONGEST_LATENCY_S:
             raise ConfigurationError(
                 f"latency_s is {low_s:g} to {high_s:g} s; allowed are 0 to {LONGEST_LATENCY_S:g} s, the "
                 "lower one first"
             )
-        mean = numbers([values["mean"][name] for name in space.names], "mean", (K,))
+        if missing := [name for name in space.names if name not in found.mean]:
+            raise ConfigurationError(f"field mean.{missing[0]} is missing")
+        mean = np.array([found.mean[name] for name in space.names])
         for p, value in zip(space, mean, strict=True):
             if p.scale == "log" and value <= 0:
                 raise ConfigurationError(
@@ -373,14 +375,26 @@ class ParameterDistribution:
         return cls(
             space=space,
             mean=mean,
-            covariance=None if covariance is None else _covariance(covariance, K),
+            covariance=None if found.covariance is None else _covariance(found.covariance, K),
             # The generator would treat minus zero as below zero.
-            latency_s=(float(low_s) + 0.0, float(high_s) + 0.0),
+            latency_s=(low_s + 0.0, high_s + 0.0),
         )
 
     def digest(self) -> str:
         """Return a digest of the distribution; a policy contains that of its own."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class _DistributionFile:
+    """A distribution as its file has it."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = {**OPEN, "allow_inf_nan": False}
+
+    space: tuple[Parameter, ...]
+    mean: dict[str, float]
+    covariance: list[list[float]] | None
+    latency_s: tuple[float, float]
 
 
 def _covariance(values: Any, size: int) -> FloatArray:

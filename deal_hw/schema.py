@@ -1,4 +1,4 @@
-"""Reads JSON into dataclasses and names wrong fields.
+"""Reads JSON into dataclasses and names wrong fields; writes dataclasses as plain JSON values.
 
 pydantic checks types, missing and unknown fields by the dataclass's annotations. Checks in its
 ``__post_init__``, which also hold in Python, cover ranges and relations of fields. pydantic is imported on
@@ -7,11 +7,14 @@ use, so that `import deal_hw` stays fast.
 
 from __future__ import annotations
 
+import dataclasses
+import enum
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
@@ -55,6 +58,31 @@ def from_values(kind: type[T], values: Any) -> T:
     except (TypeError, ValueError, RecursionError) as err:
         raise ConfigurationError(f"not plain JSON values: {err}") from err
     return read_json(kind, text)
+
+
+def plain(value: Any, *, finite: bool = True) -> Any:
+    """Return a dataclass, an array or a container of such as plain JSON values.
+
+    Enumerations are written by their values, paths as text, tuples and arrays as lists.
+
+    Args:
+        value: What to write.
+        finite: Whether a number that is not finite becomes None, as JSON has none.
+    """
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, float):
+        return value if math.isfinite(value) or not finite else None
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value):
+        entries = dataclasses.fields(value)
+        return {entry.name: plain(getattr(value, entry.name), finite=finite) for entry in entries}
+    if isinstance(value, Mapping):
+        return {key: plain(part, finite=finite) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part, finite=finite) for part in value]
+    return plain(value.tolist(), finite=finite) if hasattr(value, "tolist") else value
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import dataclasses
 import io
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any, ClassVar
 from typing_extensions import Self
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.schema import OPEN, from_values
+from deal_hw.schema import OPEN, from_values, plain
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +189,8 @@ class WireOptions(NetworkOptions):
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(self).items()}
+        values: dict[str, Any] = plain(self, finite=False)
+        return values
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> WireOptions:

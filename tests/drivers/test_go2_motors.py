@@ -94,9 +94,7 @@ def test_a_truth_survives_json() -> None:
     assert Go2Truth.from_json(truth.to_json()) == truth
     values = truth.to_json()
     del values["armature"]
-    with pytest.raises(
-        ConfigurationError, match="cannot be read as the truth of a Go2: 'armature' is missing"
-    ):
+    with pytest.raises(ConfigurationError, match="field armature is missing; --reveal-to writes one"):
         Go2Truth.from_json(values)
 
 

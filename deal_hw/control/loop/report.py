@@ -9,6 +9,7 @@ from typing import Any
 from deal_hw.control.loop.timing import LoopTimingReport
 from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.errors import ConfigurationError
+from deal_hw.schema import plain
 
 
 class Outcome(enum.Enum):
@@ -77,13 +78,5 @@ class LoopReport:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "outcome": self.outcome.value,
-            "reason": self.reason,
-            "passive_confirmed": self.passive_confirmed,
-            "loop_timing": self.loop_timing.to_json(),
-            "clipped": self.clipped,
-            "cycles_sent": self.cycles_sent,
-            "error": self.error,
-            "flags": list(self.flags),
-        }
+        values: dict[str, Any] = plain(self)
+        return values

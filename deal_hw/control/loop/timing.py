@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import math
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.errors import ConfigurationError
+from deal_hw.schema import from_values, plain
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,24 +71,19 @@ class LoopTimingReport:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; None for a value that was never measured."""
-
-        def plain(value: Any) -> Any:
-            if isinstance(value, dict):
-                return {key: plain(part) for key, part in value.items()}
-            return None if isinstance(value, float) and value != value else value
-
-        return {key: plain(value) for key, value in dataclasses.asdict(self).items()}
+        values: dict[str, Any] = plain(self)
+        return values
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> LoopTimingReport:
-        """Return the report that :meth:`to_json` wrote."""
+    def from_json(cls, values: Mapping[str, Any]) -> LoopTimingReport:
+        """Return the report that :meth:`to_json` wrote; errors as :func:`deal_hw.schema.from_values`."""
 
-        def spread(part: dict[str, float | None]) -> Spread:
-            return Spread(**{key: float("nan") if value is None else value for key, value in part.items()})
+        def numbers(part: Any) -> Any:
+            if isinstance(part, Mapping):
+                return {key: numbers(value) for key, value in part.items()}
+            return math.nan if part is None else part
 
-        changed: dict[str, Any] = {name: spread(values[name]) for name in ("period", "lateness", "state_age")}
-        changed["sections"] = {name: spread(part) for name, part in values["sections"].items()}
-        return cls(**{**values, **changed})
+        return from_values(cls, numbers(values))
 
     def lines(self) -> list[str]:
         """Return the report as lines for a person."""

@@ -10,12 +10,13 @@ distributed. (The one-sided form is the convex-hull method of Zhang, Liu and Xia
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from deal_hw.errors import InsufficientDataError
+from deal_hw.schema import plain
 from deal_hw.types import FloatArray, Trajectory
 
 STAMP_RESOLUTION_S = 2e-6
@@ -66,8 +67,8 @@ class ClockSync:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite uncertainties as null."""
-        values = asdict(self)
-        return {key: None if isinstance(v, float) and not np.isfinite(v) else v for key, v in values.items()}
+        values: dict[str, Any] = plain(self)
+        return values
 
 
 def synchronize(trajectory: Trajectory) -> ClockSync:

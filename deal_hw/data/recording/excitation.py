@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from deal_hw.schema import plain
 from deal_hw.types import Trajectory
 
 
@@ -34,7 +35,8 @@ class Excitation:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return asdict(self)
+        values: dict[str, Any] = plain(self)
+        return values
 
 
 def excitation(trajectory: Trajectory) -> Excitation:

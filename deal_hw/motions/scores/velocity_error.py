@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from deal_hw.motions.planned_end import ENDING_EVENT
 from deal_hw.motions.velocity import AXES
+from deal_hw.schema import plain
 from deal_hw.types import Event, FloatArray, Trajectory
 
 VELOCITY_EVENT = "velocity"
@@ -80,7 +81,8 @@ class VelocityError:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return asdict(self)
+        values: dict[str, Any] = plain(self)
+        return values
 
 
 def velocity_data(velocity: FloatArray) -> dict[str, float]:

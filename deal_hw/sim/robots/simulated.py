@@ -13,6 +13,7 @@ from deal_hw.clock import Clock
 from deal_hw.errors import CalibrationError, ConfigurationError, TransportTimeoutError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
+from deal_hw.schema import plain
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import reported
 from deal_hw.sim.engine.model import RobotModel
@@ -39,7 +40,8 @@ class SimulatedTruth:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {"parameters": dict(self.parameters), "latency_s": self.latency_s, "seed": self.seed}
+        values: dict[str, Any] = plain(self)
+        return values
 
 
 def draw_truth(space: ParameterSpace, seed: int, range_ratio: float, latency_s: float) -> SimulatedTruth:

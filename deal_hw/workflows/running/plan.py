@@ -35,7 +35,7 @@ from deal_hw.motions.velocity import (
     make_source,
 )
 from deal_hw.policy import VERDICT, Policy
-from deal_hw.schema import OPEN, from_values
+from deal_hw.schema import OPEN, from_values, plain
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.running.view import RunView
 
@@ -115,7 +115,8 @@ class RunPlan:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {**dataclasses.asdict(self), "wire": self.wire.to_json()}
+        values: dict[str, Any] = plain(self, finite=False)
+        return values
 
     @property
     def total_s(self) -> float:

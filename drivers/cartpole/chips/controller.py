@@ -1,4 +1,10 @@
-"""The cart-pole's firmware, by message and by tick, for any wire and mechanics."""
+"""The cart-pole's firmware in Python, by message and by tick, for any wire and mechanics.
+
+The C core is the firmware. This one is its fallback: for the emulator on a computer without a C compiler
+(``--firmware python``), and for benches, whose servo computes with the truth's floats instead of the chips'
+integers. tests/drivers/test_cartpole_firmware.py and test_cartpole_can_firmware.py compare the two bit by bit
+on random inputs.
+"""
 
 from __future__ import annotations
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from deal_hw.drivers.cartpole.plant.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.reading import number, reading
+from deal_hw.schema import OPEN, from_values, plain
 
 MOST_TICKS = 1000
 """Longest latency of one side [device ticks]."""
@@ -30,6 +32,8 @@ class CartpoleTruth:
         sensing_ticks: A frame reports the state of that many device ticks ago, before jitter.
         refused: Draws before this one that the oracle policy could not balance.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
     profile: str
     seed: int
@@ -50,15 +54,7 @@ class CartpoleTruth:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "profile": self.profile,
-            "seed": self.seed,
-            "parameters": dict(self.parameters),
-            "actuation_ticks": self.actuation_ticks,
-            "sensing_ticks": self.sensing_ticks,
-            "latency_s": self.latency_s,
-            "refused": self.refused,
-        }
+        return {**plain(self), "latency_s": self.latency_s}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> CartpoleTruth:
@@ -70,20 +66,17 @@ class CartpoleTruth:
         with reading(
             "the values", "the truth of a cart-pole", "--reveal-to writes one", error=ConfigurationError
         ):
-            ticks = {
-                key: int(number(values[key], key, 0, MOST_TICKS))
-                for key in ("actuation_ticks", "sensing_ticks")
+            found = from_values(cls, values)
+            find_profile(found.profile)
+            number(found.seed, "seed", 0)
+            number(found.refused, "refused", 0)
+            number(found.actuation_ticks, "actuation_ticks", 0, MOST_TICKS)
+            number(found.sensing_ticks, "sensing_ticks", 0, MOST_TICKS)
+            known = {
+                p.name: number(found.parameters[p.name], p.name, 0.1 * p.low, 10 * p.high)
+                for p in parameter_space().parameters
             }
-            return cls(
-                profile=find_profile(values["profile"]).name,
-                seed=int(number(values["seed"], "seed", 0)),
-                parameters={
-                    p.name: number(values["parameters"][p.name], p.name, 0.1 * p.low, 10 * p.high)
-                    for p in parameter_space().parameters
-                },
-                refused=int(number(values["refused"], "refused", 0)),
-                **ticks,
-            )
+            return dataclasses.replace(found, parameters=known)
 
 
 def unique_id(truth: CartpoleTruth) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from deal_hw.drivers.go2.descriptions.floor import (
 from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, reading
+from deal_hw.schema import OPEN, from_values
 
 JOINT_DAMPING_NMS_RAD: Final = 0.6
 ARMATURE_KGM2: Final = 0.01
@@ -122,18 +123,40 @@ class Go2Truth:
             ConfigurationError: A value is missing or invalid.
         """
         with reading("the values", "the truth of a Go2", "--reveal-to writes one", error=ConfigurationError):
+            found = from_values(_TruthFile, values)
             arrays = {
-                name: tuple(number(values[name][joint], f"{name} of {joint}", -1e3, 1e3) for joint in JOINTS)
+                name: tuple(
+                    number(getattr(found, name)[joint], f"{name} of {joint}", -1e3, 1e3) for joint in JOINTS
+                )
                 for name in _PER_JOINT
             }
             return cls(
-                profile=find_profile(values["profile"]).name,
-                seed=int(number(values["seed"], "seed", 0)),
-                latency_ms=int(number(values["latency_ms"], "latency_ms", 0, 1000)),
-                payload_kg=number(values["payload_kg"], "payload_kg", 0, 100),
-                floor_friction=number(values["floor_friction"], "floor_friction", 0, 10),
+                profile=find_profile(found.profile).name,
+                seed=int(number(found.seed, "seed", 0)),
+                latency_ms=int(number(found.latency_ms, "latency_ms", 0, 1000)),
+                payload_kg=number(found.payload_kg, "payload_kg", 0, 100),
+                floor_friction=number(found.floor_friction, "floor_friction", 0, 10),
                 **arrays,
             )
+
+
+@dataclass(frozen=True, slots=True)
+class _TruthFile:
+    """A truth as its file has it: joints by name."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
+
+    profile: str
+    seed: int
+    latency_ms: int
+    payload_kg: float
+    floor_friction: float
+    stiffness: dict[str, float]
+    damping: dict[str, float]
+    joint_damping: dict[str, float]
+    frictionloss: dict[str, float]
+    armature: dict[str, float]
+    encoder_bias: dict[str, float]
 
 
 _PER_JOINT: Final = ("stiffness", "damping", "joint_damping", "frictionloss", "armature", "encoder_bias")
