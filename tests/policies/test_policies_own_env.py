@@ -209,8 +209,8 @@ def test_an_environment_that_cannot_be_used(robot: Path, env: str, words: str, t
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"robot": "cartpole", "nominal": True}, "--env needs a robot.yaml"),
-        ({"udr": True}, "--udr does not go with --env, whose parameters have no known ranges"),
+        ({"robot": "cartpole", "nominal": True}, "'env'.*`train robot.yaml` has it"),
+        ({"udr": True}, "'udr'.*`train humanoid` have it"),
         ({}, "no distribution is named"),
     ],
 )
