@@ -6,21 +6,18 @@ simulator, so that the command line can explain all benches quickly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Final, Literal
-
-import tyro
-from tyro.constructors import PrimitiveConstructorSpec
+from typing import Annotated, ClassVar, Final, Literal
 
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
 from deal_hw.workflows.calibration.settings import Recordings
-from deal_hw.workflows.options import Ratio, Threads
+from deal_hw.workflows.options import OneWord, Ratio, Threads
 
 MOST_SEEDS: Final = 10_000
 """Most seeds of one range."""
@@ -77,26 +74,13 @@ def parse_names(text: str, option: str) -> tuple[str, ...]:
     return names
 
 
-def _one_word(parse: Callable[[str], Any], metavar: str) -> PrimitiveConstructorSpec[Any]:
-    """Return the parser's rule for values in one word, separated by commas."""
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=metavar,
-        instance_from_str=lambda words: parse(words[0]),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda value: [
-            ",".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value)
-        ],
-    )
-
-
-Seeds = Annotated[tuple[int, ...], SEEDS, _one_word(parse_seeds, "SEEDS")]
-Ratios = Annotated[tuple[float, ...], Ratio, _one_word(parse_ratios, "RATIOS")]
+Seeds = Annotated[tuple[int, ...], SEEDS, OneWord(parse_seeds, "SEEDS")]
+Ratios = Annotated[tuple[float, ...], Ratio, OneWord(parse_ratios, "RATIOS")]
 Names = tuple[str, ...]
-Tasks = Annotated[Names, _one_word(partial(parse_names, option="--task"), "TASKS")]
-Methods = Annotated[Names, _one_word(partial(parse_names, option="--methods"), "METHODS")]
-Problems = Annotated[Names, _one_word(partial(parse_names, option="--problems"), "PROBLEMS")]
-Faults = Annotated[Names, _one_word(partial(parse_names, option="--faults"), "FAULTS")]
+Tasks = Annotated[Names, OneWord(partial(parse_names, option="--task"), "TASKS")]
+Methods = Annotated[Names, OneWord(partial(parse_names, option="--methods"), "METHODS")]
+Problems = Annotated[Names, OneWord(partial(parse_names, option="--problems"), "PROBLEMS")]
+Faults = Annotated[Names, OneWord(partial(parse_names, option="--faults"), "FAULTS")]
 Profile = Literal["ideal", "sensor", "realistic"]
 
 
@@ -331,7 +315,7 @@ class Real(SearchingBench):
     name: ClassVar[str] = "real"
     work: ClassVar[str] = "deal_hw.bench.real:table"
 
-    recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
+    recordings: Recordings = field(default_factory=Recordings)
 
     dataset: Path | None = None
     """A dataset instead of --model and --data; of a robot of ours, or one that carries its robot."""

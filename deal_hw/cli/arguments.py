@@ -17,12 +17,11 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 
 from deal_hw.errors import ConfigurationError, short
 from deal_hw.ranges import option
 from deal_hw.workflows.kinds import Arguments, groups, has, listed
-from deal_hw.workflows.options import FROM_PYTHON
+from deal_hw.workflows.options import FROM_PYTHON, OneWord
 
 BOOLEANS = ("True", "False")
 
@@ -114,7 +113,7 @@ def options_of(settings: type[Any]) -> dict[str, Option]:
             count = None if endless or count is None else len(parts)
             kinds = tuple(_kinds(parts[0])) if endless or len(set(parts)) == 1 else (str,)
             kinds = (str,) if any(get_origin(kind) is tuple for kind in kinds) else kinds
-        if any(isinstance(mark, PrimitiveConstructorSpec) for mark in get_args(hint)[1:]):
+        if any(isinstance(mark, OneWord) for mark in get_args(hint)[1:]):
             # It has a parser of its own, such as for several numbers in one word.
             kinds, count = (str,), 1
         missing = dataclasses.MISSING

@@ -28,7 +28,7 @@ from deal_hw.documentation import with_places
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.ranges import option
 from deal_hw.workflows.kinds import InputKind, Kinds, MissingKindError, one_kind
-from deal_hw.workflows.options import FROM_PYTHON
+from deal_hw.workflows.options import FROM_PYTHON, OneWord
 
 if TYPE_CHECKING:
     from deal_hw.cli.main import Verb
@@ -85,6 +85,7 @@ class Rules:
     def _field(self, field: StructFieldSpec, owner: Any) -> StructFieldSpec:
         parts = get_args(field.type) if get_origin(field.type) is Annotated else (field.type,)
         marks: list[Any] = [tyro.conf.arg(metavar=_metavar(field.name, parts), help_behavior_hint=_default)]
+        marks += [_one_word(part) for part in parts[1:] if isinstance(part, OneWord)]
         if FROM_PYTHON in parts[1:]:
             marks.append(tyro.conf.Suppress)
             self._no_options += [kind for kind in parts if dataclasses.is_dataclass(kind)]
@@ -149,6 +150,19 @@ def _default(label: str) -> str:
     if label == "True":
         return "(on by default)"
     return "" if label in ("", "''", "None", "False") else f"(default: {label})"
+
+
+def _one_word(mark: OneWord) -> PrimitiveConstructorSpec[tuple[Any, ...]]:
+    """Return the parser's rule for values in one word, separated by commas."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=mark.metavar,
+        instance_from_str=lambda words: mark.parse(words[0]),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [
+            ",".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value)
+        ],
+    )
 
 
 def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:

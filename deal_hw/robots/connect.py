@@ -100,7 +100,8 @@ def adopt_robot(
     entry, wire = reached_over(name, transport_name)
     driver = entry.driver_of(wire)
     if wire.opens_port:
-        return driver(port, clock, fd=fd, can_send=can_send)  # type: ignore[no-any-return]
+        robot: Robot = driver(port, clock, fd=fd, can_send=can_send)
+        return robot
     transport = transport_entry(wire.transport)
     if not transport.adopt:
         raise ConfigurationError(

@@ -6,12 +6,27 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar, overload
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Range, option
 from deal_hw.workflows.kinds import Kinds, one_kind, signature_of
+
+
+@dataclass(frozen=True)
+class OneWord:
+    """Marks an option whose values are one word of the command line, separated by commas.
+
+    Attributes:
+        parse: Returns the values of the word.
+        metavar: How the help names the word.
+    """
+
+    parse: Callable[[str], tuple[Any, ...]]
+    metavar: str
+
 
 FROM_PYTHON = "from Python"
 """Marks a field that is no option: only Python can give it."""
