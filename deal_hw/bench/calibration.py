@@ -16,7 +16,7 @@ from typing import Any
 
 from deal_hw.bench.figures import draw
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells, Table
+from deal_hw.bench.rows import Cells, RowTable
 from deal_hw.bench.settings import FixedRange, Mismatch
 from deal_hw.bench.tables import line, print_summary
 from deal_hw.bench.tasks import check_tasks, make_case
@@ -112,7 +112,7 @@ def make_cells(settings: FixedRange | Mismatch) -> list[Cell]:
     ]
 
 
-def table(settings: FixedRange | Mismatch) -> Table:
+def table(settings: FixedRange | Mismatch) -> RowTable:
     """Return the bench: its cells by :func:`run_cell`.
 
     Raises:
@@ -125,7 +125,7 @@ def table(settings: FixedRange | Mismatch) -> Table:
         threads=settings.threads,
     )
     cells = Cells(names=KEY, runs=[(cell.key, partial(run, cell)) for cell in make_cells(settings)])
-    return Table(cells=cells, line=line, summary=print_summary, draw=draw)
+    return RowTable(cells=cells, line=line, summary=print_summary, draw=draw)
 
 
 def run_cell(cell: Cell, *, population: int | None, generations: int, threads: int | None) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, Table, printed
+from deal_hw.bench.rows import Cells, Row, RowTable, printed
 from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget, Progress
 from deal_hw.documentation import page
@@ -192,7 +192,7 @@ REAL = frozenset({"so101", "go2-suspended"})
 """Problems with real recordings."""
 
 
-def table(settings: FirstAnswer) -> Table:
+def table(settings: FirstAnswer) -> RowTable:
     """Return the bench; a real robot has one truth, so it runs for the first seed only.
 
     Raises:
@@ -206,7 +206,7 @@ def table(settings: FirstAnswer) -> Table:
     run = partial(run_cell, real=settings.real, budget=settings.budget, threads=settings.threads)
     chosen = [(name, seed) for seed in seeds for name in problems if name not in REAL or seed == seeds[0]]
     cells = Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
-    return Table(cells=cells, line=line, summary=printed(summary))
+    return RowTable(cells=cells, line=line, summary=printed(summary))
 
 
 def run_cell(

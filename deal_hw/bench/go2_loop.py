@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, Table, per_parameter, printed
+from deal_hw.bench.rows import Cells, Row, RowTable, per_parameter, printed
 from deal_hw.bench.scores import check_truth
 from deal_hw.bench.settings import Go2Loop
 from deal_hw.calibration import CalibrationResult
@@ -45,7 +45,7 @@ KINDS: Final = ("stiffness", "damping")
 KEY: Final = ("profile", "seed", "steps")
 
 
-def table(settings: Go2Loop) -> Table:
+def table(settings: Go2Loop) -> RowTable:
     """Return the bench: a cell for each seed, by :func:`loop_row`."""
     profile, steps = settings.profile, settings.steps if settings.train else 0
     folder = settings.beside("runs")
@@ -56,7 +56,7 @@ def table(settings: Go2Loop) -> Table:
         )
         for seed in settings.seeds
     ]
-    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
+    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
 
 
 def loop_row(profile: str, seed: int, steps: int, *, folder: Path, threads: int | None) -> Row:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.figures import draw
-from deal_hw.bench.rows import Cells, Table, per_parameter
+from deal_hw.bench.rows import Cells, RowTable, per_parameter
 from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
 from deal_hw.bench.settings import Loop
 from deal_hw.bench.tables import line, print_summary
@@ -152,7 +152,7 @@ def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[st
     return row
 
 
-def table(settings: Loop) -> Table:
+def table(settings: Loop) -> RowTable:
     """Return the bench: its cells, seed by seed, by :func:`loop_row`.
 
     Raises:
@@ -174,7 +174,7 @@ def table(settings: Loop) -> Table:
         )
         for seed, method in itertools.product(settings.seeds, settings.methods)
     ]
-    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw)
+    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw)
 
 
 def loop_row(

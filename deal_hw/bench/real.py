@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.figures import draw
-from deal_hw.bench.rows import Cells, Table
+from deal_hw.bench.rows import Cells, RowTable
 from deal_hw.bench.settings import Real
 from deal_hw.bench.tables import line, print_real
 from deal_hw.calib.pipeline.methods import check_method, is_default
@@ -106,7 +106,7 @@ def expected_std(
     return std
 
 
-def table(settings: Real) -> Table:
+def table(settings: Real) -> RowTable:
     """Read and check the recordings and return the bench: its cells by :func:`run_cell`.
 
     Raises:
@@ -135,7 +135,7 @@ def table(settings: Real) -> Table:
     for seed, method in itertools.product(settings.seeds, settings.methods):
         cell = (method, is_default(method) or settings.refine_all, settings.range_ratio, seed)
         runs.append(((task, split, *cell), partial(run, *cell)))
-    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=print_real, draw=draw)
+    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=print_real, draw=draw)
 
 
 def run_cell(

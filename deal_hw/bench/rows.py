@@ -38,7 +38,7 @@ class Cells:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
+class RowTable:
     """A bench: what it runs and how it is shown.
 
     Attributes:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, Table, printed
+from deal_hw.bench.rows import Cells, Row, RowTable, printed
 from deal_hw.bench.settings import Speed
 from deal_hw.bench.tasks import Case, check_tasks, make_case
 from deal_hw.errors import DealHwError
@@ -38,7 +38,7 @@ REPETITIONS: Final = 5
 KEY: Final = ("task", "space", "method", "population", "generations", "seed")
 
 
-def table(settings: Speed) -> Table:
+def table(settings: Speed) -> RowTable:
     """Return the bench: its cells by :func:`run_cell`; policies move the robots, as in the paper.
 
     Raises:
@@ -57,7 +57,7 @@ def table(settings: Speed) -> Table:
         members = settings.population or usual_population(method)
         cell = (task, settings.space, method, members, settings.generations, seed)
         runs.append((cell, partial(run, *cell)))
-    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
+    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
 
 
 def run_cell(

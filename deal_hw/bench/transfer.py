@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells, Row, Table, describe_call
+from deal_hw.bench.rows import Cells, Row, RowTable, describe_call
 from deal_hw.bench.scores import error_percent, log_error_x100
 from deal_hw.bench.settings import Transfer
 from deal_hw.bench.tasks import Case, check_tasks, make_case
@@ -111,7 +111,7 @@ class HiddenTarget:
     seconds: float
 
 
-def table(settings: Transfer) -> Table:
+def table(settings: Transfer) -> RowTable:
     """Return the bench: its cells, seed by seed, by :func:`transfer_row`.
 
     Raises:
@@ -153,7 +153,7 @@ def table(settings: Transfer) -> Table:
         )
         for one, seed, method in itertools.product(common, settings.seeds, methods)
     ]
-    return Table(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw_transfer)
+    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw_transfer)
 
 
 def print_now(text: str) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Table, printed
+from deal_hw.bench.rows import Cells, RowTable, printed
 from deal_hw.bench.scores import outside_range
 from deal_hw.bench.settings import Verdict
 from deal_hw.calib.report.verdict import trust
@@ -78,7 +78,7 @@ def robots(
     ]
 
 
-def table(settings: Verdict) -> Table:
+def table(settings: Verdict) -> RowTable:
     """Return the bench: its cells by :func:`run_cell`.
 
     Raises:
@@ -87,7 +87,7 @@ def table(settings: Verdict) -> Table:
     run = partial(run_cell, budget=settings.budget, threads=settings.threads)
     chosen = robots(settings.seeds, settings.problems, settings.faults)
     cells = Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
-    return Table(cells=cells, line=line, summary=printed(summary))
+    return RowTable(cells=cells, line=line, summary=printed(summary))
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:

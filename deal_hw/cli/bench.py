@@ -13,7 +13,7 @@ from deal_hw.cli.piped import PipedProgress
 from deal_hw.workflows.kinds import InputKind, Kinds
 
 if TYPE_CHECKING:
-    from deal_hw.bench.rows import Row, Table
+    from deal_hw.bench.rows import Row, RowTable
 
 KINDS = Kinds(noun="bench", table=lambda: {name: InputKind(settings) for name, settings in BENCHES.items()})
 
@@ -29,11 +29,11 @@ def bench(settings: Bench) -> int:
 
 def _run(settings: Bench) -> int:
     module, _, function = settings.work.partition(":")
-    made: int | Table = getattr(importlib.import_module(module), function)(settings)
+    made: int | RowTable = getattr(importlib.import_module(module), function)(settings)
     return made if isinstance(made, int) else _run_table(settings, made)
 
 
-def _run_table(settings: Bench, table: Table) -> int:
+def _run_table(settings: Bench, table: RowTable) -> int:
     from deal_hw.bench.rows import run_cells
 
     out = settings.file

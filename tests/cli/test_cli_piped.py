@@ -168,7 +168,7 @@ def test_design_excitation(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_bench(lines: Lines, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Rows done."""
     from deal_hw.bench import loop
-    from deal_hw.bench.rows import Cells, Table
+    from deal_hw.bench.rows import Cells, RowTable
     from deal_hw.bench.settings import Loop
 
     reported: list[str] = []
@@ -180,7 +180,7 @@ def test_bench(lines: Lines, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
 
     made = rows()
     cells = Cells(names=("seed",), runs=[((seed,), lambda: next(made)) for seed in (0, 1)])
-    table = Table(cells=cells, line=str, summary=lambda rows: None)
+    table = RowTable(cells=cells, line=str, summary=lambda rows: None)
     monkeypatch.setattr(loop, "table", lambda settings: table)
     assert bench.bench(Loop(out=tmp_path / "rows.json")) == 0
     assert reported == ["bench loop: 10 s, 1/2 rows done"]

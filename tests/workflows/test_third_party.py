@@ -64,7 +64,7 @@ def recorded(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Recor
     """Emulate the robot, and record it with the real control process."""
     out = tmp_path_factory.mktemp("run")
     with EmulatorProcess(ROBOT, "--seed", "1", "--reveal") as emulator:
-        checked = deal_hw("doctor", ROBOT, "--port", emulator.port, "--seconds", 0.5)
+        checked = deal_hw("doctor", ROBOT, "--port", emulator.port, "--seconds", 3)
         assert f"{ROBOT} answers" in checked and "states a second of 50" in checked
         assert f"robot {ROBOT} (deal-hw-bench-cartpole 0.1.0)" in checked
         motion = ["--excite", "multisine", "--seconds", 6]
@@ -96,7 +96,7 @@ def test_its_transport_reaches_the_robot(installed: Path, tmp_path: Path) -> Non
     """The same bytes through TCP; the control process goes on with the connection that its parent opened."""
     with EmulatorProcess(ROBOT, "--seed", "2") as emulator, forwarded(emulator.port) as port:
         wire = ["--transport", "tcp", "--port", port]
-        assert f"{ROBOT} answers" in deal_hw("doctor", ROBOT, *wire, "--seconds", 0.5)
+        assert f"{ROBOT} answers" in deal_hw("doctor", ROBOT, *wire, "--seconds", 3)
         deal_hw("collect", ROBOT, *wire, "--out", tmp_path, "--motion", "hold", "--seconds", 1)
     assert [path.name for path in (tmp_path / "dataset" / "episodes").iterdir()] == ["000000.mcap"]
 
