@@ -74,6 +74,18 @@ class Registry(Generic[EntryT]):
                 return found
         return None
 
+    def named(self, name: str) -> EntryT:
+        """Return an entry.
+
+        Raises:
+            UnknownNameError: There is none of that name.
+            ConfigurationError: It is a plug-in's that cannot be used.
+        """
+        found = self.find(name)
+        if found is None:
+            raise UnknownNameError(self._kind, name, self.names())
+        return found
+
     def names(self) -> tuple[str, ...]:
         """Return all names, the built-in ones first; no plug-in is loaded."""
         return (*self._own, *dict.fromkeys(p.name for p in self._entry_points() if p.name not in self._own))
@@ -174,10 +186,7 @@ def robot_entry(name: str) -> RobotEntry:
         UnknownNameError: There is no such robot.
         ConfigurationError: It is a plug-in's that cannot be used.
     """
-    found = robots().find(name)
-    if found is None:
-        raise UnknownNameError("robot", name, robots().names())
-    return found
+    return robots().named(name)
 
 
 def driven_entry(name: str) -> RobotEntry:
@@ -215,10 +224,7 @@ def transport_entry(name: str) -> TransportEntry:
         UnknownNameError: There is no such transport.
         ConfigurationError: It is a plug-in's that cannot be used.
     """
-    found = transports().find(name)
-    if found is None:
-        raise UnknownNameError("transport", name, transports().names())
-    return found
+    return transports().named(name)
 
 
 def transport_of(wire: str) -> TransportEntry:

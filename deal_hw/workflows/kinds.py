@@ -136,10 +136,10 @@ class Kinds:
         joined = functools.partial(_joined, more)
 
         def table() -> Mapping[str, InputKind]:
-            own: dict[str, Any] = {name: kind.settings for name, kind in self.table().items()}
+            kinds = self.table()
+            own: dict[str, Any] = {name: kind.settings for name, kind in kinds.items()}
             return {
-                name: dataclasses.replace(kind, settings=joined(own[name]))
-                for name, kind in self.table().items()
+                name: dataclasses.replace(kind, settings=joined(own[name])) for name, kind in kinds.items()
             }
 
         return dataclasses.replace(self, table=table)

@@ -24,7 +24,7 @@ from deal_hw.cli.main import VERBS, main, parse
 from deal_hw.errors import DealHwError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import robot_entry
-from deal_hw.workflows.emulation import cartpole as emulated_cartpole
+from deal_hw.workflows.emulation import common as emulation
 from deal_hw.workflows.emulation import go2 as emulated_go2
 from deal_hw.workflows.train import udr_distribution
 
@@ -318,7 +318,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(emulated_go2, "make_topic_transport", note("transport"))
     monkeypatch.setattr(emulated_go2, "summary", lambda report: [])
     monkeypatch.setattr(emulated_go2, "tracking", nothing("tracking"))
-    for module in (emulated_cartpole, emulated_go2):
+    for module in (emulation, emulated_go2):
         for name in ("run_until", "reveal"):
             monkeypatch.setattr(module, name, note(name))
         monkeypatch.setattr(module, "happenings", nothing("happenings"))

@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
 from deal_hw.errors import MissingExtraError
 from deal_hw.robots import robot_entry
-from deal_hw.workflows.emulation.common import (
-    choose_truth,
-    happenings,
-    next_line,
-    realtime_priority,
-    reveal,
-    run_until,
-)
+from deal_hw.workflows.emulation.common import choose_truth, serve
 from deal_hw.workflows.emulation.settings import (
     CARTPOLE_RANGE_RATIO,
     ON_CAN,
     WITH_FIRMWARE,
     EmulateCartpoleSettings,
 )
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
@@ -60,26 +53,12 @@ def emulate_cartpole(
         runs = f", firmware: {own['firmware']}"
     link = None if config.link is None else Path(config.link)
     emulator: CartpoleEmulator = make(truth, link=link, hazards=_hazards(config), **own)
-    try:
-        port = emulator.open()
-        announce(f"port {port}")
-        announce(f"profile {truth.profile}, seed {truth.seed}{runs}; Ctrl-C ends")
-        announce(next_line(config, port))
-        with realtime_priority(), happenings(config.events_to, emulator.changes) as tell:
+    what = f"profile {truth.profile}, seed {truth.seed}{runs}"
 
-            def step() -> bool:
-                if cut.is_set():
-                    cut.clear()
-                    emulator.cut()
-                going_on = emulator.step()
-                tell()
-                return going_on
+    def report() -> dict[str, Any]:
+        return {**truth.to_json(), **emulator.report()}
 
-            run_until(step, stop, config.duration_s, config.parent)
-    finally:
-        emulator.close()
-        report = {**truth.to_json(), **emulator.report()}
-        reveal(report, announce if config.reveal else silent, config.reveal_to)
+    serve(emulator, config, what, stop, cut, announce=announce, report=report)
     say(
         f"emulator: this computer stalled it {emulator.slips} times; {emulator.dropped} frames came while no "
         "program read the port"

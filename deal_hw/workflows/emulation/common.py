@@ -16,10 +16,11 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
+from deal_hw.robots.emulation import Emulation
 from deal_hw.signals import ENDING, taken
 from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.options import File
-from deal_hw.workflows.say import Say
+from deal_hw.workflows.say import Say, silent
 
 T = TypeVar("T")
 _PARENT_CHECK_STEPS = 100
@@ -86,6 +87,48 @@ def run_until(
             return
         if parent is not None and count % _PARENT_CHECK_STEPS == 0 and os.getppid() != parent:
             return
+
+
+def serve(
+    emulation: Emulation,
+    config: EmulateSettings,
+    what: str,
+    stop: threading.Event,
+    cut: threading.Event,
+    *,
+    announce: Say,
+    report: Callable[[], Mapping[str, Any]],
+) -> None:
+    """Run an emulator until a stop, the given time or the end of its port, and reveal its truth.
+
+    Args:
+        emulation: The emulator, not yet opened.
+        config: Its settings.
+        what: What is emulated, for the second line.
+        stop: Ends it.
+        cut: Cuts the wire.
+        announce: Called with the port first, and with the truth at the end.
+        report: Returns the truth and what happened.
+    """
+    try:
+        port = emulation.open()
+        announce(f"port {port}")
+        announce(f"{what}; Ctrl-C ends")
+        announce(next_line(config, port))
+        with realtime_priority(), happenings(config.events_to, emulation.changes) as tell:
+
+            def step() -> bool:
+                if cut.is_set():
+                    cut.clear()
+                    emulation.cut()
+                going_on = emulation.step()
+                tell()
+                return going_on
+
+            run_until(step, stop, config.duration_s, config.parent)
+    finally:
+        emulation.close()
+        reveal(report(), announce if config.reveal else silent, config.reveal_to)
 
 
 def choose_truth(

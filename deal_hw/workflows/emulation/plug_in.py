@@ -10,16 +10,9 @@ from typing import Any
 from deal_hw.robots import reached_over, robot_entry
 from deal_hw.robots.emulation import Emulation, EmulatorRequest
 from deal_hw.testing.faults import FaultRates
-from deal_hw.workflows.emulation.common import (
-    happenings,
-    next_line,
-    read_truth,
-    realtime_priority,
-    reveal,
-    run_until,
-)
+from deal_hw.workflows.emulation.common import read_truth, serve
 from deal_hw.workflows.emulation.settings import EmulateSettings
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say
 
 
 def emulate_plug_in(
@@ -39,25 +32,8 @@ def emulate_plug_in(
     wire = config.transport or robot_entry(config.robot).emulated_on[0]
     entry, chosen = reached_over(config.robot, wire)
     emulation: Emulation = entry.load(chosen.emulator)(_request(config, wire))
-    try:
-        port = emulation.open()
-        announce(f"port {port}")
-        announce(f"profile {config.profile}, seed {config.seed}; Ctrl-C ends")
-        announce(next_line(config, port))
-        with realtime_priority(), happenings(config.events_to, emulation.changes) as tell:
-
-            def step() -> bool:
-                if cut.is_set():
-                    cut.clear()
-                    emulation.cut()
-                going_on = emulation.step()
-                tell()
-                return going_on
-
-            run_until(step, stop, config.duration_s, config.parent)
-    finally:
-        emulation.close()
-        reveal(emulation.report(), announce if config.reveal else silent, _path(config.reveal_to))
+    what = f"profile {config.profile}, seed {config.seed}"
+    serve(emulation, config, what, stop, cut, announce=announce, report=emulation.report)
 
 
 def _request(config: EmulateSettings, wire: str) -> EmulatorRequest:
@@ -76,7 +52,3 @@ def _request(config: EmulateSettings, wire: str) -> EmulatorRequest:
         cut_after_s=config.cut_after_s,
         cut_s=config.cut_s,
     )
-
-
-def _path(path: Path | str | None) -> Path | None:
-    return None if path is None else Path(path)
