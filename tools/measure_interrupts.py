@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How long `train` and `calibrate` live after a signal, and what they leave behind.
+"""How long `train`, `calibrate` and `demo` live after a signal, and what they leave behind.
 
 python tools/measure_interrupts.py runs/demo/dataset --runs 20 --out interrupts.json
 
@@ -44,12 +44,13 @@ def command(verb: str, dataset: Path, out: Path) -> list[str]:
         "train": ["train", "cartpole", "--udr", "--steps", "1000000", "--out", str(out)],
         "train-go2": ["train", "go2", "--udr", "--steps", "10000000", "--out", str(out)],
         "calibrate": ["calibrate", str(dataset), "--out", str(out)],
+        "demo": ["demo", "cartpole", "--out", str(out)],
         "calibrate-deal": ["calibrate", str(dataset), "--method", "deal", "--out", str(out)],
     }
     return [sys.executable, "-m", "deal_hw", *arguments[verb]]
 
 
-VERBS = ("train", "train-go2", "calibrate", "calibrate-deal")
+VERBS = ("train", "train-go2", "calibrate", "calibrate-deal", "demo")
 
 
 def left_over(mark: str) -> list[int]:
