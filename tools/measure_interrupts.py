@@ -45,7 +45,7 @@ def command(verb: str, dataset: Path, out: Path) -> list[str]:
         "train-go2": ["train", "go2", "--udr", "--steps", "10000000", "--out", str(out)],
         "calibrate": ["calibrate", str(dataset), "--out", str(out)],
         "demo": ["demo", "cartpole", "--out", str(out)],
-        "calibrate-deal": ["calibrate", str(dataset), "--method", "deal", "--out", str(out)],
+        "calibrate-deal": ["calibrate", str(dataset), "--search", "deal", "--no-refine", "--out", str(out)],
     }
     return [sys.executable, "-m", "deal_hw", *arguments[verb]]
 
@@ -130,7 +130,9 @@ def sound(row: Mapping[str, Any]) -> bool:
     # Python ends itself by SIGINT after any interrupt that came while it ran text, as dataclasses do; and a
     # signal ends it before the verb has taken signals. A shell sees 130 or 143.
     codes = (INTERRUPTED, -signal.Signals[row["signal"]])
-    ended = row["ended_before"] or (row["took_s"] <= MOST_S and row["exit_code"] in codes)
+    in_time = row["took_s"] <= MOST_S and row["exit_code"] in codes
+    # A verb that was refused has met no signal.
+    ended = row["exit_code"] == 0 if row["ended_before"] else in_time
     return ended and not row["processes_left"] and not row["broken_files"]
 
 
