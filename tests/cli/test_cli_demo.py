@@ -47,6 +47,7 @@ from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
 from deal_hw.workflows.running.supervised import InterruptedRunError
 from deal_hw.workflows.train import Training, TrainSettings
+from deal_hw.workflows.train import run as run_training
 
 pytestmark = pytest.mark.real_time
 
@@ -275,7 +276,7 @@ def test_a_signal_ends_the_demo_in_each_job(
         def __init__(self, **settings: Any) -> None:
             super().__init__(**{**settings, "on_beat": press})
 
-    training = train_verb.run
+    training = run_training
 
     def pressed_in_training(config: TrainSettings, _: TrainingProgress | None = None) -> Training:
         return training(config, lambda status: signal.raise_signal(number))
