@@ -49,7 +49,7 @@ from deal_hw.calib.pipeline.calibration_run import (
     FitOutcome,
 )
 from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
+from deal_hw.calib.validation.checks import Validation, doubtful, hold_windows, judge, unexplained
 from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play
 from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
 from deal_hw.calib.validation.shared_errors import find_shared_error
@@ -376,8 +376,8 @@ def conclude_fit(
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
-    steady = late is None and not (wrong or unexplained(refined))
-    if problem.fixed_latency_s is None and steady:
+    doubt = late is not None or wrong or doubtful(refined)
+    if problem.fixed_latency_s is None and not doubt:
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -392,9 +392,9 @@ def conclude_fit(
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
-    if late is not None or wrong or unexplained(refined):
+    if doubt or unexplained(refined):
         # Delays were found because the fit with a constant one is not right.
-        known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
+        known = hold_windows(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause)
