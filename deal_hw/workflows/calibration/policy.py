@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, UNALIGNED_METHODS, search_of
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
+from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.motions.velocity import FixedVelocity, make_source
 from deal_hw.workflows.options import refuse
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
@@ -33,10 +35,22 @@ def check_policy(method: str, *, given: bool, model: bool, files: bool = False) 
     search = search_of(method)
     if search not in CLOSED_LOOP_METHODS:
         refuse(["--policy"] if given and not files else [], f"{search} runs no policy")
-    elif model:
+    elif model and not (given and files):
         raise ConfigurationError(
-            f"{search} runs the policy that moved the robot, which is unknown for --model and for "
-            "a dataset with its own robot.yaml; use eki, deal or deal-paper-replay"
+            f"{search} runs the policy that moved the robot, which is unknown for --model without --policy "
+            "FILE.onnx, and for a dataset with its own robot.yaml; name it, or use eki, deal or "
+            "deal-paper-replay"
+        )
+
+
+def say_that_alignment_is_better(method: str, say: Say) -> None:
+    """Say it where a search compares distributions of recordings whose commands and states are aligned."""
+    if method in UNALIGNED_METHODS:
+        say(
+            f"{method} compares distributions of motion. In these recordings commands and states have one "
+            "clock, so predictions can be compared, too, and every robot that was measured was predicted "
+            f"better by that ({page('results/paper.md')}): leave --method out, unless the motion diverges "
+            "from any prediction"
         )
 
 

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from deal_hw.calib.pipeline.methods import (
+    CLOSED_LOOP_METHODS,
     DEFAULT_SEARCH,
     SEARCHES,
     SEARCHING,
     check_method,
+    search_of,
     usual_budget,
     with_search,
 )
@@ -252,6 +254,11 @@ class CalibrateSettings(Checked):
     def named(self, pipeline: str = "") -> str:
         """Return the name of a pipeline, by default the one that is asked for, with its search."""
         return with_search(pipeline or self.method or "default", self.search or DEFAULT_SEARCH)
+
+    @property
+    def in_closed_loop(self) -> bool:
+        """Whether the method runs the policy that moved the robot in every simulator."""
+        return search_of(self.named()) in CLOSED_LOOP_METHODS
 
     @property
     def budget(self) -> Budget:
