@@ -113,6 +113,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             help="find the simulator parameters that explain recordings of any robot (--model)",
             example="calibrate runs/first/dataset",
             extra="calib",
+            config="KINDS",
             function="calibrate_or_write_parameters",
             common="model data columns parameters write_parameters holdout leave_out method "
             "search known space out resume json quiet",

@@ -91,7 +91,7 @@ class Rules:
             self._no_options += [kind for kind in parts if dataclasses.is_dataclass(kind)]
         elif field.name == self._without and self._helps:
             marks.append(tyro.conf.Suppress)
-            field = dataclasses.replace(field, default="")
+            field = dataclasses.replace(field, default=Path() if parts[0] is Path else "")
         elif is_positional(owner, field.name, field.type):
             marks += [tyro.conf.Positional]
             marks[0] = tyro.conf.arg(metavar=field.name.upper(), help_behavior_hint=_default)
@@ -249,6 +249,10 @@ def read_settings(
             _print_and_exit(kinds_page(name, verb, kinds))
         example = f"example: deal-hw {verb.example}; all options: deal-hw {name} --help"
         raise ConfigurationError(f"`deal-hw {name}`: {error}; {example}") from None
+    except ConfigurationError:
+        if explain is not None:
+            explain(words)
+        raise
     line = f"deal-hw {name} {chosen.usage or word}".rstrip()
     if kinds.noun and not kinds.argument:
         words.remove(given.positional[0])
@@ -257,7 +261,11 @@ def read_settings(
         _print_help(verb, chosen, line, () if HELP_ALL in arguments else verb.common, without)
 
     def having(field: str) -> list[str]:
-        return [f"{name} {one}" for one, kind in kinds.table().items() if field in options_of(kind.settings)]
+        return [
+            f"{name} {kind.usage or one}"
+            for one, kind in kinds.table().items()
+            if field in options_of(kind.settings)
+        ]
 
     try:
         check(line, words, chosen.settings, having)
