@@ -102,6 +102,11 @@ class PopulationDemonstration:
         self._offset = centre(description)
 
     @property
+    def trained_under(self) -> str:
+        """Digest of the distribution that the policy was trained under; "" where it is unknown."""
+        return self._policy.spec.trained_under
+
+    @property
     def history(self) -> int:
         """Length of the policy's memory [control periods]."""
         return self._policy.spec.history

@@ -12,7 +12,7 @@ from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.policy import recorded_policy
+from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
@@ -62,6 +62,7 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
     if settings.in_closed_loop:
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
+        say_other_range(policy, robot_name, space, say)
     trajectories, telemetry = sound_recordings(
         {i: episode.trajectory for i, episode in episodes.items()}, dataset.folder, settings.spikes, say
     )

@@ -16,6 +16,7 @@ from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.parameters import ParameterSpace
     from deal_hw.policies.demonstration import PopulationDemonstration
 
 
@@ -54,6 +55,32 @@ def say_that_alignment_is_better(method: str, say: Say) -> None:
             f"better by that ({page('results/paper.md')}): leave --method out, unless the motion diverges "
             "from any prediction"
         )
+
+
+def say_other_range(policy: PopulationDemonstration, robot: str, space: ParameterSpace, say: Say) -> None:
+    """Say where a policy was not trained in the search's range, as the DEAL paper's is.
+
+    Args:
+        policy: The policy that moved the robot.
+        robot: Name of a robot with a driver.
+        space: What is searched.
+        say: Called with the sentence.
+    """
+    from deal_hw.workflows.train import udr_distribution
+
+    usual = udr_distribution(robot)
+    ranges = {p.name: (p.low, p.high) for p in usual.space}
+    other = [p.name for p in space if ranges.get(p.name) != (p.low, p.high)]
+    if policy.trained_under != usual.digest():
+        what = "under another distribution than uniform randomisation"
+    elif other:
+        what = f"in another range of {', '.join(other[:3])}{' and others' if len(other) > 3 else ''}"
+    else:
+        return
+    say(
+        f"the policy that moved the robot was trained {what}. The DEAL paper trains it in the range that is "
+        "searched. Simulators at the ends of the range may fall at once under this one, and then say little"
+    )
 
 
 def recorded_policy(
