@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.state_stream import StateStream
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import TransportTimeoutError, WrongDeviceError
 from deal_hw.transport import TopicTransport
 

@@ -15,7 +15,6 @@ from deal_hw.drivers.go2.command_sender import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.go2.connect import await_robot
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.body import body_state, is_damped
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import StateCheck
@@ -24,6 +23,7 @@ from deal_hw.drivers.go2.messages.rpc import HEARD_TEXTS, STATUS_TEXTS, read_not
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.go2.takeover import Takeover
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message, TopicTransport

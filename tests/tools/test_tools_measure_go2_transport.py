@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from measure_go2_transport import TransportBench, bench_transport, lines, main, summary
 
-from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
+from deal_hw.drivers.transports.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import ConfigurationError, TransportError
 from deal_hw.transport import WireOptions
 

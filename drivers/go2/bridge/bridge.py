@@ -16,12 +16,12 @@ from deal_hw.drivers.go2.bridge.admission import Admission, Control
 from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits
 from deal_hw.drivers.go2.bridge.mode_question import ModeQuestion
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
 from deal_hw.drivers.go2.motion_switcher import SWITCHER, MotionSwitcher, ServiceClient
+from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Stamp
 from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport

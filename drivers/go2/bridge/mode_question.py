@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 from deal_hw.drivers.go2.bridge.robot_side import BUSY
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.drivers.go2.motion_switcher import BUSY as BUSY_CODE
 from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import FrameError
 from deal_hw.transport import Message
 
