@@ -220,7 +220,7 @@ def test_a_reader_that_stays_away_finds_the_newest(endpoint: str) -> None:
             for number in range(2000):
                 send(number)
             wait_for_arrival(near, (1999).to_bytes(4, "big"), again=lambda: send(1999))
-            numbers = []
+            numbers: list[int] = []
             while not numbers or numbers[-1] != 1999:
                 numbers.append(int.from_bytes(near.receive(5.0).payload, "big"))
     assert len(numbers) <= 257

@@ -20,7 +20,8 @@ def sleeps(source: str) -> list[str]:
     """Return what a test's source calls to sleep, in its own process."""
     tree = ast.parse(source)
     modules = {"time": "time", "asyncio": "asyncio"}
-    functions, real = {}, set()
+    functions: dict[str, str] = {}
+    real: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             modules |= {name.asname or name.name: name.name for name in node.names}

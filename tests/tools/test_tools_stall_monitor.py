@@ -84,6 +84,7 @@ def test_each_processor_is_watched_until_the_block_ends(monkeypatch: pytest.Monk
     try:
         with watch_stalls(-1) as seen:
             for monitor in begun:
+                assert monitor.stdout is not None
                 assert select.select([monitor.stdout], [], [], PATIENCE_S)[0], "it reports no pause"
     except ConfigurationError:
         pytest.skip("SCHED_FIFO is refused here")
