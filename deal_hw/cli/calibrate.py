@@ -36,6 +36,7 @@ from deal_hw.workflows.calibration.settings import (
     OwnDatasetSettings,
     Pairs,
     Triples,
+    doubt_of,
     kind_of,
 )
 from deal_hw.workflows.calibration.space import write_parameters
@@ -107,8 +108,7 @@ class CalibrateOwnDataset(CalibrateOptions, OwnDatasetSettings):
 class CalibrateFiles(CalibrateOptions, FilesSettings):
     """Find the simulator parameters that explain recordings of any robot.
 
-    From its MuJoCo model and recordings of joint positions and commands:
-    deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine
+    From its MuJoCo model and recordings of joint positions and commands.
     """
 
     model: Path = field(kw_only=True)
@@ -124,14 +124,12 @@ class CalibrateFiles(CalibrateOptions, FilesSettings):
 Calibrate: TypeAlias = CalibrateDataset | CalibrateOwnDataset | CalibrateFiles
 
 CLASSES = {"dataset": CalibrateDataset, "own-robot": CalibrateOwnDataset, "model": CalibrateFiles}
+TABLE = {name: dataclasses.replace(kind, settings=CLASSES[name]) for name, kind in RECORDINGS.items()}
 KINDS = Kinds(
     noun="recordings",
-    table=lambda: {
-        name: dataclasses.replace(kind, settings=CLASSES[name]) for name, kind in RECORDINGS.items()
-    },
-    find=lambda given: kind_of(
-        dataset=given.first, model=given.options.get("model"), data="data" in given.options
-    ),
+    table=lambda: TABLE,
+    find=lambda given: kind_of(given.first, given.options.get("model"), given.options, TABLE),
+    doubt=lambda given: doubt_of(given.first),
     argument="dataset",
 )
 

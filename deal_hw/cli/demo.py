@@ -89,7 +89,10 @@ class DemoGo2(Demo):
     """Calibrate from a recording with the body on a stand instead of from the walk."""
 
 
-_TABLE = {"cartpole": InputKind(DemoCartpole), "go2": InputKind(DemoGo2)}
+_TABLE = {
+    "cartpole": InputKind(DemoCartpole, example="cartpole --out runs/demo"),
+    "go2": InputKind(DemoGo2, example="go2 --out runs/demo_go2"),
+}
 KINDS = Kinds(
     noun="robot",
     argument="robot",

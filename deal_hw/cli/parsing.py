@@ -258,7 +258,8 @@ def read_settings(
         words.remove(given.positional[0])
     if helps:
         without = "" if chosen.usage else kinds.argument
-        _print_help(verb, chosen, line, () if HELP_ALL in arguments else verb.common, without)
+        common = () if HELP_ALL in arguments else verb.common
+        _print_help(verb, chosen, line, example_of(name, verb, chosen), common, without)
 
     def having(field: str) -> list[str]:
         return [
@@ -273,7 +274,8 @@ def read_settings(
         if explain is not None:
             explain(words)
         page = f"{line} {HELP_ALL if verb.common else '--help'}"
-        raise ConfigurationError(f"{error}; all options: {page}") from None
+        message = kinds.doubted(given.arguments, str(error))
+        raise ConfigurationError(f"{message}; all options: {page}") from None
     return _parsed(chosen.settings, words, line)
 
 
@@ -299,12 +301,18 @@ def _parsed(settings: type[Any], words: Sequence[str], line: str) -> Any:
         ) from None
 
 
-def _print_help(verb: Verb, kind: InputKind, line: str, common: Collection[str], without: str) -> NoReturn:
+def example_of(name: str, verb: Verb, kind: InputKind) -> str:
+    """Return a working command line of one kind of a verb's input."""
+    return f"deal-hw {verb.example}" if kind.example is None else f"deal-hw {name} {kind.example}".rstrip()
+
+
+def _print_help(
+    verb: Verb, kind: InputKind, line: str, example: str, common: Collection[str], without: str
+) -> NoReturn:
     """Print the options of one kind of a verb's input."""
     rules = Rules(helps=True, common=common, without=without)
     text = inspect.cleandoc(kind.settings.__doc__ or "") or f"{verb.help[:1].upper()}{verb.help[1:]}."
-    if f"deal-hw {verb.example}" not in text:
-        text = f"{text}\n\nExample:  deal-hw {verb.example}"
+    text = f"{text}\n\nExample:  {example}"
     with contextlib.suppress(SystemExit):
         tyro.cli(
             kind.settings,

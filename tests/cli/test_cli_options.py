@@ -221,7 +221,7 @@ def test_a_refused_number_gets_one_line(line: str, words: str, capsys: pytest.Ca
         ),
         (
             "calibrate d --nosuch",
-            "--nosuch: `deal-hw calibrate dataset` has no such option; all",
+            "d does not exist; --nosuch: `deal-hw calibrate dataset` has no such option; all",
         ),
         ("data info", "`deal-hw data info` needs PATH; PATH is: A dataset (DIR) or an episode"),
         ("data info d e", "`deal-hw data info` takes no 'e' there; options begin with --"),

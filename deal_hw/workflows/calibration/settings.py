@@ -6,7 +6,7 @@ with the options that apply to them. :func:`kind_of` chooses one from what was n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -29,7 +29,7 @@ from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
 from deal_hw.workflows.calibration.policy import check_policy_runs, refuse_closed_loop
 from deal_hw.workflows.calibration.source import Division
-from deal_hw.workflows.kinds import InputKind, Kinds
+from deal_hw.workflows.kinds import InputKind, Kinds, fitting
 from deal_hw.workflows.options import File, Ratio, Seed, Threads
 from deal_hw.workflows.robot import carries_robot
 
@@ -388,30 +388,40 @@ class FilesSettings(UserRobotSettings, Recordings):
 
 
 RECORDINGS: Mapping[str, InputKind] = {
-    "dataset": InputKind(DriverDatasetSettings, "a dataset of a robot with a driver"),
-    "own-robot": InputKind(OwnDatasetSettings, "a dataset with its own robot.yaml"),
-    "model": InputKind(FilesSettings, "any robot: its MuJoCo model and its recordings", "--model robot.xml"),
+    "dataset": InputKind(
+        DriverDatasetSettings, "a dataset of a robot with a driver", example="runs/first/dataset"
+    ),
+    "own-robot": InputKind(
+        OwnDatasetSettings, "a dataset with its own robot.yaml", example="runs/mine/dataset --holdout 1"
+    ),
+    "model": InputKind(
+        FilesSettings,
+        "any robot: its MuJoCo model and its recordings",
+        usage="--model robot.xml",
+        example="--model robot.xml --data rec.csv --out runs/mine",
+    ),
 }
 """The kinds of recordings."""
 
 
-def kind_of(*, dataset: Any, model: Any, data: bool) -> str:
+def kind_of(dataset: Any, model: Any, options: Collection[str], table: Mapping[str, InputKind]) -> str:
     """Return the kind of the recordings that were named.
 
     Args:
         dataset: The named dataset, or the name of a kind.
         model: The given model.
-        data: Whether recordings for a model are given.
+        options: The names of all given options.
+        table: The kinds.
 
     Raises:
         ConfigurationError: There is none, or there are two; or a model is named as a dataset.
     """
     if model is None and dataset is not None and Path(dataset).suffix == ".xml":
-        recordings = "" if data else " --data rec.csv"
+        recordings = "" if "data" in options else " --data rec.csv"
         raise ConfigurationError(
             f"{dataset} is a model, not a dataset; name it by --model {dataset}{recordings}"
         )
-    if model is None and dataset is None and data:
+    if model is None and dataset is None and "data" in options:
         raise ConfigurationError("--data needs the robot's model: add --model robot.xml")
     if (dataset is None) == (model is None):
         how = "one of the two" if model is None else "not both"
@@ -421,9 +431,19 @@ def kind_of(*, dataset: Any, model: Any, data: bool) -> str:
         )
     if model is not None:
         return "model"
-    if str(dataset) in RECORDINGS and not Path(dataset).exists():
+    if str(dataset) in table and not Path(dataset).exists():
         return str(dataset)
+    if doubt_of(dataset):
+        # The reader will say that it is not there; until then the options of either kind fit.
+        return fitting({name: table[name] for name in ("dataset", "own-robot")}, options) or "dataset"
     return "own-robot" if carries_robot(dataset_of(dataset)) else "dataset"
+
+
+def doubt_of(dataset: Any) -> str:
+    """Return why the kind of a named dataset is not known; empty if it is, or none is named."""
+    if dataset is None or str(dataset) in RECORDINGS or Path(dataset).exists():
+        return ""
+    return f"{dataset} does not exist"
 
 
 def python_kinds() -> Kinds:
@@ -432,10 +452,12 @@ def python_kinds() -> Kinds:
         noun="recordings",
         table=lambda: RECORDINGS,
         find=lambda given: kind_of(
-            dataset=given.options.get("dataset"),
-            model=given.options.get("model") if given.first is None else given.first,
-            data="data" in given.options,
+            given.options.get("dataset"),
+            given.options.get("model") if given.first is None else given.first,
+            given.options,
+            RECORDINGS,
         ),
+        doubt=lambda given: doubt_of(given.options.get("dataset")),
     )
 
 
