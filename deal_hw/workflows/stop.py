@@ -110,6 +110,7 @@ STOP = robot_kinds(
     {"cartpole": StopCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), StopGo2Settings)},
     plain=StopSettings,
     legged=StopSettings,
+    example="--port {port}",
 )
 """The kinds of :func:`stop`."""
 
