@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -196,10 +197,45 @@ def _cartpole(ask: _Ask) -> Case:
     )
 
 
+BAND_HZ: Final = (0.3, 2.5)
+FAST_HZ: Final = (1.5, 4.0)
+AMPLITUDE: Final = 0.9
+"""Share of a motor's torque."""
+SWING_RAD: Final = 0.2
+"""Swing of a servo's target about the default pose [rad]."""
+_TONES: Final = 3
+
+
+def flail(
+    rng: np.random.Generator, description: RobotDescription, band_hz: tuple[float, float] = BAND_HZ
+) -> Callable[[FloatArray, FloatArray, float], FloatArray]:
+    """Return a behaviour that drives all actuators with sums of sines, which makes an ant hop and slide.
+
+    Args:
+        rng: Draws frequencies and phases.
+        description: The robot; targets of servos stay within its limits.
+        band_hz: Lowest and highest frequency [Hz].
+    """
+    low, high = band_hz
+    count = len(description.actuated)
+    frequency = np.exp(rng.uniform(np.log(low), np.log(high), (count, _TONES)))
+    phase = rng.uniform(0.0, 2 * np.pi, (count, _TONES))
+    rest, swing = np.zeros(count), AMPLITUDE
+    if description.actuation == "position":
+        rest = np.array(description.default_position)[list(description.actuated_index)]
+        swing = SWING_RAD
+    least, most = np.array(description.limits.target).T
+
+    def behaviour(position: FloatArray, velocity: FloatArray, at_s: float) -> FloatArray:
+        wave = np.sin(2 * np.pi * frequency * at_s + phase).sum(axis=1)
+        return np.asarray(np.clip(rest + swing * wave, least, most))
+
+    return behaviour
+
+
 def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
     """Return a case of a robot that exists only in simulators and reports its whole state."""
     from deal_hw.robots import parameter_spaces, robot_description
-    from deal_hw.robots.simulated_motions import FAST_HZ, flail
 
     if ask.profile != "ideal":
         raise ConfigurationError(f"the {task} has no sensors, so no profile {ask.profile!r}; use ideal")
