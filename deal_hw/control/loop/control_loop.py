@@ -9,7 +9,7 @@ import contextlib
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -40,6 +40,14 @@ class Outcome(enum.Enum):
     """Ended by an error."""
 
 
+HOME_TIMEOUT_S: Final = 20.0
+"""Longest homing [s]."""
+ARM_TIMEOUT_S: Final = 1.0
+"""Longest wait until the robot reports that its motors follow commands [s]."""
+STATE_TIMEOUT_S: Final = 1.0
+"""Longest wait for the first state sample [s]."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopConfig:
     """Settings of one run."""
@@ -50,10 +58,6 @@ class LoopConfig:
     """Compute everything but send no command: the robot is neither homed nor armed."""
     home: bool = True
     """Bring the robot to its start pose first."""
-    home_timeout_s: float = 20.0
-    arm_timeout_s: float = 1.0
-    state_timeout_s: float = 1.0
-    """Longest wait for the first state sample [s]."""
     passive: PassiveConfig = field(default_factory=PassiveConfig)
     """How the passive command is repeated at the end, until the robot confirms it."""
     record_wire: bool = True
@@ -266,15 +270,15 @@ class ControlLoop:
         if c.home and not c.dry_run:
             # Reported before it happens, so that a supervisor that finds this process dead knows whether to
             # send damping.
-            self._progress(HOMING, c.home_timeout_s + c.state_timeout_s + 2.0)
+            self._progress(HOMING, HOME_TIMEOUT_S + STATE_TIMEOUT_S + 2.0)
             self._commanding = self._robot.homes_by_motor
-            self._robot.home(c.home_timeout_s)
+            self._robot.home(HOME_TIMEOUT_S)
         self._await_state()
         if not c.dry_run:
             self._safety.arm(self._input())
-            self._progress(ARMING, c.arm_timeout_s + c.state_timeout_s + 2.0)
+            self._progress(ARMING, ARM_TIMEOUT_S + STATE_TIMEOUT_S + 2.0)
             self._commanding = True
-            self._robot.arm(c.arm_timeout_s)
+            self._robot.arm(ARM_TIMEOUT_S)
             self.note("armed", "the motors follow commands")
             # States that waited in buffers are old; the first cycle uses only newer ones.
             self._drain()
@@ -284,7 +288,7 @@ class ControlLoop:
         self._pending = self._pending[-1:]
 
     def _await_state(self) -> None:
-        self._receive(self._robot.read_state(self._config.state_timeout_s))
+        self._receive(self._robot.read_state(STATE_TIMEOUT_S))
         self._drain()
 
     def _cycles(self) -> tuple[Outcome, str]:

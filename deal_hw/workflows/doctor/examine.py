@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.safety.safety import SafetyConfig
+from deal_hw.control.safety.safety import LINK_ERROR_SHARE
 from deal_hw.data.checks.clock_rate import judge_clock
 from deal_hw.errors import DealHwError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
@@ -222,7 +222,7 @@ def judge_interfaces(port: str) -> Iterator[Finding]:
 
 _FEW_ERRORS = 0.01
 """Accepted share of corrupt and missing states."""
-_TRIPS = SafetyConfig().link_error_share
+_TRIPS = LINK_ERROR_SHARE
 """Share of errors among the states due at which the safety module ends a run: no work is possible."""
 _SLOW = 0.9
 _PATIENCE_S = 1.0
