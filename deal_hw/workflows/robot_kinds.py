@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from deal_hw.errors import ConfigurationError, DealHwError
-from deal_hw.robots import driven_robots, driver_description
+from deal_hw.robots import driven_robots, driver_description, robot_entry
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.robot import is_user_robot
 
@@ -32,7 +32,7 @@ def robot_kinds(
     """Return the kinds of a verb whose first argument is a robot.
 
     Args:
-        own: Robots with settings of their own -> the settings.
+        own: Robots with settings of their own -> the settings; those of a machine hold for all its robots.
         plain: Settings of another robot, such as one of a plug-in.
         legged: Those of another robot with legs.
         file: Those of a robot.yaml; None where the verb takes none.
@@ -43,7 +43,9 @@ def robot_kinds(
     def table() -> Mapping[str, InputKind]:
         found = {} if nothing is None else {"": InputKind(nothing)}
         for name in driven_robots():
-            found[name] = InputKind(own.get(name) or (legged if has_legs(name) else plain))
+            # The same machine on the floor and on a stand has the same options.
+            made = own.get(name) or own.get(robot_entry(name).machine)
+            found[name] = InputKind(made or (legged if has_legs(name) else plain))
         return found if file is None else {**found, FILE: InputKind(file)}
 
     def find(arguments: Arguments) -> str:

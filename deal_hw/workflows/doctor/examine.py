@@ -104,7 +104,7 @@ class DoctorGo2Settings(DoctorRobotSettings):
 
 
 DOCTOR = robot_kinds(
-    {"cartpole": DoctorCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), DoctorGo2Settings)},
+    {"cartpole": DoctorCartpoleSettings, "go2": DoctorGo2Settings},
     plain=DoctorRobotSettings,
     legged=DoctorRobotSettings,
     nothing=DoctorSettings,
