@@ -122,6 +122,8 @@ COLLECT = robot_kinds(
     plain=CollectSettings,
     legged=CollectLeggedSettings,
     file=CollectSimulatedSettings,
+    example="--port {port} --out runs/first",
+    file_example="--simulated --out runs/first",
 )
 """The kinds of :func:`collect`."""
 

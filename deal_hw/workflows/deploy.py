@@ -85,6 +85,7 @@ DEPLOY = robot_kinds(
     plain=DeploySettings,
     legged=DeployLeggedSettings,
     no_file=f"; {page('how-to/add.md')} shows how to write one",
+    example="--port {port} --policy runs/first/policies/policy.onnx",
 )
 """The kinds of :func:`deploy`."""
 

@@ -110,6 +110,7 @@ STOP = robot_kinds(
     {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings},
     plain=StopSettings,
     legged=StopSettings,
+    example="--port {port}",
 )
 """The kinds of :func:`stop`."""
 

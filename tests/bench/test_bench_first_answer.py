@@ -80,7 +80,7 @@ def test_the_go2s_files_are_those_that_its_page_makes(tmp_path: Path) -> None:
     for name in ("columns.yaml", *(f"traj_0_part{k}.npz" for k in range(1, 5))):
         (folder / name).touch()
     config = first_answer.PROBLEMS["go2-suspended"](first_answer._Ask(tmp_path, 0, tmp_path, 1.0))
-    assert [path.name for path in config.recordings.data] == [f"traj_0_part{k}.npz" for k in (1, 2, 3)]
+    assert [path.name for path in config.data] == [f"traj_0_part{k}.npz" for k in (1, 2, 3)]
     assert config.holdout == (folder / "traj_0_part4.npz",)
     page = (Path(__file__).parents[2] / "docs/results/example-go2-suspended.md").read_text(encoding="utf-8")
     assert "--out go2 --parts 4" in page and "traj_0_part4.npz" in page

@@ -34,7 +34,7 @@ from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import NEAR_SPREAD, Eki
 from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
 from deal_hw.calib.validation.checks import Validation
-from deal_hw.calibration import EXPLAINED_CHI2, Budget, Progress
+from deal_hw.calibration import EXPLAINED_CHI2, Budget, CalibrationResult, Progress
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
@@ -177,14 +177,16 @@ class TestDealPaperReplayed(MethodSuite):
     @classmethod
     def case(cls) -> MethodCase:
         """Return the method under test."""
-        case = case_of("deal-paper-replay", Budget(population=100, generations=25), 0.4)
+        case = case_of("deal-paper-replay", Budget(population=10, generations=2), None)
         make = functools.partial(dataclasses.replace, small_problem(), policy=None)
         return dataclasses.replace(case, make_problem=make)
 
-    def test_recovers_a_known_cartpole(self, case: MethodCase) -> None:
+    def test_with_the_same_commands_it_is_the_closed_loop_method(
+        self, case: MethodCase, short: CalibrationResult
+    ) -> None:
         """The small problem's policy sends what was recorded, so both methods end at the same place."""
         closed = case_of("deal-paper", case.budget, case.tolerance).run(case.short_budget)
-        np.testing.assert_array_equal(case.run(case.short_budget).estimate, closed.estimate)
+        np.testing.assert_array_equal(short.estimate, closed.estimate)
 
 
 class TestDealPaperLiteral(MethodSuite):

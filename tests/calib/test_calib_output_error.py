@@ -37,7 +37,7 @@ from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progre
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 HINGE = """
 <mujoco model="hinge">
@@ -88,13 +88,14 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     (folder / "params.yaml").write_text(PARAMETERS)
     for name, phase in (("first", 1.0), ("second", 2.3)):
         (folder / f"{name}.csv").write_text(recording(phase))
-    source = Recordings(
+    source = FilesSettings(
         model=folder / "hinge.xml",
         data=(folder / "first.csv", folder / "second.csv"),
         parameters=folder / "params.yaml",
         holdout_part=0.0,
+        threads=1,
     )
-    work = calibration_input(CalibrateSettings(recordings=source, threads=1))
+    work = calibration_input(source)
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

@@ -12,7 +12,7 @@ import pytest
 from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calibration import read_result
-from deal_hw.cli.calibrate import Calibrate, calibrate, calibrate_or_write_parameters
+from deal_hw.cli.calibrate import CalibrateDataset, CalibrateFiles, calibrate, calibrate_or_write_parameters
 from deal_hw.cli.calibrate_output import print_files
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -22,7 +22,6 @@ from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.workflows.calibration.dataset import choose_episodes
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.calibration.space import without_speed_limits
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
@@ -68,7 +67,7 @@ def realistic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("realistic") / "dataset", [("rich", rich, 4.6)], "realistic")
 
 
-def settings(folder: Path, **changes: object) -> Calibrate:
+def settings(folder: Path, **changes: object) -> CalibrateDataset:
     """Settings of a short calibration of two parameters."""
     values: dict[str, object] = {
         "dataset": folder,
@@ -77,23 +76,22 @@ def settings(folder: Path, **changes: object) -> Calibrate:
         "generations": 12,
         "quiet": True,
     }
-    return Calibrate(**{**values, **changes})  # type: ignore[arg-type]
+    return CalibrateDataset(**{**values, **changes})  # type: ignore[arg-type]
 
 
 def test_a_file_adds_parameters_to_a_robots_own_set(dataset: Path, tmp_path: Path) -> None:
     """Alarms advise to free an encoder's zero or a gear's play: also for robots with a driver."""
     extra = tmp_path / "extra.yaml"
     extra.write_text("parameters:\n  - {kind: encoder_bias, elements: cart}\n")
-    chosen = Recordings(parameters=extra)
-    space = calibration_input(settings(dataset, free=(), recordings=chosen)).space
+    space = calibration_input(settings(dataset, free=(), parameters=extra)).space
     assert space.names == (*k9_space().names, "cart.encoder_bias")
     freed = calibration_input(
-        settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)
+        settings(dataset, free=("cart.mass", "cart.encoder_bias"), parameters=extra)
     ).space
     assert freed.names == ("cart.mass", "cart.encoder_bias")
     extra.write_text("parameters:\n  - {kind: dof_damping, elements: pole, name: twice}\n")
     with pytest.raises(ConfigurationError, match="both set dof_damping of 'pole'"):
-        calibration_input(settings(dataset, free=(), recordings=chosen))
+        calibration_input(settings(dataset, free=(), parameters=extra))
 
 
 def test_writes_everything_a_user_needs(
@@ -145,9 +143,9 @@ def test_a_realistic_robot_is_searched_adversarially(
 
 def test_no_document_of_a_calibration_that_does_not_run(tmp_path: Path) -> None:
     """--write-parameters writes a file and calibrates nothing."""
-    recordings = Recordings(model=tmp_path / "arm.xml", write_parameters=tmp_path / "p.yaml")
+    config = CalibrateFiles(model=tmp_path / "arm.xml", write_parameters=tmp_path / "p.yaml", json=True)
     with pytest.raises(ConfigurationError, match="--json would have no effect: --write-parameters"):
-        calibrate_or_write_parameters(Calibrate(recordings=recordings, json=True))
+        calibrate_or_write_parameters(config)
 
 
 def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import required_policy
@@ -163,7 +163,7 @@ def test_a_file_of_states_is_prepared_with_its_policy(table: Table, policy: Path
     file = tmp_path / "states.csv"
     columns = np.column_stack([table.time_s, table.position, table.velocity])
     np.savetxt(file, columns, delimiter=",", header="time,cart.pos,pole.pos,cart.vel,pole.vel", comments="")
-    settings = CalibrateSettings(recordings=Recordings(model=DESCRIPTION.mjcf, data=(file,)))
+    settings = FilesSettings(model=DESCRIPTION.mjcf, data=(file,))
     with pytest.raises(DatasetError, match="--policy"):
         calibration_input(settings)
     printed: list[str] = []

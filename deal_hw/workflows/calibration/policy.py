@@ -11,29 +11,31 @@ from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.motions.velocity import FixedVelocity, make_source
-from deal_hw.workflows.options import refuse
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.policies.demonstration import PopulationDemonstration
 
 
-def check_policy(method: str, *, given: bool, model: bool, files: bool = False) -> None:
-    """Check that a method suits the source of the recordings.
-
-    Args:
-        method: Name of the method.
-        given: Whether a policy was named.
-        model: Whether the robot is described by the user's own MJCF, named or in the dataset.
-        files: Whether recordings are files; for these a policy gives commands or checks their clock.
+def check_policy_runs(method: str) -> None:
+    """Check that a method runs the policy that moved the robot.
 
     Raises:
-        ConfigurationError: A policy would have no effect, or the method needs one that is unknown.
+        ConfigurationError: It does not, so a named policy would have no effect.
     """
     search = search_of(method)
     if search not in CLOSED_LOOP_METHODS:
-        refuse(["--policy"] if given and not files else [], f"{search} runs no policy")
-    elif model:
+        raise ConfigurationError(f"--policy would have no effect: {search} runs no policy")
+
+
+def refuse_closed_loop(method: str) -> None:
+    """Refuse a method that runs the policy that moved the robot, where nobody knows that policy.
+
+    Raises:
+        ConfigurationError: The method does.
+    """
+    search = search_of(method)
+    if search in CLOSED_LOOP_METHODS:
         raise ConfigurationError(
             f"{search} runs the policy that moved the robot, which is unknown for --model and for "
             "a dataset with its own robot.yaml; use eki, deal or deal-paper-replay"

@@ -109,6 +109,7 @@ DOCTOR = robot_kinds(
     legged=DoctorRobotSettings,
     nothing=DoctorSettings,
     no_file=", so there is no connection to check; `deal-hw robot check robot.yaml` checks its description",
+    example="--port {port}",
 )
 """The kinds of :func:`doctor`."""
 

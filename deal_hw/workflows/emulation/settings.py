@@ -246,7 +246,10 @@ _SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettin
 
 
 def _table() -> dict[str, InputKind]:
-    return {name: InputKind(_SETTINGS.get(name, EmulatePlugInSettings)) for name in emulated_robots()}
+    return {
+        name: InputKind(_SETTINGS.get(name, EmulatePlugInSettings), example=f"{name} --seed 0")
+        for name in emulated_robots()
+    }
 
 
 def _find(arguments: Arguments) -> str:
