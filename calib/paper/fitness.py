@@ -186,9 +186,12 @@ class RolloutView:
 
     def __init__(self, problem: Problem, settings: FitnessSettings) -> None:
         self._problem, self._settings = problem, settings
-        history = 0 if settings.replay else policy_of(problem).history
         most = settings.most_transitions(problem.robot.description.name)
-        self._ticks = [control_ticks(problem, index, most, history) for index in range(len(problem.episodes))]
+        ticks = functools.partial(control_ticks, problem, most=most)
+        if not settings.replay:
+            policy = policy_of(problem)
+            ticks = functools.partial(ticks, history=policy.history, ran_before=policy.ran_before)
+        self._ticks = [ticks(index) for index in range(len(problem.episodes))]
         raw = np.concatenate(
             [
                 demonstration(problem, index, ticks, difference=settings.difference)

@@ -201,6 +201,7 @@ class TestDealPaperLiteral(MethodSuite):
         return dataclasses.replace(case, grows=True)
 
 
+@pytest.mark.slow
 class TestDealPaperLiteralWithoutNoiseAdaptation(MethodSuite):
     """`deal-paper-literal-fn` keeps the contract."""
 
@@ -212,6 +213,7 @@ class TestDealPaperLiteralWithoutNoiseAdaptation(MethodSuite):
         return dataclasses.replace(case, grows=True)
 
 
+@pytest.mark.slow
 class TestDealPaperLiteralWithoutNormalisation(MethodSuite):
     """`deal-paper-literal-pn` keeps the contract in SI units from zero."""
 
@@ -233,6 +235,7 @@ class TestDealPaperLiteralFlat(MethodSuite):
         return case_of("deal-paper-literal-flat", Budget(population=10, generations=3), None)
 
 
+@pytest.mark.slow
 class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
     """`deal-paper-fn` keeps the contract."""
 
@@ -243,6 +246,7 @@ class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
         return case_of("deal-paper-fn", Budget(population=10, generations=2), None)
 
 
+@pytest.mark.slow
 class TestDealPaperWithoutNormalisation(MethodSuite):
     """`deal-paper-pn` keeps the contract in raw units."""
 
