@@ -416,6 +416,16 @@ def test_the_search_of_the_default_is_adversarial() -> None:
     made = make_method("default", refine=True)
     assert isinstance(made, CalibrationPipeline) and isinstance(made.search, Deal)
     assert made.search.settings.features and made.search.settings.trained
+    assert made.search.adversarial
+
+
+def test_a_method_knows_whether_a_critic_learns_and_whether_it_searches() -> None:
+    """The messages follow from the method, whatever its name is."""
+    learning = {name for name in METHODS if make_method(name).adversarial}
+    assert learning >= {"default", "deal", "deal-critic", "deal-paper", "deal-unaligned"}
+    assert not learning & {"eki", "deal-untrained", "deal-no-critic", "deal-paper-mmd", "mmd-unaligned"}
+    assert not learning & NO_DATA_METHODS
+    assert {name for name in METHODS if not make_method(name).moves} == {"nominal"}
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
