@@ -34,7 +34,7 @@ from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 SAMPLES, JOINTS, ACTUATED = 7, 4, (0, 1, 3)
 
@@ -107,9 +107,7 @@ def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds:
     """Return the problem of a simulated robot's recordings."""
     robot = make_robot(kind, 3, fault)
     model, paths, held_out = write(robot, folder, seconds=seconds)
-    work = calibration_input(
-        CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
-    )
+    work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

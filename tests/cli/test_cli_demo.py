@@ -25,7 +25,7 @@ from deal_hw.calibration import percent
 from deal_hw.cli import demo_cartpole, demo_go2, demo_runs
 from deal_hw.cli import deploy as deploy_verb
 from deal_hw.cli import train as train_verb
-from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.demo import KINDS as DEMO
 from deal_hw.cli.demo import Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
@@ -41,6 +41,7 @@ from deal_hw.motions.posture import PostureConfig
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingProgress
+from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
@@ -52,7 +53,7 @@ from deal_hw.workflows.train import run as run_training
 pytestmark = pytest.mark.real_time
 
 
-def beside_in_short(config: Calibrate) -> CalibrateReport:
+def beside_in_short(config: CalibrateDataset) -> CalibrateReport:
     """Calibrate; the search beside it, whose estimates are only noted, gets 20 members and 4 generations."""
     beside = not config.refine
     return calibrate(dataclasses.replace(config, population=20, generations=4) if beside else config)
