@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import examine_recording
-from deal_hw.workflows.calibration.policy_commands import with_policy_commands
 from deal_hw.workflows.calibration.recordings import (
     Recorded,
     at_rest_without_commands,
@@ -125,6 +124,8 @@ def _tables(
     printed: dict[str, str] = {}
     found = [read_tables(sources, columns, facts, say, name, printed) for name, sources in groups]
     if settings.policy is not None:
+        from deal_hw.workflows.calibration.policy_commands import with_policy_commands
+
         policy = Path(settings.policy)
         found = [with_policy_commands(tables, policy, facts, say) for tables in found]
     found = [at_rest_without_commands(tables, facts, say) for tables in found]

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
-from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.motions.velocity import FixedVelocity, make_source
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
@@ -59,6 +57,7 @@ def recorded_policy(
         ConfigurationError: The file is another policy, or the dataset has no copy of it.
         PolicyError: The file cannot be run.
     """
+    from deal_hw.motions.velocity import FixedVelocity, make_source
     from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 
@@ -97,6 +96,8 @@ def recorded_policy(
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:
     """Refuse an episode in which not only the policy moved the robot."""
+    from deal_hw.data.recording.episode_info import motion_of
+
     motion, stands = motion_of(run), bool(run.get("stand", False))
     if motion == "balance" and not stands:
         return
