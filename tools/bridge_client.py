@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -41,11 +41,12 @@ class BridgeClient:
     Args:
         port: End point of the bridge.
         options: Certificates.
+        settings: Further settings of its Zenoh session.
     """
 
-    def __init__(self, port: str, options: WireOptions) -> None:
+    def __init__(self, port: str, options: WireOptions, settings: Mapping[str, Any] | None = None) -> None:
         self._clock = MonotonicClock()
-        self._link = ZenohTransport(port, self._clock, options)
+        self._link = ZenohTransport(port, self._clock, options, settings)
         self._link.declare(publish=[topics.LOW_COMMAND], subscribe=[topics.LOW_STATE, topics.BRIDGE])
         self._encoder = LowCommandEncoder()
         self._gains = np.full(12, STIFFNESS), np.full(12, 1.0)

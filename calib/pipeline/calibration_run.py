@@ -134,14 +134,13 @@ class CalibrationRun:
 
     def say_search(self, why: str = "") -> None:
         """Report that the search begins, of which kind, and why; nothing where it stands in for none."""
-        name = self.attempts.search.name
-        if name == "nominal":
+        search = self.attempts.search
+        if not search.moves:
             return
-        with_critic = name.startswith("deal") and name not in ("deal-no-critic", "deal-untrained")
-        kind = "an adversarial search" if with_critic else "a search"
+        kind = "an adversarial search" if search.adversarial else "a search"
         if self.local is not None:
             why = "the local fit leaves more than noise, so "
-        self.say(BEFORE_SEARCH, f"{why}{kind} follows ({name})")
+        self.say(BEFORE_SEARCH, f"{why}{kind} follows ({search.name})")
 
     def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -34,19 +34,21 @@ from deal_hw.workflows.calibration.settings import FilesSettings
 KEY = ("task", "seed")
 
 
+NEAR: Final = 1.1
+"""Largest held-out error of a first answer, as a multiple of the final one."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstAnswerSettings:
     """Settings of the bench.
 
     Attributes:
-        near: Largest held-out error of a first answer, as a multiple of the final one.
         window_s: Length of held-out predictions [s].
         sysid_window_s: Windows of mujoco.sysid [s]: on the public SO-101 recordings 2 s did best.
         sysid_iterations: Most iterations of its optimiser: its own default.
         seconds: Length of each simulated recording [s]; two are fitted, one is held out.
     """
 
-    near: float = 1.1
     window_s: float = 2.0
     sysid_window_s: float = 2.0
     sysid_iterations: int = 200
@@ -321,7 +323,7 @@ def _compared(
     judged = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads).errors(fits)
     errors = judged.mean()
     ours = [errors[str(i)] for i in range(len(shown))]
-    first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= settings.near * ours[-1])
+    first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= NEAR * ours[-1])
     return {
         "method": method,
         "parameters": len(work.space),

@@ -90,7 +90,7 @@ class ReplaySimulatedSettings(ReplayOptions):
 
 
 _ROBOTS = robot_kinds(
-    {"cartpole": ReplayCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), ReplayGo2Settings)},
+    {"cartpole": ReplayCartpoleSettings, "go2": ReplayGo2Settings},
     plain=ReplaySettings,
     legged=ReplayLeggedSettings,
     file=ReplaySimulatedSettings,

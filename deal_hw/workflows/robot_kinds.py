@@ -40,7 +40,7 @@ def robot_kinds(
     """Return the kinds of a verb whose first argument is a robot.
 
     Args:
-        own: Robots with settings of their own -> the settings.
+        own: Robots with settings of their own -> the settings; those of a machine hold for all its robots.
         plain: Settings of another robot, such as one of a plug-in.
         legged: Those of another robot with legs.
         file: Those of a robot.yaml; None where the verb takes none.
@@ -53,7 +53,9 @@ def robot_kinds(
     def table() -> Mapping[str, InputKind]:
         found = {} if nothing is None else {"": InputKind(nothing, example="")}
         for name in driven_robots():
-            settings = own.get(name) or (legged if has_legs(name) else plain)
+            # The same machine on the floor and on a stand has the same options.
+            settings = own.get(name) or own.get(robot_entry(name).machine)
+            settings = settings or (legged if has_legs(name) else plain)
             found[name] = InputKind(settings, example=f"{name} {example.format(port=usual_port(name))}")
         return found if file is None else {**found, FILE: InputKind(file, example=f"{FILE} {file_example}")}
 

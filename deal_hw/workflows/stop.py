@@ -107,7 +107,7 @@ class StopGo2Settings(StopSettings):
 
 
 STOP = robot_kinds(
-    {"cartpole": StopCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), StopGo2Settings)},
+    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings},
     plain=StopSettings,
     legged=StopSettings,
     example="--port {port}",

@@ -8,7 +8,7 @@ import mujoco
 import pytest
 
 from deal_hw.bench import first_answer
-from deal_hw.bench.first_answer import FirstAnswerSettings, line, run_cell, summary
+from deal_hw.bench.first_answer import NEAR, FirstAnswerSettings, line, run_cell, summary
 from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget
 from deal_hw.cli.bench import bench
@@ -35,7 +35,7 @@ def test_both_answer_on_the_double_pendulum() -> None:
     stages = {one["stage"]: one for one in row["shown"]}
     assert stages["end"]["heldout_rmse"] == row["heldout_rmse"]
     assert 0 < row["first_s"] <= row["seconds"] and 0 < row["first_cpu_s"] <= row["cpu_s"]
-    assert stages[row["first_stage"]]["heldout_rmse"] <= SHORT.near * row["heldout_rmse"]
+    assert stages[row["first_stage"]]["heldout_rmse"] <= NEAR * row["heldout_rmse"]
     assert row["seconds_ratio"] == row["first_s"] / row["sysid_s"]
     assert row["heldout_ratio"] == row["heldout_rmse"] / row["heldout_rmse_sysid"]
     assert row["latency_sysid"] == pytest.approx(row["latency_found"], abs=1e-3)

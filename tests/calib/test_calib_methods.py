@@ -201,6 +201,7 @@ class TestDealPaperLiteral(MethodSuite):
         return dataclasses.replace(case, grows=True)
 
 
+@pytest.mark.slow
 class TestDealPaperLiteralWithoutNoiseAdaptation(MethodSuite):
     """`deal-paper-literal-fn` keeps the contract."""
 
@@ -212,6 +213,7 @@ class TestDealPaperLiteralWithoutNoiseAdaptation(MethodSuite):
         return dataclasses.replace(case, grows=True)
 
 
+@pytest.mark.slow
 class TestDealPaperLiteralWithoutNormalisation(MethodSuite):
     """`deal-paper-literal-pn` keeps the contract in SI units from zero."""
 
@@ -233,6 +235,7 @@ class TestDealPaperLiteralFlat(MethodSuite):
         return case_of("deal-paper-literal-flat", Budget(population=10, generations=3), None)
 
 
+@pytest.mark.slow
 class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
     """`deal-paper-fn` keeps the contract."""
 
@@ -243,6 +246,7 @@ class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
         return case_of("deal-paper-fn", Budget(population=10, generations=2), None)
 
 
+@pytest.mark.slow
 class TestDealPaperWithoutNormalisation(MethodSuite):
     """`deal-paper-pn` keeps the contract in raw units."""
 
@@ -412,6 +416,16 @@ def test_the_search_of_the_default_is_adversarial() -> None:
     made = make_method("default", refine=True)
     assert isinstance(made, CalibrationPipeline) and isinstance(made.search, Deal)
     assert made.search.settings.features and made.search.settings.trained
+    assert made.search.adversarial
+
+
+def test_a_method_knows_whether_a_critic_learns_and_whether_it_searches() -> None:
+    """The messages follow from the method, whatever its name is."""
+    learning = {name for name in METHODS if make_method(name).adversarial}
+    assert learning >= {"default", "deal", "deal-critic", "deal-paper", "deal-unaligned"}
+    assert not learning & {"eki", "deal-untrained", "deal-no-critic", "deal-paper-mmd", "mmd-unaligned"}
+    assert not learning & NO_DATA_METHODS
+    assert {name for name in METHODS if not make_method(name).moves} == {"nominal"}
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])

@@ -175,12 +175,12 @@ def test_a_stand_is_level(axis: int, angle: float, support: Support) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"window_s": 0.0}, {"loaded": 0.2}, {"held_reach_m": 0.1}, {"level_rad": math.nan}]
+    "changes", [{"force_m_s2": 0.0}, {"loaded": 0.2}, {"held_reach_m": 0.1}, {"level_rad": math.nan}]
 )
 def test_settings_that_mean_nothing_are_refused(changes: dict[str, float]) -> None:
     """Neither negative, nor in the wrong order."""
     with pytest.raises(ConfigurationError):
-        SupportConfig(**changes)  # type: ignore[arg-type]
+        SupportConfig(**changes)
 
 
 @pytest.mark.parametrize("profile", ["sensor", "realistic"])

@@ -17,7 +17,6 @@ import psutil
 import pytest
 
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers.transports import zenoh_session
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import (
     ConfigurationError,
@@ -268,13 +267,12 @@ def test_a_taken_port_and_a_foreign_address_are_told_apart(endpoint: str) -> Non
         foreign.open()
 
 
-def test_what_is_no_zenoh_gives_no_session(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_zenoh_gives_no_session() -> None:
     """A server that says nothing is recognised within the time for opening."""
-    monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with pytest.raises(PortNotFoundError, match="something listens there, but it is not Zenoh"):
-            ZenohTransport(f"tcp/127.0.0.1:{port}").open()
+            ZenohTransport(f"tcp/127.0.0.1:{port}", settings={"connect/timeout_ms": 300}).open()
 
 
 def test_an_unknown_host_is_named() -> None:

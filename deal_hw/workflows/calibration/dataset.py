@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
 from deal_hw.data.checks.spikes import SpikeSettings
 from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.policy import recorded_policy
+from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
@@ -61,9 +60,10 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
     space = settings.searched(space)
     episodes = {i: dataset.read(i) for i in (*fit, *held)}
     policy = None
-    if search_of(settings.named()) in CLOSED_LOOP_METHODS:
+    if settings.in_closed_loop:
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
+        say_other_range(policy, robot_name, space, say)
     trajectories, telemetry = sound_recordings(
         {i: episode.trajectory for i, episode in episodes.items()}, dataset.folder, settings.spikes, say
     )

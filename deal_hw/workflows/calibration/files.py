@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import examine_recording
+from deal_hw.workflows.calibration.policy_commands import (
+    at_policy_rate,
+    policy_of_files,
+    with_policy_commands,
+)
 from deal_hw.workflows.calibration.recordings import (
     Recorded,
     at_rest_without_commands,
@@ -58,6 +63,9 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
     facts = joint_facts(path, model)
     fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), facts, say)
     rates = common_rates([*fitted, *held], model, settings.physics_step, settings.window)
+    in_loop = None if settings.policy is None or not settings.in_closed_loop else Path(settings.policy)
+    if in_loop is not None:
+        rates = at_policy_rate(rates, in_loop)
     description = describe(path, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
     parts = without(
@@ -95,6 +103,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
+        policy=None if in_loop is None else policy_of_files(in_loop, description),
     )
 
 
@@ -124,8 +133,6 @@ def _tables(
     printed: dict[str, str] = {}
     found = [read_tables(sources, columns, facts, say, name, printed) for name, sources in groups]
     if settings.policy is not None:
-        from deal_hw.workflows.calibration.policy_commands import with_policy_commands
-
         policy = Path(settings.policy)
         found = [with_policy_commands(tables, policy, facts, say) for tables in found]
     found = [at_rest_without_commands(tables, facts, say) for tables in found]

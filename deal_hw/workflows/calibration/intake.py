@@ -21,6 +21,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
+from deal_hw.workflows.calibration.policy import say_that_alignment_is_better
 from deal_hw.workflows.calibration.settings import (
     CalibrateSettings,
     DriverDatasetSettings,
@@ -140,6 +141,7 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         require_base(robot, source.feet, trajectories)
     known_std, provenance = expected_std(settings.residual_std, robot), dict(source.provenance)
     fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
+    say_that_alignment_is_better(settings.named(), say)
     shown = trajectories[0]
     walks = division is None and all_walk(robot, trajectories)
     if walks:

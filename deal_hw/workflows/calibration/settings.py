@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from deal_hw.calib.pipeline.methods import (
+    CLOSED_LOOP_METHODS,
     DEFAULT_SEARCH,
     SEARCHES,
     SEARCHING,
     check_method,
+    search_of,
     usual_budget,
     with_search,
 )
@@ -147,6 +149,11 @@ class CalibrateSettings(Checked):
     def named(self, pipeline: str = "") -> str:
         """Return the name of a pipeline, by default the one that is asked for, with its search."""
         return with_search(pipeline or self.method or "default", self.search or DEFAULT_SEARCH)
+
+    @property
+    def in_closed_loop(self) -> bool:
+        """Whether the method runs the policy that moved the robot in every simulator."""
+        return search_of(self.named()) in CLOSED_LOOP_METHODS
 
     @property
     def budget(self) -> Budget:
@@ -323,7 +330,13 @@ class UserRobotSettings(Divided, CalibrateSettings):
     def check(self) -> None:
         """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
         super().check()
-        refuse_closed_loop(self.named())
+        if not self.knows_policy:
+            refuse_closed_loop(self.named())
+
+    @property
+    def knows_policy(self) -> bool:
+        """Whether the policy that moved the robot was named."""
+        return False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,7 +363,12 @@ class FilesSettings(UserRobotSettings, Recordings):
 
     policy: File | None = None
     """The policy (.onnx) that moved the robot: it gives the commands of recordings without any, and checks
-    the clock of recorded ones."""
+    the clock of recorded ones. Methods that run it in every simulator need it, such as deal-unaligned."""
+
+    @property
+    def knows_policy(self) -> bool:
+        """Whether the policy that moved the robot was named."""
+        return self.policy is not None
 
     @property
     def judges(self) -> tuple[Any, ...]:
