@@ -350,6 +350,16 @@ class CalibrationMethod(abc.ABC, Generic[ProblemT]):
 
     name: str
 
+    @property
+    def adversarial(self) -> bool:
+        """Whether a critic learns to tell recording and simulation apart."""
+        return False
+
+    @property
+    def moves(self) -> bool:
+        """Whether it looks for other values than the model's own."""
+        return True
+
     @abc.abstractmethod
     def run(
         self,

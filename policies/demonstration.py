@@ -79,6 +79,8 @@ class PopulationDemonstration:
         description: The robot.
         wanted: Commanded velocity of the base: x, y [m/s] and yaw rate [rad/s], for policies that observe it;
             clipped to the range of their training, as in deploying.
+        ran_before: Whether the policy ran before the recordings began; if not, their first command is its
+            first.
         spec_digest: Digest of the policy's spec, training record included.
 
     Raises:
@@ -88,6 +90,7 @@ class PopulationDemonstration:
     policy: InitVar[BatchPolicy]
     description: InitVar[RobotDescription]
     wanted: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ran_before: bool = False
     spec_digest: str = ""
 
     def __post_init__(self, policy: BatchPolicy, description: RobotDescription) -> None:
@@ -97,6 +100,11 @@ class PopulationDemonstration:
         self._policy, self._description = policy, description
         self._scale = np.array(spec.action_scale)
         self._offset = centre(description)
+
+    @property
+    def trained_under(self) -> str:
+        """Digest of the distribution that the policy was trained under; "" where it is unknown."""
+        return self._policy.spec.trained_under
 
     @property
     def history(self) -> int:

@@ -6,7 +6,7 @@ import collections
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -33,6 +33,12 @@ from deal_hw.policies.vector_env import ServoVectorEnv
 from deal_hw.policy import Observation
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 
+CLIP: Final = 0.2
+"""Largest relative change of an action's probability in an update: the value of PPO's authors (arXiv
+1707.06347)."""
+TRACE: Final = 0.95
+"""Lambda of the generalised advantage estimate, from the same paper."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PpoConfig:
@@ -46,9 +52,7 @@ class PpoConfig:
         batches: Parts of a rollout in each pass.
         learning_rate: Adam's first learning rate; later it follows ``divergence``.
         divergence: Kullback-Leibler divergence of an update for which the learning rate is tuned [nat].
-        clip: Largest relative change of an action's probability in an update.
         gamma: Discount per tick.
-        trace: Lambda of the generalised advantage estimate.
         entropy: Weight of the entropy of the actions.
         exploration: Standard deviation of the first actions.
         reward_scale: Factor on the rewards for the critic.
@@ -62,9 +66,7 @@ class PpoConfig:
     batches: int = 4
     learning_rate: float = 1e-3
     divergence: float = 0.01
-    clip: float = 0.2
     gamma: float = 0.99
-    trace: float = 0.95
     entropy: float = 0.005
     exploration: float = 0.5
     reward_scale: float = 0.02
@@ -72,8 +74,8 @@ class PpoConfig:
 
     def __post_init__(self) -> None:
         positive = "steps rollout epochs batches learning_rate divergence "
-        positive += "clip exploration reward_scale checkpoint_updates"
-        check_config(self, positive, "gamma trace")
+        positive += "exploration reward_scale checkpoint_updates"
+        check_config(self, positive, "gamma")
 
 
 class PpoTrainer:
@@ -167,9 +169,9 @@ class _Learner:
             storage,
             num_learning_epochs=config.epochs,
             num_mini_batches=config.batches,
-            clip_param=config.clip,
+            clip_param=CLIP,
             gamma=config.gamma,
-            lam=config.trace,
+            lam=TRACE,
             entropy_coef=config.entropy,
             learning_rate=config.learning_rate,
             desired_kl=config.divergence,

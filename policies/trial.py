@@ -41,6 +41,12 @@ _DYING_S: Final = 1.0
 _ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
+MEMORY_BYTES: Final = 2**30
+"""Memory for loading and running, beyond what onnxruntime itself uses."""
+SEED: Final = 0
+"""Seeds the random observations."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialSettings:
     """Limits and size of a trial.
@@ -49,18 +55,14 @@ class TrialSettings:
         processor_s: Processor time for loading and all observations together, whole seconds [s]; 0.1 s is
             usual. A busy computer does not use it up.
         time_limit_s: Time for start, loading and all observations together [s]; 0.5 s is usual.
-        memory_bytes: Memory for loading and running, beyond what onnxruntime itself uses.
         nominal: Observations of the robot at rest in its default pose.
         random: Random observations, within the ranges of the description.
-        seed: Seeds these.
     """
 
     processor_s: int = 10
     time_limit_s: float = 60.0
-    memory_bytes: int = 2**30
     nominal: int = 20
     random: int = 100
-    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +126,7 @@ class TrialPolicy:
                     "deal_hw.policies.trial_process",
                     str(fd),
                     str(os.getpid()),
-                    str(settings.memory_bytes),
+                    str(MEMORY_BYTES),
                     str(settings.processor_s),
                     str(self.path),
                 ],
@@ -279,7 +281,7 @@ def try_policy(
     source = GivenVelocity()
     behaviour = PolicyBehaviour(policy, description, source)
     states = ProbeStates(description)
-    rng = np.random.default_rng(settings.seed)
+    rng = np.random.default_rng(SEED)
     times: dict[str, list[float]] = {}
     for probe in (*states.nominal(settings.nominal), *states.extreme(), *states.random(settings.random, rng)):
         if probe.fresh:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -14,10 +14,10 @@ import numpy as np
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.realtime import FIFO_PRIORITY, priority
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.rpc import decode_request
+from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Echoes
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import TransportError, TransportTimeoutError
@@ -41,11 +41,12 @@ class BridgeClient:
     Args:
         port: End point of the bridge.
         options: Certificates.
+        settings: Further settings of its Zenoh session.
     """
 
-    def __init__(self, port: str, options: WireOptions) -> None:
+    def __init__(self, port: str, options: WireOptions, settings: Mapping[str, Any] | None = None) -> None:
         self._clock = MonotonicClock()
-        self._link = ZenohTransport(port, self._clock, options)
+        self._link = ZenohTransport(port, self._clock, options, settings)
         self._link.declare(publish=[topics.LOW_COMMAND], subscribe=[topics.LOW_STATE, topics.BRIDGE])
         self._encoder = LowCommandEncoder()
         self._gains = np.full(12, STIFFNESS), np.full(12, 1.0)

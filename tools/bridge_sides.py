@@ -21,7 +21,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.realtime import become_realtime, die_with_parent
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
+from deal_hw.drivers.transports.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import TransportError, TransportTimeoutError
 from deal_hw.robots import make_topic_transport
 from deal_hw.transport import Message, WireOptions

@@ -20,6 +20,7 @@ multicast, which a network of its own allows:
 from __future__ import annotations
 
 import json
+import math
 import os
 import pty
 import re
@@ -112,7 +113,7 @@ def run_in_terminal(
     output, seen, keys = "", 0, list(client.keys)
     begin_s = time.monotonic()
     due_s: float | None = None
-    stopped = False
+    stop_at_s: float | None = None
     try:
         while True:
             passed_s = time.monotonic() - begin_s
@@ -120,9 +121,12 @@ def run_in_terminal(
                 process.kill()
                 output += f"\nstopped after {client.limit_s:g} s\n"
                 break
-            if client.stop_after_s and passed_s > client.stop_after_s and not stopped:
+            # Counted from its first output: a start on a busy machine takes longer than this time.
+            if output and stop_at_s is None:
+                stop_at_s = passed_s + (client.stop_after_s or math.inf)
+            if stop_at_s is not None and passed_s > stop_at_s:
                 process.send_signal(signal.SIGINT)
-                stopped = True
+                stop_at_s = math.inf
             if select.select([master], [], [], 0.1)[0]:
                 try:
                     data = os.read(master, 4096)

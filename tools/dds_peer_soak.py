@@ -28,9 +28,9 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.realtime import become_realtime
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
+from deal_hw.drivers.transports.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.transport import Message, WireOptions
 

@@ -86,7 +86,7 @@ def stop_supervisor(rig: Rig) -> None:
     control = rig.control_pid()
     rig.signal(rig.run.pid, signal.SIGSTOP)
     with contextlib.suppress(TimeoutError):
-        rig.until(lambda: process_state(control) in "ZX", 10.0)
+        rig.until(lambda: process_state(control) in "ZX")
     rig.run.send_signal(signal.SIGCONT)
 
 
@@ -98,7 +98,7 @@ def suspend(rig: Rig) -> None:
 
 def _go_on(rig: Rig) -> None:
     """Wait until the run has stopped, check that the motors do not obey, and let it go on."""
-    stopped = rig.until(lambda: process_state(rig.run.pid) == "T", 20.0)
+    stopped = rig.until(lambda: process_state(rig.run.pid) == "T")
     if not stopped:
         rig.notes.append("it ended instead of stopping")
         return

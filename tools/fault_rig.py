@@ -27,8 +27,8 @@ from deal_hw.workflows.emulation.process import EmulatorProcess
 
 UNDER_TEST = os.environ.get("DEAL_HW_PYTHON", sys.executable)
 """Python of the deal-hw under test, perhaps of an older checkout; emulator and judgement are of this one."""
-PATIENCE_S = 75.0
-"""A run that takes longer than this hangs [s]."""
+PATIENCE_S = 240.0
+"""A run that takes longer than this hangs; a busy machine takes ten times as long as a quiet one [s]."""
 CONNECTING, TAKING_OVER, ARMING, RISING, RUNNING, LYING_DOWN, ENDING = (
     "connecting",
     "taking over",
@@ -238,7 +238,7 @@ class Rig(ABC):
                 self.events.append((host_ns, what))
                 self._events_at = file.tell()
 
-    def until(self, ready: Callable[[], Any], seconds: float = 40.0) -> Any:
+    def until(self, ready: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
         """Return the result of ``ready`` as soon as it is true; None if the run ended before.
 
         Raises:

@@ -15,9 +15,9 @@ from measuring import Rows, line, markdown, parser
 from deal_hw.drivers.go2.descriptions.leg_geometry import foot_loads, foot_positions
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.support import read_support
+from deal_hw.drivers.transports import topics
 
 SITUATIONS = {
     "lying, limp": {"sport": ""},

@@ -40,23 +40,35 @@ from deal_hw.motions.scores.velocity_error import velocity_error
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.types import FloatArray, RobotState
 from deal_hw.workflows.emulation.virtual_go2 import VirtualWalk, walk
-from deal_hw.workflows.emulation.walk_script import PROFILE, PROFILE_S
+from deal_hw.workflows.emulation.walk_script import PROFILE, PROFILE_S, Walk
 from deal_hw.workflows.shipped import shipped_policy
 
+SCRIPT = Walk(PROFILE, PROFILE_S)
 NAMES = ("stand", "ahead", "left", "turn")
-"""Durations of the profile's parts."""
+"""Names of the profile's parts."""
 
 
 class Rounds:
-    """The profile, repeated."""
+    """A walk, repeated."""
+
+    def __init__(self, script: Walk) -> None:
+        self._script = script
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
         """Return the velocity of the present part."""
-        part = np.searchsorted([begin for begin, _ in PROFILE], time_s % PROFILE_S, side="right") - 1
-        return np.array(PROFILE[int(part)][1])
+        begins = [begin for begin, _ in self._script.parts]
+        part = np.searchsorted(begins, time_s % self._script.seconds, side="right") - 1
+        return np.array(self._script.parts[int(part)][1])
 
 
-def measure(policy: OnnxPolicy, profile: str, seed: int | None, rounds: int) -> dict[str, Any]:
+def measure(
+    policy: OnnxPolicy,
+    profile: str,
+    seed: int | None,
+    rounds: int,
+    script: Walk = SCRIPT,
+    names: Sequence[str] = NAMES,
+) -> dict[str, Any]:
     """Walk some rounds with one robot.
 
     Args:
@@ -64,16 +76,18 @@ def measure(policy: OnnxPolicy, profile: str, seed: int | None, rounds: int) -> 
         profile: The emulator's profile.
         seed: Seed of its hidden parameters; None: the nominal ones.
         rounds: Number of rounds.
+        script: The walk of a round.
+        names: Names of its parts.
 
     Returns:
         Plain JSON values: end of the run, clipped commands, and mean errors by part [m/s, rad/s].
     """
     truth = nominal_truth(profile) if seed is None else draw_truth(profile, seed)
-    done = walk(truth, policy, Rounds(), rounds * PROFILE_S, record=False)
+    done = walk(truth, policy, Rounds(script), rounds * script.seconds, record=False)
     row: dict[str, Any] = {
         "profile": profile,
         "seed": seed,
-        "seconds": rounds * PROFILE_S,
+        "seconds": rounds * script.seconds,
         "outcome": done.report.outcome.value,
         "reason": done.report.reason,
         "clipped": done.report.clipped,
@@ -84,7 +98,7 @@ def measure(policy: OnnxPolicy, profile: str, seed: int | None, rounds: int) -> 
         columns = ("velocity_error", "yaw_error", "ahead", "left", "turn")
         wanted = {
             ",".join(f"{v:g}" for v in velocity): name
-            for name, (_, velocity) in zip(NAMES, PROFILE, strict=True)
+            for name, (_, velocity) in zip(names, script.parts, strict=True)
         }
         row |= {
             "velocity_error_m_s": round(error.velocity_m_s, 4),

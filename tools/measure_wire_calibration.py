@@ -34,7 +34,7 @@ import numpy as np
 from measuring import Rows, add_seeds, parser, read_rows
 
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.collect import collect
 from deal_hw.drivers.cartpole.chips.avr_device import AvrDevice
@@ -109,7 +109,7 @@ def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[s
             )
     truth = json.loads(truth_file.read_text(encoding="utf-8"))
     found = calibrate(
-        Calibrate(dataset=run / "dataset", out=run, seed=seed, quiet=True, report=False, advise=False)
+        CalibrateDataset(dataset=run / "dataset", out=run, seed=seed, quiet=True, report=False, advise=False)
     ).result
     return _errors(found, truth["parameters"], truth["latency_s"], transport)
 

@@ -6,7 +6,11 @@ A settings class is a dataclass whose name ends in Settings, Config or Options.
 A field counts as set where code outside the class gives it a value:
     by a keyword (or in order) in a call of the class or of a class derived from it, also in ``partial``;
     by ``replace(x, field=...)`` in a file that names the class or its module;
-    by the command line, for a class under ``workflows/`` or ``cli/`` (tyro sets its fields).
+    by the command line, for a class under ``workflows/`` or ``cli/`` (tyro sets its fields), and for a class
+        that is the type of a field there;
+    by text of the user, for a class in a call ``from_values(Class, ...)``: all its fields;
+    by a dict of the product whose keys are fields, for a class that another one names as its ``config``: the
+        tables of the training tasks.
 A field that nobody sets is a constant written as a setting.
 
 Replaced by tests: ``monkeypatch.setattr`` on a name in capitals or on a settings class of the product.
@@ -23,7 +27,6 @@ from typing import Any
 from import_graph import SourceFile
 
 ENDINGS = ("Settings", "Config", "Options")
-PLACES = ("product", "tests", "tools")
 
 
 @dataclass(slots=True)
@@ -35,7 +38,8 @@ class SettingsClass:
         file: Its file, from the root of the checkout.
         fields: Names of its own fields, in order.
         bases: Names of the classes it derives from.
-        set_by: Field -> places (``product``, ``tests``, ``tools``, ``command line``) that give it a value.
+        set_by: Field -> places (``product``, ``tests``, ``tools``, ``command line``,
+            ``text``) that give it a value.
     """
 
     name: str
@@ -72,11 +76,46 @@ def settings_classes(
     for place, trees in (("product", product), *others.items()):
         for tree in trees.values():
             _note_uses(tree, found, "tools" if place == "examples" else place)
+    typed = {
+        name for file in sources.values() if _is_shown(str(file.path)) for name in _field_types(file.tree)
+    }
+    tables = [keys for tree in product.values() for keys in _keys(tree)]
+    configs = {name for tree in product.values() for name in _configs(tree)}
     for one in found.values():
-        if any(part in one.file for part in ("workflows/", "cli/")):
-            for name in one.fields:
-                one.set_by.setdefault(name, set()).add("command line")
+        if _is_shown(one.file) or one.name in typed:
+            _note([one], one.fields, "command line")
+        if one.name in configs:
+            _note([one], (key for keys in tables if keys <= set(one.fields) for key in keys), "product")
     return list(found.values())
+
+
+def _is_shown(path: str) -> bool:
+    """Return whether the command line takes its options from a file's settings."""
+    return any(part in path for part in ("workflows/", "cli/"))
+
+
+def _field_types(tree: ast.Module) -> Iterator[str]:
+    """Yield the names in the types of dataclasses' fields."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and _is_dataclass(node):
+            types = (part.annotation for part in node.body if isinstance(part, ast.AnnAssign))
+            yield from (name.id for one in types for name in ast.walk(one) if isinstance(name, ast.Name))
+
+
+def _keys(tree: ast.Module) -> Iterator[set[str]]:
+    """Yield the keys of a file's dicts whose keys are all text."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Dict):
+            named = [ast.literal_eval(key) for key in node.keys if isinstance(key, ast.Constant)]
+            if all(isinstance(name, str) for name in named):
+                yield set(named)
+
+
+def _configs(tree: ast.Module) -> Iterator[str]:
+    """Yield the classes that a class of the file names as its ``config``."""
+    for node in (part for one in tree.body if isinstance(one, ast.ClassDef) for part in one.body):
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "config":
+            yield ast.unparse(node.value)
 
 
 def replaced_by_tests(sources: Mapping[str, SourceFile], root: Path) -> list[str]:
@@ -146,6 +185,8 @@ def _note_uses(tree: ast.Module, found: Mapping[str, SettingsClass], place: str)
             lineage = list(_lineage(found[called], found))
             ordered = [name for one in reversed(lineage) for name in one.fields][: len(args)]
             _note(lineage, [*keywords, *ordered], place)
+        elif called == "from_values" and args and (one := found.get(ast.unparse(args[0]))):
+            _note([one], one.fields, "text")
         elif called == "replace":
             _note((one for one in found.values() if one.name in named), keywords, place)
 

@@ -151,6 +151,11 @@ class PopulationPolicy(Protocol):
         """Length of its memory [control periods]."""
         ...
 
+    @property
+    def ran_before(self) -> bool:
+        """Whether it ran before the recordings began; if not, their first command is its first."""
+        ...
+
     def restart(
         self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
     ) -> None:

@@ -24,7 +24,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback, StateStore
 from deal_hw.errors import ConfigurationError, DatasetError, short, shown
 from deal_hw.reading import RECORDING_BYTES, object_of, read_arrays, read_bytes, reading
-from deal_hw.sim.engine.digest import model_digest
+from deal_hw.sim.engine.model import model_digest
 
 State = Mapping[str, Any]
 """Nested mappings and lists of plain JSON values and NumPy arrays."""

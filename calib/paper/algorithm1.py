@@ -153,6 +153,11 @@ class DealPaper(RangedSearch):
     name: str = "deal-paper"
     stepper = _DealPaper
 
+    @property
+    def adversarial(self) -> bool:
+        """Whether the fitness is the critic's."""
+        return self.settings.fitness == "critic"
+
 
 def paper() -> DealPaper:
     """Return `deal-paper`: Algorithm 1 with our best choice where the paper leaves one."""

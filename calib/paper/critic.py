@@ -12,7 +12,7 @@ import contextlib
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,11 @@ else:
 Samples = npt.NDArray[np.float32]
 
 
+PENALTY: Final = 10.0
+"""Weight of the squared distance of the gradient's norm from one (`PenaltyCritic`): lambda of WGAN-GP, arXiv
+1704.00028."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CriticSettings:
     """Size and training of a critic.
@@ -41,7 +46,6 @@ class CriticSettings:
         updates: Updates n a generation.
         batch: Samples M of each side in one update.
         clip: Weights are cut to [-clip, clip] after each update (`ClippedCritic`).
-        penalty: Weight of the squared distance of the gradient's norm from one (`PenaltyCritic`).
     """
 
     hidden: tuple[int, int] = (256, 256)
@@ -49,7 +53,6 @@ class CriticSettings:
     updates: int = 20
     batch: int = 1024
     clip: float = 0.01
-    penalty: float = 10.0
 
 
 FEATURE_CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
@@ -262,6 +265,6 @@ class PenaltyCritic(Critic):
         (slope,) = torch.autograd.grad(output[ends[1] :].sum(), between, create_graph=True)
         penalty = ((slope.norm(dim=1) - 1) ** 2).mean()
         gap = output[: ends[0]].mean() - output[ends[0] : ends[1]].mean()
-        (-gap + self.settings.penalty * penalty).backward()
+        (-gap + PENALTY * penalty).backward()
         self.optimiser.step()
         return float(gap.detach())

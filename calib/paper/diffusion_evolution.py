@@ -19,7 +19,7 @@ starts.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from scipy.special import logsumexp, softmax
@@ -31,6 +31,10 @@ from deal_hw.types import FloatArray
 Schedule = Literal["cosine", "linear"]
 
 
+ALPHA_LAST: Final = 1e-3
+"""alpha_T: eq. 12 wants about 0; a true 0 would weight all neighbours equally."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiffusionSettings:
     r"""The paper's choices, and ours where it leaves one.
@@ -38,7 +42,6 @@ class DiffusionSettings:
     Attributes:
         generations: Search steps T.
         schedule: How alpha_t falls from 1 to about 0; the paper names none.
-        alpha_last: alpha_T: eq. 12 wants about 0; a true 0 would weight all neighbours equally.
         eta: sigma_t in units of the full DDPM noise; 0 is deterministic DDIM. The paper names no schedule.
         divide_distance: Whether the kernel's squared distance is divided by K. The paper's N(.; ., 1 - alpha)
             is a sum over coordinates. At high K it underflows: each member then has only itself as neighbour.
@@ -51,7 +54,6 @@ class DiffusionSettings:
 
     generations: int = 50
     schedule: Schedule = "cosine"
-    alpha_last: float = 1e-3
     eta: float = 1.0
     divide_distance: bool = True
     temperature: float | None = 0.3
@@ -108,7 +110,7 @@ class DiffusionEvolution(Stateful):
         self._theta = np.array(population, dtype=float)
         self._settings = settings
         self._rng = rng
-        self.alpha = alpha_schedule(settings.generations, settings.schedule, settings.alpha_last)
+        self.alpha = alpha_schedule(settings.generations, settings.schedule, ALPHA_LAST)
         self.t = settings.generations
 
     def ask(self) -> FloatArray:

@@ -66,8 +66,6 @@ class FitnessSettings:
         standardise: Scale transitions to mean 0 and variance 1 over the recording; the paper has no input
             scaling. Standardised inputs are cut at five standard deviations: otherwise a member whose pole
             spins dominates the critic's output, and with it the softmax.
-        bandwidth: Width of `mmd`'s kernel in standardised units; None for the median distance between the
-            recording's transitions.
         critic: Size and training of the critic; None for the paper's.
         replay_generations: Number of generations of rollouts D_S in the critic's training; None for all.
             Algorithm 1 stores rollouts and does not say whether it forgets. A critic that is still trained
@@ -80,7 +78,6 @@ class FitnessSettings:
     replay: bool = False
     difference: bool = False
     standardise: bool = True
-    bandwidth: float | None = None
     critic: CriticSettings | None = None
     replay_generations: int | None = 1
 
@@ -93,8 +90,6 @@ class FitnessSettings:
             raise ConfigurationError(
                 f"replay_generations must be at least 1 or None, got {self.replay_generations}"
             )
-        if self.bandwidth is not None and not self.bandwidth > 0:
-            raise ConfigurationError(f"the bandwidth must be above 0 or None, got {self.bandwidth:g}")
 
     def most_transitions(self, robot: str) -> int:
         """Return the most transitions of a rollout of this robot."""
@@ -191,9 +186,12 @@ class RolloutView:
 
     def __init__(self, problem: Problem, settings: FitnessSettings) -> None:
         self._problem, self._settings = problem, settings
-        history = 0 if settings.replay else policy_of(problem).history
         most = settings.most_transitions(problem.robot.description.name)
-        self._ticks = [control_ticks(problem, index, most, history) for index in range(len(problem.episodes))]
+        ticks = functools.partial(control_ticks, problem, most=most)
+        if not settings.replay:
+            policy = policy_of(problem)
+            ticks = functools.partial(ticks, history=policy.history, ran_before=policy.ran_before)
+        self._ticks = [ticks(index) for index in range(len(problem.episodes))]
         raw = np.concatenate(
             [
                 demonstration(problem, index, ticks, difference=settings.difference)
@@ -267,7 +265,8 @@ class KernelFitness(EnergyFitness):
 
     def _prepare(self, rng: np.random.Generator) -> None:
         super()._prepare(rng)
-        self._bandwidth = self._settings.bandwidth or float(np.median(pdist(self._real)))
+        # In standardised units: the usual choice for a kernel two-sample test (Gretton et al. 2012).
+        self._bandwidth = float(np.median(pdist(self._real)))
 
     def _distance(self, samples: FloatArray) -> float:
         return squared_mmd(self._real, samples, self._bandwidth)

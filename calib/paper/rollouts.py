@@ -56,12 +56,15 @@ class Ticks:
         return np.asarray(self.action[0] + period * np.arange(-len(self.past), 0))
 
 
-def control_ticks(problem: Problem, index: int, most: int | None = None, history: int = 0) -> Ticks:
+def control_ticks(
+    problem: Problem, index: int, most: int | None = None, history: int = 0, *, ran_before: bool = False
+) -> Ticks:
     """Divide an episode into control periods, from its first usable sample to the first gap.
 
     A tick starts at the newest state that the controller can have seen: the last sample before its command
-    acts. At most ``most`` ticks are returned. If the recording begins after the policy did, ``history`` ticks
-    are left out, so that the policy's past is known.
+    acts. At most ``most`` ticks are returned. If the first usable sample comes after the policy's first
+    command, ``history`` ticks are left out, so that the policy's past is known. With ``ran_before`` it does
+    in any case.
 
     Raises:
         InsufficientDataError: There are fewer than two ticks.
@@ -79,7 +82,7 @@ def control_ticks(problem: Problem, index: int, most: int | None = None, history
     number = (at + lead - phase) // period
     start, sample = [], []
     last_usable = first
-    skip = history if number > 0 else 0
+    skip = history if number > 0 or ran_before else 0
     while at <= episode.steps and at in row_of:
         row = row_of[at]
         if not episode.usable[last_usable : row + 1].all():

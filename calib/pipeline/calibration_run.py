@@ -12,16 +12,16 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
-from deal_hw.calib.fit.intervals import Uncertainty
-from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.validation.checks import Validation
-from deal_hw.calib.validation.wider_models import WiderFit
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
+    from deal_hw.calib.fit.intervals import Uncertainty
     from deal_hw.calib.fit.output_error import OutputErrorFit
+    from deal_hw.calib.fit.refinement import Refined
+    from deal_hw.calib.validation.wider_models import WiderFit
 
 SHARED_ERRORS = "errors that commands and measurements share"
 AFTER_FIT = "after the fit"
@@ -134,14 +134,13 @@ class CalibrationRun:
 
     def say_search(self, why: str = "") -> None:
         """Report that the search begins, of which kind, and why; nothing where it stands in for none."""
-        name = self.attempts.search.name
-        if name == "nominal":
+        search = self.attempts.search
+        if not search.moves:
             return
-        with_critic = name.startswith("deal") and name not in ("deal-no-critic", "deal-untrained")
-        kind = "an adversarial search" if with_critic else "a search"
+        kind = "an adversarial search" if search.adversarial else "a search"
         if self.local is not None:
             why = "the local fit leaves more than noise, so "
-        self.say(BEFORE_SEARCH, f"{why}{kind} follows ({name})")
+        self.say(BEFORE_SEARCH, f"{why}{kind} follows ({search.name})")
 
     def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
         """Report a candidate estimate and the stage that found it."""

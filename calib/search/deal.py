@@ -399,6 +399,11 @@ class Deal(Search):
     name: str = "deal"
     stepper = _Deal
 
+    @property
+    def adversarial(self) -> bool:
+        """Whether the critic learns; the variants without it regress on innovations or first weights."""
+        return self.settings.with_critic
+
 
 def critic_alone() -> Deal:
     """Return `deal` that regresses on the critic's features alone."""

@@ -53,6 +53,11 @@ class NoData(Search):
     stepper = _Draw
     settings = NoSettings()
 
+    @property
+    def moves(self) -> bool:
+        """Whether it returns other values than the model's own."""
+        return self.name != "nominal"
+
     def estimate(self, space: ParameterSpace) -> FloatArray:
         """Return the estimate, (K,)."""
         if self.name == "midpoint-linear":

@@ -239,6 +239,11 @@ class Unaligned(Search):
     name: str = "deal-unaligned"
     stepper = _Unaligned
 
+    @property
+    def adversarial(self) -> bool:
+        """Whether the statistics are those of a critic, which learns."""
+        return self.settings.statistics == "critic"
+
 
 def by_critic() -> Unaligned:
     """Return `deal-unaligned`: a critic's features."""

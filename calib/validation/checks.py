@@ -31,6 +31,7 @@ from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import Allows, all_allowed, diagnose
 from deal_hw.calib.validation.residual_place import unexplained_alarm
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Z90, listed
@@ -60,29 +61,6 @@ HALVES = "two halves of the data"
 
 LATENCY = "latency"
 """Name of the latency among the values that a cause moves."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Validation:
-    """Which checks follow a refinement."""
-
-    local_first: bool = True
-    """Refine the nominal values first; where that explains the recordings there is no search."""
-
-    cross_validation: bool = True
-    """Choose among candidate fits by their predictions of data that they left out (`output-error`)."""
-
-    split_half: bool = True
-    """Refine two halves of the data alone and compare."""
-
-    physics_step: bool = True
-    """Predict with half the physics step; intervals include the step's shift."""
-
-    diagnosis: bool = True
-    """Name causes of an unexplained residual."""
-
-    thorough: bool = False
-    """Run checks to their end where they take more physics steps than the fits."""
 
 
 def latency_alarms(problem: Problem, latency_s: float) -> tuple[Finding, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -26,32 +26,22 @@ POLICIES = {
 """The distribution of a policy's training, by the end of its fields' names."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FigureSettings:
-    """Settings of the figures.
-
-    Attributes:
-        colors: Of range ratios, after Okabe and Ito (2008): distinct with any colour vision.
-        markers: Of the same, for print without colours.
-        floor: Smallest drawn parameter error: an exact result has no place on a log scale.
-        decades: Ratio of an axis's values above which it is logarithmic.
-        width: Of a panel [inches].
-        height: Of a panel's title and labels [inches].
-        mark_height: Additional height per method [inches].
-        dpi: Of the PNG.
-    """
-
-    colors: tuple[str, ...] = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-    markers: tuple[str, ...] = ("o", "s", "^", "D")
-    floor: float = 1e-3
-    decades: float = 10.0
-    width: float = 5.6
-    height: float = 1.5
-    mark_height: float = 0.5
-    dpi: int = 110
-
-
-SETTINGS = FigureSettings()
+COLORS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+"""Of range ratios, after Okabe and Ito (2008): distinct with any colour vision."""
+MARKERS: Final = ("o", "s", "^", "D")
+"""Of the same, for print without colours."""
+SMALLEST: Final = 1e-3
+"""Smallest drawn parameter error: an exact result has no place on a log scale."""
+DECADES: Final = 10.0
+"""Ratio of an axis's values above which it is logarithmic."""
+WIDTH: Final = 5.6
+"""Of a panel [inches]."""
+HEIGHT: Final = 1.5
+"""Of a panel's title and labels [inches]."""
+MARK_HEIGHT: Final = 0.5
+"""Additional height per method [inches]."""
+DPI: Final = 110
+"""Of the PNG."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +72,7 @@ class _Panel:
         return np.maximum(np.array(known, dtype=float), self.floor)
 
 
-def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -> None:
+def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw the rows of a bench: a panel for each task and profile, and one for policies, if there are any.
 
     Without any value (every prediction diverged), nothing is drawn.
@@ -90,13 +80,12 @@ def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -
     Args:
         path: The PNG.
         rows: Rows without errors, at least one.
-        settings: Colours and sizes.
     """
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError as err:
         raise MissingExtraError("matplotlib", "bench") from err
-    panels = _panels(rows, settings)
+    panels = _panels(rows)
     trained = [row for row in rows if "angle_error_retrained" in row]
     count = len(panels) + bool(trained)
     if not count:
@@ -104,22 +93,22 @@ def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -
     columns = min(count, 2)
     lines = -(-count // columns)
     marks = max(len({method_name(row) for row in rows}), len(POLICIES))
-    height = settings.height + settings.mark_height * marks
-    figure = Figure(figsize=(settings.width * columns, height * lines), layout="constrained")
+    height = HEIGHT + MARK_HEIGHT * marks
+    figure = Figure(figsize=(WIDTH * columns, height * lines), layout="constrained")
     places = [figure.add_subplot(lines, columns, number + 1) for number in range(count)]
     ratios = sorted({float(row["range_ratio"]) for row in rows})
     for panel, axes in zip(panels, places, strict=False):
-        _methods(axes, panel, ratios, settings)
+        _methods(axes, panel, ratios)
     if trained:
         _policies(places[-1], trained)
     # One legend for all panels: a colour has the same meaning in each.
     named = [pair for axes in places for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
     legend = {label: handle for handle, label in sorted(named, key=lambda pair: "no data" in pair[1])}
     figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=columns + 1, fontsize=9)
-    figure.savefig(path, dpi=settings.dpi)
+    figure.savefig(path, dpi=DPI)
 
 
-def _panels(rows: Sequence[Row], settings: FigureSettings) -> list[_Panel]:
+def _panels(rows: Sequence[Row]) -> list[_Panel]:
     found: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         found.setdefault((row.get("task", "cartpole"), row.get("split") or row["profile"]), []).append(row)
@@ -142,19 +131,19 @@ def _panels(rows: Sequence[Row], settings: FigureSettings) -> list[_Panel]:
                 mark="range ratio {:g}",
                 rows=part,
                 baselines={"midpoint of the range": "null_log_error_x100"},
-                floor=settings.floor,
+                floor=SMALLEST,
             )
         if panel.values(part, panel.field).size:
             panels.append(panel)
     return panels
 
 
-def _methods(axes: Axes, panel: _Panel, ratios: Sequence[float], settings: FigureSettings) -> None:
+def _methods(axes: Axes, panel: _Panel, ratios: Sequence[float]) -> None:
     """Draw a line for each method, with its range ratios below each other."""
     names = list(dict.fromkeys(method_name(row) for row in panel.rows))
     numbers = set()
     for r, ratio in enumerate(ratios):
-        color, marker = settings.colors[r % len(settings.colors)], settings.markers[r % len(settings.markers)]
+        color, marker = COLORS[r % len(COLORS)], MARKERS[r % len(MARKERS)]
         shift = 0.6 * ((r + 0.5) / len(ratios) - 0.5)
         mine = [row for row in panel.rows if row["range_ratio"] == ratio]
         word = panel.mark.format(ratio)
@@ -210,7 +199,7 @@ def _finish(axes: Axes, title: str, numbers: set[int], label: str, upwards: str)
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axes.dataLim.intervalx
-    if low > 0 and high / low > SETTINGS.decades:
+    if low > 0 and high / low > DECADES:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high / low > 100 else (1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -29,9 +29,13 @@ from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 KEY = ("task", "seed")
+
+
+NEAR: Final = 1.1
+"""Largest held-out error of a first answer, as a multiple of the final one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,14 +43,12 @@ class FirstAnswerSettings:
     """Settings of the bench.
 
     Attributes:
-        near: Largest held-out error of a first answer, as a multiple of the final one.
         window_s: Length of held-out predictions [s].
         sysid_window_s: Windows of mujoco.sysid [s]: on the public SO-101 recordings 2 s did best.
         sysid_iterations: Most iterations of its optimiser: its own default.
         seconds: Length of each simulated recording [s]; two are fitted, one is held out.
     """
 
-    near: float = 1.1
     window_s: float = 2.0
     sysid_window_s: float = 2.0
     sysid_iterations: int = 200
@@ -108,16 +110,16 @@ class _Ask:
         return files
 
 
-def _written(robot: PlainRobot, ask: _Ask) -> CalibrateSettings:
+def _written(robot: PlainRobot, ask: _Ask) -> FilesSettings:
     model, fit, held_out = write(robot, ask.folder, seconds=ask.seconds)
-    return CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
+    return FilesSettings(model=model, data=fit, holdout=held_out)
 
 
-def _plain(ask: _Ask, kind: str) -> CalibrateSettings:
+def _plain(ask: _Ask, kind: str) -> FilesSettings:
     return _written(make_robot(kind, ask.seed), ask)
 
 
-def _torque_arm(ask: _Ask) -> CalibrateSettings:
+def _torque_arm(ask: _Ask) -> FilesSettings:
     """Return an arm of two links with torque motors instead of servos."""
     robot = make_robot("double-pendulum", ask.seed)
     gains = {name.partition(".")[0]: value for name, value in _stiffness(robot.model).items()}
@@ -142,7 +144,7 @@ def _stiffness(mjcf: str) -> dict[str, float]:
     return {name: float(kp) for name, kp in re.findall(r'joint="(\w+)" kp="([^"]*)"', mjcf)}
 
 
-def _so101(ask: _Ask) -> CalibrateSettings:
+def _so101(ask: _Ask) -> FilesSettings:
     from deal_hw.robots.so101.description import DESCRIPTION
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
@@ -150,36 +152,36 @@ def _so101(ask: _Ask) -> CalibrateSettings:
     files = ask.recorded("so101", (*fitted, *held_out), page("results/example-so101.md"))
     parameters = ask.folder / "so101.yaml"
     parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
-    recordings = Recordings(
+    return FilesSettings(
         model=DESCRIPTION.mjcf,
-        data=tuple(files[: len(fitted)]),
+        data=files[: len(fitted)],
+        holdout=files[len(fitted) :],
         parameters=parameters,
         columns=files[0].with_name("columns.yaml"),
         leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
         fit_seconds=30.0,
         physics_step=0.004,
     )
-    return CalibrateSettings(recordings=recordings, holdout=tuple(files[len(fitted) :]))
 
 
-def _go2(ask: _Ask) -> CalibrateSettings:
+def _go2(ask: _Ask) -> FilesSettings:
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
     parts = [f"traj_0_part{number}" for number in range(1, 5)]
     files = ask.recorded("go2", parts, page("results/example-go2-suspended.md"))
     parameters = ask.folder / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
-    recordings = Recordings(
+    return FilesSettings(
         model=DESCRIPTION.mjcf,
-        data=tuple(files[:3]),
+        data=files[:3],
+        holdout=files[3],
         parameters=parameters,
         columns=files[0].with_name("columns.yaml"),
         window=0.2,
     )
-    return CalibrateSettings(recordings=recordings, holdout=(files[3],))
 
 
-PROBLEMS: Mapping[str, Callable[[_Ask], CalibrateSettings]] = {
+PROBLEMS: Mapping[str, Callable[[_Ask], FilesSettings]] = {
     "double-pendulum": partial(_plain, kind="double-pendulum"),
     "cart-pole": partial(_plain, kind="cart-pole"),
     "torque-arm": _torque_arm,
@@ -270,7 +272,7 @@ class _Shown:
 
 def _compared(
     work: CalibrationInput,
-    config: CalibrateSettings,
+    config: FilesSettings,
     seed: int,
     budget: Budget,
     threads: int | None,
@@ -321,7 +323,7 @@ def _compared(
     judged = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads).errors(fits)
     errors = judged.mean()
     ours = [errors[str(i)] for i in range(len(shown))]
-    first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= settings.near * ours[-1])
+    first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= NEAR * ours[-1])
     return {
         "method": method,
         "parameters": len(work.space),

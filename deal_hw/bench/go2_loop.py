@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -33,12 +33,22 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingFiles
 from deal_hw.workflows.calibrate import calibrate
 from deal_hw.workflows.emulation.virtual_go2 import walk
-from deal_hw.workflows.emulation.walk_script import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
+from deal_hw.workflows.emulation.walk_script import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, Walk, write_script
 from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import train_policy, udr_distribution
 
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
-WALKS: Final = 3
+
+
+class Walks(NamedTuple):
+    """What the robot walks: for the calibration and its test, and how often each policy walks the first."""
+
+    profile: Walk = Walk(PROFILE, PROFILE_S)
+    heldout: Walk = Walk(HELDOUT, HELDOUT_S)
+    repeats: int = 3
+
+
+WALKS: Final = Walks()
 NEXT_NOISE: Final = 100_000
 """Distance between the noise seeds of two walks."""
 KINDS: Final = ("stiffness", "damping")
@@ -59,7 +69,9 @@ def table(settings: Go2Loop) -> RowTable:
     return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
 
 
-def loop_row(profile: str, seed: int, steps: int, *, folder: Path, threads: int | None) -> Row:
+def loop_row(
+    profile: str, seed: int, steps: int, *, folder: Path, threads: int | None, walks: Walks = WALKS
+) -> Row:
     """Run one cell; an error goes into the row, so that the other cells still run.
 
     Args:
@@ -68,6 +80,7 @@ def loop_row(profile: str, seed: int, steps: int, *, folder: Path, threads: int 
         steps: Steps of each fine-tune; 0 for none.
         folder: Folder of recordings and policies.
         threads: Simulation threads.
+        walks: What the robot walks.
     """
     row: Row = {
         "bench": "go2-loop",
@@ -81,21 +94,21 @@ def loop_row(profile: str, seed: int, steps: int, *, folder: Path, threads: int 
         check_truth(walk_space(), truth.walk_parameters())
         out.mkdir(parents=True, exist_ok=True)
         began = time.process_time()
-        dataset = recorded(truth, out)
+        dataset = recorded(truth, out, walks)
         found = calibrate(dataset=dataset, space="walk", holdout=1, seed=seed, threads=threads)
         row |= calibration_part(found.result, truth)
         row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
-        row |= policies_part(found.result, truth, steps, out)
+        row |= policies_part(found.result, truth, steps, out, walks)
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"
     return row
 
 
-def recorded(truth: Go2Truth, out: Path) -> Path:
+def recorded(truth: Go2Truth, out: Path, walks: Walks) -> Path:
     """Let the shipped policy walk the profile and another one, and record both; return the dataset."""
     folder, policy = out / "dataset", OnnxPolicy(required_policy("go2"))
     with Dataset.create_or_open(folder, DRIVER) as store:
-        for name, script, seconds in (("profile", PROFILE, PROFILE_S), ("heldout", HELDOUT, HELDOUT_S))[
+        for name, (script, seconds) in (("profile", walks.profile), ("heldout", walks.heldout))[
             len(store.episodes) :
         ]:
             source = ScriptVelocity(write_script(out / f"{name}.csv", script))
@@ -135,7 +148,7 @@ def calibration_part(result: CalibrationResult, truth: Go2Truth) -> Row:
     return row
 
 
-def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: Path) -> Row:
+def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: Path, walks: Walks) -> Row:
     """Fine-tune the shipped policy in three ways, and let all four walk; without steps the shipped one."""
     space = walk_space()
     values = np.array([truth.walk_parameters()[name] for name in space.names])
@@ -154,19 +167,19 @@ def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: P
             files = TrainingFiles(checkpoint=file.with_suffix(".safetensors"), start=start)
             policy = train_policy("go2", under[name], file, seed=truth.seed, steps=steps, files=files)
             row[f"cpu_seconds_train_{name}"] = round(time.process_time() - began, 1)
-        row |= {f"{key}_{name}": value for key, value in score(truth, policy, out).items()}
+        row |= {f"{key}_{name}": value for key, value in score(truth, policy, out, walks).items()}
     return row
 
 
-def score(truth: Go2Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
+def score(truth: Go2Truth, policy: OnnxPolicy, out: Path, walks: Walks) -> dict[str, Any]:
     """Let a policy walk the profile several times, each with other noise; return its errors by the truth.
 
     They are mean errors [m/s, rad/s] of the walks that lasted long enough, and the number of falls.
     """
-    source, errors, falls = ScriptVelocity(write_script(out / "profile.csv", PROFILE)), [], 0
-    for number in range(WALKS):
+    source, errors, falls = ScriptVelocity(write_script(out / "profile.csv", walks.profile.parts)), [], 0
+    for number in range(walks.repeats):
         noisy = dataclasses.replace(truth, seed=truth.seed + number * NEXT_NOISE)
-        done = walk(noisy, policy, source, PROFILE_S, record=False)
+        done = walk(noisy, policy, source, walks.profile.seconds, record=False)
         falls += done.report.outcome is not Outcome.FINISHED
         error = None if done.wanted is None else velocity_error(done.track, done.wanted)
         if error is not None:
@@ -201,7 +214,8 @@ def summary(rows: Sequence[Row]) -> list[str]:
         found = [row[f"velocity_error_{name}"] for row in whole]
         falls = sum(row[f"falls_{name}"] for row in whole)
         lines.append(
-            f"{name}: velocity error {np.mean(found):.3f} m/s, {falls} falls in {WALKS * len(whole)} walks"
+            f"{name}: velocity error {np.mean(found):.3f} m/s, {falls} falls in "
+            f"{WALKS.repeats * len(whole)} walks"
         )
     if whole:
         gains = np.array([row["velocity_error_udr_more"] - row["velocity_error_calibrated"] for row in whole])

@@ -27,7 +27,15 @@ from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import HELDOUT_PART, CalibrateSettings
+from deal_hw.workflows.calibration.settings import (
+    HELDOUT_PART,
+    CalibrateSettings,
+    DatasetSettings,
+    FilesSettings,
+    Recordings,
+    UserRobotSettings,
+    python_kinds,
+)
 from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
@@ -35,32 +43,35 @@ UNTOLD = frozenset({"nominal", "output-error"})
 """Methods that need no expected prediction error."""
 
 
-def calibrate_settings(settings: Real) -> CalibrateSettings:
+def source_of(settings: Real) -> CalibrateSettings:
     """Return the settings of a calibration that reads the recordings as ``deal-hw calibrate`` does.
 
     Raises:
-        ConfigurationError: No recordings were named, or a file of parameters is to be written.
+        ConfigurationError: No recordings were named, or both.
+        UnknownNameError: A setting does not apply to such recordings.
     """
-    if settings.recordings.write_parameters is not None:
-        raise ConfigurationError(
-            "--write-parameters: `deal-hw calibrate` writes that file; edit it, and name it here by "
-            "--parameters"
-        )
-    if settings.recordings.model is None and settings.dataset is None:
+    recordings = settings.recordings
+    if recordings.model is None and settings.dataset is None:
         raise ConfigurationError(
             "bench real needs --model robot.xml --data rec.csv ... or --dataset DIR, and --holdout other.csv "
             "(of a dataset episodes) or a part of each recording (--holdout-part)"
         )
-    return CalibrateSettings(
-        dataset=settings.dataset,
-        recordings=settings.recordings,
+    named = {} if settings.dataset is None else {"dataset": settings.dataset}
+    for entry in dataclasses.fields(Recordings):
+        value = getattr(recordings, entry.name)
+        if value != entry.default:
+            named[entry.name] = value
+    source: CalibrateSettings = python_kinds().make(
+        "bench real",
+        **named,
         holdout=tuple(int(str(one)) if str(one).isdigit() else one for one in settings.holdout),
         heldout_window=settings.heldout_window,
         residual_std=settings.residual_std,
         # A file of parameters has ranges of its own.
-        range_ratio=settings.range_ratio if settings.recordings.parameters is None else None,
+        range_ratio=settings.range_ratio if recordings.parameters is None else None,
         threads=settings.threads,
     )
+    return source
 
 
 def prepare(source: CalibrateSettings, *, quiet: bool = False) -> CalibrationInput:
@@ -74,15 +85,17 @@ def prepare(source: CalibrateSettings, *, quiet: bool = False) -> CalibrationInp
         ConfigurationError: A setting cannot be used.
         DatasetError: A recording cannot be used.
     """
-    source.check()
     return calibration_input(source, say=silent if quiet else to_stderr)
 
 
 def split_name(source: CalibrateSettings) -> str:
     """Return the name of the held-out part."""
-    if source.holdout:
-        return "+".join(Path(str(one)).stem for one in source.holdout)
-    part = source.recordings.holdout_part
+    judges: tuple[Any, ...] = ()
+    if isinstance(source, DatasetSettings | FilesSettings):
+        judges = source.judges
+    if judges:
+        return "+".join(Path(str(one)).stem for one in judges)
+    part = source.holdout_part if isinstance(source, UserRobotSettings) else None
     share = HELDOUT_PART if part is None else part
     return f"last {share:.0%}"
 
@@ -116,11 +129,10 @@ def table(settings: Real) -> RowTable:
     """
     for method in settings.methods:
         check_method(method)
-    source = calibrate_settings(settings)
+    source = source_of(settings)
     work = prepare(source, quiet=settings.quiet)
-    model = source.recordings.model
-    task = work.robot.description.name if model is None else model.stem
-    split, expected = split_name(source), expected_std(work, source.known_std(work.robot), settings.threads)
+    task = Path(source.model).stem if isinstance(source, FilesSettings) else work.robot.description.name
+    split, expected = split_name(source), expected_std(work, work.known_std, settings.threads)
     run = partial(
         run_cell,
         work,

@@ -93,6 +93,8 @@ class Bench(Checked):
     work: ClassVar[str]
     """MODULE:FUNCTION that takes these settings. It returns the bench's table, or does all by itself and
     returns the exit code."""
+    example: ClassVar[str] = ""
+    """Options in the example of its help."""
 
     out: Path | None = None
     """File of the rows, by default BENCH.json; the CSV and the figure lie beside it."""
@@ -195,6 +197,7 @@ class FixedRange(KnownTruth):
     """Calibrate robots with drawn truths in a fixed range."""
 
     name: ClassVar[str] = "fixed-range"
+    example: ClassVar[str] = "--task cartpole --methods default,eki"
 
     profile: Profile = "sensor"
     """Profile of the emulated robots."""
@@ -205,6 +208,7 @@ class Paper(FixedRange):
     """DEAL's protocol: the robot to find is the nominal model."""
 
     name: ClassVar[str] = "paper"
+    example: ClassVar[str] = "--task cartpole --methods deal-paper"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,6 +216,7 @@ class Mismatch(KnownTruth):
     """Calibrate robots with effects that no simulator here models (profile realistic)."""
 
     name: ClassVar[str] = "mismatch"
+    example: ClassVar[str] = "--task cartpole"
     profile: ClassVar[str] = "realistic"
 
 
@@ -221,6 +226,7 @@ class Loop(SeededBench):
 
     name: ClassVar[str] = "loop"
     work: ClassVar[str] = "deal_hw.bench.loop:table"
+    example: ClassVar[str] = "--profile sensor --seeds 0,1"
 
     profile: Profile = "sensor"
     """Profile of the emulated robots."""
@@ -241,6 +247,7 @@ class Go2Loop(SeededBench):
 
     name: ClassVar[str] = "go2-loop"
     work: ClassVar[str] = "deal_hw.bench.go2_loop:table"
+    example: ClassVar[str] = "--seeds 0,1"
 
     profile: Profile = "sensor"
     """Profile of the emulated robots."""
@@ -261,6 +268,7 @@ class Transfer(TaskBench):
 
     name: ClassVar[str] = "transfer"
     work: ClassVar[str] = "deal_hw.bench.transfer:table"
+    example: ClassVar[str] = "--task cartpole"
 
     methods: Methods = (
         "udr",
@@ -294,6 +302,7 @@ class Speed(TaskBench):
 
     name: ClassVar[str] = "speed"
     work: ClassVar[str] = "deal_hw.bench.speed:table"
+    example: ClassVar[str] = "--task cartpole,go2"
 
     space: str = ""
     """Parameter set of the task; its default where nothing is named."""
@@ -314,6 +323,7 @@ class Real(SearchingBench):
 
     name: ClassVar[str] = "real"
     work: ClassVar[str] = "deal_hw.bench.real:table"
+    example: ClassVar[str] = "--model robot.xml --data rec.csv --holdout other.csv"
 
     recordings: Recordings = field(default_factory=Recordings)
 
@@ -349,6 +359,7 @@ class Verdict(SearchingBench):
 
     name: ClassVar[str] = "verdict"
     work: ClassVar[str] = "deal_hw.bench.verdict:table"
+    example: ClassVar[str] = "--problems pendulum --faults none,friction"
 
     problems: Problems = ()
     """Robots, comma separated; by default all: pendulum, double-pendulum, arm, cart-pole, leg."""
@@ -366,6 +377,7 @@ class FirstAnswer(SearchingBench):
 
     name: ClassVar[str] = "first-answer"
     work: ClassVar[str] = "deal_hw.bench.first_answer:table"
+    example: ClassVar[str] = "--problems double-pendulum"
 
     problems: Problems = ()
     """Robots, comma separated; by default all: double-pendulum, cart-pole, torque-arm, so101,

@@ -20,7 +20,7 @@ import numpy as np
 
 from deal_hw.bench.rows import Cells, Row, RowTable, printed
 from deal_hw.bench.settings import Speed
-from deal_hw.bench.tasks import Case, check_tasks, make_case
+from deal_hw.bench.tasks import TASKS, Case, check_tasks, make_case
 from deal_hw.errors import DealHwError
 from deal_hw.workflows.calibration.run import calibrate_episodes
 
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calibration import CalibrationResult
     from deal_hw.types import FloatArray
-
-PAPER_SECONDS: Final = {"allegro": 3245.0, "ant": 98.0, "cartpole": 75.0, "go2": 303.0, "humanoid": 103.0}
-"""DEAL on an i5-14600KF and an RTX 4060 Ti, 50 generations of 200 members (Table 3) [s]."""
 
 REPETITIONS: Final = 5
 """Number of rollouts of bare physics; the median counts."""
@@ -138,7 +135,7 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
         "seconds_physics": physics_s,
         "seconds_physics_constant": result.steps * constant_s,
         "ratio": result.seconds / physics_s,
-        "paper_seconds": PAPER_SECONDS.get(case.task),
+        "paper_seconds": TASKS[case.task].paper_s,
         "load": os.getloadavg()[0],
     }
 
@@ -209,7 +206,7 @@ def summary(rows: Sequence[Row]) -> list[str]:
             )
     for (task, method, population, generations), group in groups.items():
         seconds, ratio = (statistics.median(row[name] for row in group) for name in ("seconds", "ratio"))
-        paper = PAPER_SECONDS.get(task)
+        paper = TASKS[task].paper_s if task in TASKS else None
         beside = f"; the paper: {paper:.0f} s on a GPU" if paper else ""
         found.append(
             f"{task} {method}, {population} x {generations}: {seconds:.1f} s, {ratio:.2f} times bare physics"

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.rows import Cells, Row, RowTable, describe_call
 from deal_hw.bench.scores import error_percent, log_error_x100
 from deal_hw.bench.settings import Transfer
-from deal_hw.bench.tasks import Case, check_tasks, make_case
+from deal_hw.bench.tasks import TASKS, Case, check_tasks, make_case
 from deal_hw.bench.transfer_figure import draw_transfer
 from deal_hw.bench.transfer_target import WORKS, judged, speed_profile, truth_of
 from deal_hw.calib.pipeline.methods import check_method, is_default, usual_budget
@@ -40,24 +40,6 @@ from deal_hw.workflows.train import nominal_distribution, train_policy, udr_dist
 
 WITHOUT_DATA: Final = ("udr", "nominal", "oracle")
 """Methods that read no demonstration."""
-
-STEPS: Final[Mapping[str, int]] = {
-    "cartpole": 24_000,
-    "ant": 60_000,
-    "go2": 300_000,
-    "humanoid": 60_000,
-    "allegro": 60_000,
-}
-"""Steps of a fine-tune, by task. On seed 0 the oracle's return on the cart-pole is 11 after 2000 steps, 157
-after 16 000 and 212 after 24 000; on the ant it rises from 284 to 479. The Go2 has those of `go2-loop`. Those
-of humanoid and hand are not tuned."""
-
-BASE_SEED: Final = {"cartpole": 1}
-"""Training seed of a base policy that the bench trains itself, where it is not 0: that of the shipped one."""
-
-OTHER_DEMONSTRATOR: Final = frozenset({"go2"})
-"""Tasks in which the shipped demonstration policy moves the target: the Go2's walking policy asks for more
-torque than the model of its calibration allows."""
 
 SHORTEST_S: Final = 0.5
 """A shorter demonstration is none [s]."""
@@ -126,7 +108,7 @@ def table(settings: Transfer) -> RowTable:
     common = [
         Setting(
             task=task,
-            steps=settings.steps or STEPS[task],
+            steps=settings.steps or TASKS[task].train_steps,
             seconds=settings.demonstration_seconds,
             base=given.get(task),
             folder=settings.beside("policies"),
@@ -222,7 +204,7 @@ def base_policy(setting: Setting, say: Say = silent) -> Path:
         say(f"{task}: training the base policy of all rows under uniform randomisation, once: {path}")
         checkpoint = path.with_suffix(".safetensors")
         files = TrainingFiles(checkpoint=checkpoint, resume=checkpoint.exists())
-        seed = BASE_SEED.get(task, 0)
+        seed = TASKS[task].base_seed
         train_policy(task, udr_distribution(task), path, seed=seed, files=files)
     check_base(task, path)
     return path
@@ -242,7 +224,7 @@ def draw_target(setting: Setting, seed: int, base: Path) -> HiddenTarget:
         seed,
         setting.range_ratio,
         by_policy=True,
-        checkpoint=None if setting.task in OTHER_DEMONSTRATOR else base,
+        checkpoint=None if TASKS[setting.task].shown_by_shipped else base,
         seconds=setting.seconds,
     )
     lasted_s = float(case.fit.time_s[-1] - case.fit.time_s[0])
@@ -383,8 +365,8 @@ def _trained_part(
     policy = _fine_tuned(setting, seed, method, target, distribution)
     began = time.monotonic()
     row = judged(setting.task, target.truth, policy, seed)
-    if setting.task == "go2":
-        row |= speed_profile(target.truth, policy, seed)
+    if TASKS[setting.task].walks:
+        row |= speed_profile(setting.task, target.truth, policy, seed)
     record = json.loads(policy.path.with_suffix(".json").read_text(encoding="utf-8"))
     return row | {
         "seconds_train": record["seconds"],

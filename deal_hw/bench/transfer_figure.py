@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.bench.figures import SETTINGS, FigureSettings
+from deal_hw.bench.figures import DPI, HEIGHT, MARK_HEIGHT, WIDTH
 from deal_hw.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -20,13 +20,12 @@ COLOURS = ("#000000", "#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d
 """Of methods, after Okabe and Ito (2008)."""
 
 
-def draw_transfer(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -> None:
+def draw_transfer(path: Path, rows: Sequence[Row]) -> None:
     """Draw a panel for each task, and two with the speeds of the Go2 of the first seed, if there is one.
 
     Args:
         path: The PNG.
         rows: Rows without errors, at least one.
-        settings: Sizes.
     """
     try:
         from matplotlib.figure import Figure
@@ -39,16 +38,14 @@ def draw_transfer(path: Path, rows: Sequence[Row], settings: FigureSettings = SE
     count = len(tasks) + len(axes_names)
     columns = min(count, 2)
     lines = -(-count // columns)
-    height = settings.height + settings.mark_height * len({row["method"] for row in rows})
-    figure = Figure(
-        figsize=(settings.width * columns, max(height, 3.0) * lines), layout="constrained", dpi=settings.dpi
-    )
+    height = HEIGHT + MARK_HEIGHT * len({row["method"] for row in rows})
+    figure = Figure(figsize=(WIDTH * columns, max(height, 3.0) * lines), layout="constrained", dpi=DPI)
     places = [figure.add_subplot(lines, columns, number + 1) for number in range(count)]
     for task, axes in zip(tasks, places, strict=False):
         _returns(axes, task, [row for row in rows if row["task"] == task])
     for axis, axes in zip(axes_names, places[len(tasks) :], strict=True):
         _speeds(axes, axis, walked)
-    figure.savefig(path, dpi=settings.dpi)
+    figure.savefig(path, dpi=DPI)
 
 
 def _returns(axes: Axes, task: str, rows: Sequence[Row]) -> None:

@@ -1,4 +1,4 @@
-"""A hidden target of the transfer bench: the episodes that judge a policy in it, and the Go2's speeds."""
+"""A hidden target of the transfer bench: the episodes that judge a policy, and a walking robot's speeds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.bench.rows import Row
-from deal_hw.bench.tasks import Case
+from deal_hw.bench.tasks import TASKS, Case
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.demonstration import BatchPolicy
 from deal_hw.robots import training_task
@@ -19,11 +19,6 @@ from deal_hw.workflows.robot import described
 EPISODES: Final = 32
 JUDGED: Final = 1_000_000
 """Distance between a training's seed and that of the episodes that judge it."""
-
-UPRIGHT: Final = {"cartpole": 1.0}
-"""Added to a task's reward in each tick without a failure; its cost of failing is left out. The reward of the
-cart-pole lies in (-1, 0]. With this, a return of 0 is a pole that falls at once, and shares of returns have a
-meaning."""
 
 WORKS: Final = 0.9
 """A policy works in a target if its episodes last this share of their time on average."""
@@ -56,7 +51,7 @@ def target_env(task: str, truth: ParameterDistribution, count: int, ticks: int |
         ticks: Control periods of a speed profile; None for the task's own episodes and commands.
     """
     more: dict[str, Any] = {}
-    if task == "go2":
+    if TASKS[task].walks:
         from deal_hw.policies.go2_env import WalkTask
 
         friction = float(load_model(described(task)).model.geom("floor").friction[0])
@@ -77,7 +72,7 @@ def judged(task: str, truth: ParameterDistribution, policy: BatchPolicy, seed: i
     env = target_env(task, truth, EPISODES)
     observation, _ = env.reset(seed=seed + JUDGED)
     going, total, lasted = np.ones(EPISODES, dtype=bool), np.zeros(EPISODES), np.zeros(EPISODES)
-    upright = UPRIGHT.get(task)
+    upright = TASKS[task].upright
     for _ in range(env.ticks):
         observation, reward, terminated, truncated, _ = env.step(policy.act_batch(observation))
         if upright is not None:
@@ -99,6 +94,7 @@ def commands(ahead_m_s: Sequence[float] = AHEAD_M_S, aside_m_s: Sequence[float] 
 
 
 def speed_profile(
+    task: str,
     truth: ParameterDistribution,
     policy: BatchPolicy,
     seed: int,
@@ -114,11 +110,11 @@ def speed_profile(
         Under ``speed``: times [s], commanded and mean speeds in x and y [m/s]; beside it the mean errors of
         the speeds and the number of falls.
     """
-    rate_hz = described("go2").control_rate_hz
+    rate_hz = described(task).control_rate_hz
     asked_for = commands() if profile is None else profile
     wanted = np.repeat(asked_for, round(STEP_S * rate_hz), axis=0)
     # One tick more: the environment restarts a robot in the tick in which its time is over.
-    env = target_env("go2", truth, count, ticks=len(wanted) + 1)
+    env = target_env(task, truth, count, ticks=len(wanted) + 1)
     observation, _ = env.reset(seed=seed + JUDGED)
     going = np.ones(count, dtype=bool)
     speeds = np.zeros((len(wanted), count, 2))

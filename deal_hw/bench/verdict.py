@@ -41,7 +41,7 @@ from deal_hw.testing.plain_robots import (
 )
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 KEY = ("task", "fault", "seed")
 RIGHT = ""
@@ -105,7 +105,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
     row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as name:
         model, fit, held_out = write(robot, Path(name))
-        config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
+        config = FilesSettings(model=model, data=fit, holdout=held_out)
         try:
             work = calibration_input(config, say=messages.append)
             if why := outside_range(work.space, robot.truth):

@@ -15,7 +15,13 @@ from deal_hw.workflows.kinds import InputKind, Kinds
 if TYPE_CHECKING:
     from deal_hw.bench.rows import Row, RowTable
 
-KINDS = Kinds(noun="bench", table=lambda: {name: InputKind(settings) for name, settings in BENCHES.items()})
+KINDS = Kinds(
+    noun="bench",
+    table=lambda: {
+        name: InputKind(settings, example=" ".join(f"{name} {settings.example} --out {name}.json".split()))
+        for name, settings in BENCHES.items()
+    },
+)
 
 
 def bench(settings: Bench) -> int:

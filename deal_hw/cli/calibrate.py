@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import itertools
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
 import tyro
 
@@ -14,6 +18,7 @@ from deal_hw.calibration import Progress
 from deal_hw.cli.calibrate_output import print_files, print_result, print_verdict, show_progress
 from deal_hw.cli.json_output import only_document
 from deal_hw.errors import ConfigurationError
+from deal_hw.ranges import Range
 from deal_hw.workflows.calibration.best_so_far import (
     CHECKPOINT,
     SO_FAR,
@@ -23,31 +28,37 @@ from deal_hw.workflows.calibration.best_so_far import (
 )
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
 from deal_hw.workflows.calibration.run import CalibrateReport, calibrate_input, finish
-from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.settings import (
+    RECORDINGS,
+    CalibrateSettings,
+    DriverDatasetSettings,
+    FilesSettings,
+    OwnDatasetSettings,
+    Pairs,
+    Triples,
+    doubt_of,
+    kind_of,
+)
 from deal_hw.workflows.calibration.space import write_parameters
-from deal_hw.workflows.options import refuse
+from deal_hw.workflows.kinds import Kinds
 from deal_hw.workflows.say import silent, to_stderr
-
-__all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_parameters"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(CalibrateSettings):
-    """Find the simulator parameters that explain a recording.
+class CalibrateOptions(CalibrateSettings):
+    """What the verb can do beside the calibration."""
 
-    From a dataset, of a robot of deal-hw or with its own robot.yaml: deal-hw calibrate runs/first/dataset
+    free: tuple[str, ...] = ()
 
-    Of any robot, from its MuJoCo model and recordings of joint positions and commands:
-    deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine
-    """
+    known: Annotated[Pairs, Range(-1e12, 1e12)] = ()
 
-    dataset: tyro.conf.Positional[Path | None] = None
+    range: Annotated[Triples, Range(-1e12, 1e12)] = ()
+
+    residual_std: tuple[str, ...] = ()
 
     out: Path | None = None
     """Run folder; results go to OUT/calibration. By default the folder that holds the dataset, or
     runs/MODEL."""
-
-    residual_std: tuple[str, ...] = ()
 
     resume: bool = False
     """Continue the calibration that was stopped in this folder; all other settings must be the same."""
@@ -70,6 +81,57 @@ class Calibrate(CalibrateSettings):
 
     quiet: bool = False
     """Print nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateDataset(CalibrateOptions, DriverDatasetSettings):
+    """Find the simulator parameters that explain a dataset of a robot with a driver."""
+
+    dataset: tyro.conf.Positional[Path]
+
+    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOwnDataset(CalibrateOptions, OwnDatasetSettings):
+    """Find the simulator parameters that explain a dataset with its own robot.yaml."""
+
+    dataset: tyro.conf.Positional[Path]
+
+    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
+
+    write_parameters: Path | None = None
+    """Write a --parameters file for the robot's model, to edit, and end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateFiles(CalibrateOptions, FilesSettings):
+    """Find the simulator parameters that explain recordings of any robot.
+
+    From its MuJoCo model and recordings of joint positions and commands.
+    """
+
+    model: Path = field(kw_only=True)
+
+    data: tuple[Path, ...] = field(default=(), kw_only=True)
+
+    holdout: tuple[Path, ...] = ()
+
+    write_parameters: Path | None = None
+    """Write a --parameters file for the model, to edit, and end."""
+
+
+Calibrate: TypeAlias = CalibrateDataset | CalibrateOwnDataset | CalibrateFiles
+
+CLASSES = {"dataset": CalibrateDataset, "own-robot": CalibrateOwnDataset, "model": CalibrateFiles}
+TABLE = {name: dataclasses.replace(kind, settings=CLASSES[name]) for name, kind in RECORDINGS.items()}
+KINDS = Kinds(
+    noun="recordings",
+    table=lambda: TABLE,
+    find=lambda given: kind_of(given.first, given.options.get("model"), given.options, TABLE),
+    doubt=lambda given: doubt_of(given.first),
+    argument="dataset",
+)
 
 
 def check_words(words: Sequence[str]) -> None:
@@ -98,11 +160,15 @@ def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:
     Raises:
         DealHwError: A setting or a recording is unusable; raised before any long work.
     """
-    if config.recordings.write_parameters is not None:
-        refuse(["--json"] if config.json else [], "--write-parameters calibrates nothing")
-        path = write_parameters(config.recordings, config.dataset)
-        model = config.recordings.model
-        source = str(config.dataset) if model is None else f"--model {model} --data ..."
+    if not isinstance(config, CalibrateDataset) and config.write_parameters is not None:
+        if config.json:
+            raise ConfigurationError("--json would have no effect: --write-parameters calibrates nothing")
+        path = write_parameters(config, config.write_parameters)
+        source = (
+            f"--model {config.model} --data ..."
+            if isinstance(config, CalibrateFiles)
+            else str(config.dataset)
+        )
         again = f"deal-hw calibrate {source} --parameters {path}"
         print(f"written: {path}; edit it, then: {again}")
         return 0
@@ -124,7 +190,8 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
-    work = calibration_input(config, say=say)
+    with _without_windows():
+        work = calibration_input(config, say=say)
     method = usual_method(config, work, say)
     with (
         saying_how_to_resume(checkpoint),
@@ -167,6 +234,18 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     return report
 
 
+@contextlib.contextmanager
+def _without_windows() -> Iterator[None]:
+    """Let MuJoCo be loaded without its library for windows, which starts a process to ask for its version."""
+    name, given = "MUJOCO_GL", os.environ.get("MUJOCO_GL")
+    os.environ.setdefault(name, "disable")
+    try:
+        yield
+    finally:
+        if given is None:
+            del os.environ[name]
+
+
 def _print_next(report: CalibrateReport, robot: str, folder: Path) -> None:
     """Print the line that trains with the result, where there is a task and the result can be used."""
     from deal_hw.calib.report.verdict import trust
@@ -180,6 +259,6 @@ def _print_next(report: CalibrateReport, robot: str, folder: Path) -> None:
 def _run_folder(config: Calibrate) -> Path:
     if config.out is not None:
         return config.out
-    if config.dataset is not None:
-        return config.dataset.resolve().parent
-    return Path("runs") / Path(config.recordings.model or "model").stem
+    if isinstance(config, CalibrateFiles):
+        return Path("runs") / config.model.stem
+    return config.dataset.resolve().parent

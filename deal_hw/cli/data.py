@@ -21,7 +21,7 @@ from deal_hw.workflows.import_export import (
     export_recordings,
     import_recordings,
 )
-from deal_hw.workflows.kinds import sub_verbs
+from deal_hw.workflows.kinds import InputKind, sub_verbs
 from deal_hw.workflows.robot import carried_problems, carries_robot
 from deal_hw.workflows.say import to_stderr
 
@@ -66,10 +66,7 @@ class Repair:
 
 @dataclass(frozen=True, kw_only=True)
 class Import(ImportSettings):
-    """Make a dataset from plausible recordings of any robot.
-
-    Example:  deal-hw data import rec.csv --robot robot.yaml --out runs/mine/dataset
-    """
+    """Make a dataset from plausible recordings of any robot."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
 
@@ -82,7 +79,13 @@ class Export(ExportSettings):
 
 
 KINDS = sub_verbs(
-    **{"info": InfoSettings, "verify": Verify, "repair": Repair, "import": Import, "export": Export}
+    **{
+        "info": InputKind(InfoSettings, example="info runs/first/dataset"),
+        "verify": InputKind(Verify, example="verify runs/first/dataset"),
+        "repair": InputKind(Repair, example="repair runs/first/dataset"),
+        "import": InputKind(Import, example="import rec.csv --robot robot.yaml --out runs/mine/dataset"),
+        "export": InputKind(Export, example="export runs/first/dataset --out exported"),
+    }
 )
 
 

@@ -21,11 +21,11 @@ import numpy as np
 from rich.markup import escape
 
 from deal_hw.calibration import CalibrationResult, percent
-from deal_hw.cli.calibrate import CalibrateReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.kinds import InputKind, Kinds
 from deal_hw.workflows.options import Seed
 from deal_hw.workflows.running.report import RunReport
@@ -89,7 +89,10 @@ class DemoGo2(Demo):
     """Calibrate from a recording with the body on a stand instead of from the walk."""
 
 
-_TABLE = {"cartpole": InputKind(DemoCartpole), "go2": InputKind(DemoGo2)}
+_TABLE = {
+    "cartpole": InputKind(DemoCartpole, example="cartpole --out runs/demo"),
+    "go2": InputKind(DemoGo2, example="go2 --out runs/demo_go2"),
+}
 KINDS = Kinds(
     noun="robot",
     argument="robot",

@@ -13,7 +13,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.collect import collect
 from deal_hw.cli.demo import DemoCartpole, Demonstrated, Measure, Stages, read_truth, show_episode
@@ -48,7 +48,7 @@ def run(config: DemoCartpole, folder: RunFolder, stages: Stages) -> Demonstrated
     with _emulated(config) as robot:
         with stages.stage("collect", "4 s of informative motion, and 4 s of other motion as held-out data"):
             rich, chirp = (recorded(partial(robot.collect, kind), kind) for kind in ("rich", "chirp"))
-    calibration = Calibrate(
+    calibration = CalibrateDataset(
         dataset=folder.dataset, out=out, episodes=numbers(rich), holdout=numbers(chirp), seed=config.seed
     )
     with stages.stage("calibrate", "search, refinement, latency, intervals"):

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.calib.report.verdict import trust
-from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.collect import collect
 from deal_hw.cli.demo import DemoGo2, Demonstrated, Measure, Stages, read_truth, show_episode
@@ -29,6 +29,7 @@ from deal_hw.documentation import page
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.motions.scores.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.collect import CollectGo2Settings
 from deal_hw.workflows.emulation.go2 import read_track
 from deal_hw.workflows.emulation.process import EmulatorProcess
@@ -66,7 +67,7 @@ def run(config: DemoGo2, folder: RunFolder, stages: Stages) -> Demonstrated:
     else:
         with stages.stage("calibrate", "gains and friction from joints, feet and IMU; payload from efforts"):
             found = calibrate(
-                Calibrate(
+                CalibrateDataset(
                     dataset=folder.dataset,
                     out=out,
                     space="walk",
@@ -188,7 +189,7 @@ def _on_stand(config: DemoGo2, folder: RunFolder, stages: Stages) -> tuple[Calib
                 runs.append(recorded(partial(_collected, motion), excite))
     with stages.stage("calibrate", "gains, friction and armature of each joint"):
         found = calibrate(
-            Calibrate(
+            CalibrateDataset(
                 dataset=dataset,
                 out=out,
                 episodes=numbers(runs[0]),

@@ -12,6 +12,7 @@ from deal_hw.workflows.emulation.settings import (
     EMULATE,
     EmulateCartpoleSettings,
     EmulateGo2Settings,
+    EmulatePlugInSettings,
     EmulateSettings,
 )
 from deal_hw.workflows.say import to_stderr
@@ -30,6 +31,6 @@ def emulate(config: EmulateSettings) -> int:
             emulate_go2(config, stop, cut, announce=announce, say=to_stderr)
         elif isinstance(config, EmulateCartpoleSettings):
             emulate_cartpole(config, stop, cut, announce=announce, say=to_stderr)
-        else:
+        elif isinstance(config, EmulatePlugInSettings):
             emulate_plug_in(config, stop, cut, announce=announce)
     return 0

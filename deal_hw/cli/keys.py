@@ -18,7 +18,7 @@ from deal_hw.drivers.transports.certificates import (
 )
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
-from deal_hw.workflows.kinds import sub_verbs
+from deal_hw.workflows.kinds import InputKind, sub_verbs
 
 Days = Annotated[float, Range(1, 36500, "days")]
 WARN_DAYS = 30
@@ -73,7 +73,11 @@ class Show(Checked):
     """The folder."""
 
 
-KINDS = sub_verbs(make=Make, add=Add, show=Show)
+KINDS = sub_verbs(
+    make=InputKind(Make, example="make --out keys --robot 192.168.1.20"),
+    add=InputKind(Add, example="add keys observer2"),
+    show=InputKind(Show, example="show keys"),
+)
 
 
 def keys(config: Make | Add | Show) -> int:

@@ -41,9 +41,10 @@ class Verb:
 
     A verb whose options depend on its input has *kinds*. ``config`` then names a ``Kinds`` in its module:
 
-    - Its ``table`` returns kind word -> ``InputKind(settings, help)``; the settings are a frozen dataclass
-      that has only the options that apply. Share options by inheritance, or by groups: a field whose type is
-      another dataclass, with a default factory. Its options need no prefix on the command line.
+    - Its ``table`` returns kind word -> ``InputKind(settings, help, example=...)``; the settings are a frozen
+      dataclass that has only the options that apply, and the example stands in the help of that kind. Share
+      options by inheritance, or by groups: a field whose type is another dataclass, with a default factory.
+      Its options need no prefix on the command line.
     - Its ``find`` returns the kind word from :class:`~deal_hw.workflows.kinds.Arguments`, where the first
       argument alone is none, such as for a path or for ``--model``.
     - ``argument`` is the field that takes the first argument; without it the word only names the kind, as in
@@ -113,6 +114,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             help="find the simulator parameters that explain recordings of any robot (--model)",
             example="calibrate runs/first/dataset",
             extra="calib",
+            config="KINDS",
             function="calibrate_or_write_parameters",
             common="model data columns parameters write_parameters holdout leave_out method "
             "search known space out resume json quiet",

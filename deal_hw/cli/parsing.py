@@ -91,7 +91,7 @@ class Rules:
             self._no_options += [kind for kind in parts if dataclasses.is_dataclass(kind)]
         elif field.name == self._without and self._helps:
             marks.append(tyro.conf.Suppress)
-            field = dataclasses.replace(field, default="")
+            field = dataclasses.replace(field, default=Path() if parts[0] is Path else "")
         elif is_positional(owner, field.name, field.type):
             marks += [tyro.conf.Positional]
             marks[0] = tyro.conf.arg(metavar=field.name.upper(), help_behavior_hint=_default)
@@ -249,15 +249,24 @@ def read_settings(
             _print_and_exit(kinds_page(name, verb, kinds))
         example = f"example: deal-hw {verb.example}; all options: deal-hw {name} --help"
         raise ConfigurationError(f"`deal-hw {name}`: {error}; {example}") from None
+    except ConfigurationError:
+        if explain is not None:
+            explain(words)
+        raise
     line = f"deal-hw {name} {chosen.usage or word}".rstrip()
     if kinds.noun and not kinds.argument:
         words.remove(given.positional[0])
     if helps:
         without = "" if chosen.usage else kinds.argument
-        _print_help(verb, chosen, line, () if HELP_ALL in arguments else verb.common, without)
+        common = () if HELP_ALL in arguments else verb.common
+        _print_help(verb, chosen, line, example_of(name, verb, chosen), common, without)
 
     def having(field: str) -> list[str]:
-        return [f"{name} {one}" for one, kind in kinds.table().items() if field in options_of(kind.settings)]
+        return [
+            f"{name} {kind.usage or one}"
+            for one, kind in kinds.table().items()
+            if field in options_of(kind.settings)
+        ]
 
     try:
         check(line, words, chosen.settings, having)
@@ -265,7 +274,8 @@ def read_settings(
         if explain is not None:
             explain(words)
         page = f"{line} {HELP_ALL if verb.common else '--help'}"
-        raise ConfigurationError(f"{error}; all options: {page}") from None
+        message = kinds.doubted(given.arguments, str(error))
+        raise ConfigurationError(f"{message}; all options: {page}") from None
     return _parsed(chosen.settings, words, line)
 
 
@@ -291,12 +301,18 @@ def _parsed(settings: type[Any], words: Sequence[str], line: str) -> Any:
         ) from None
 
 
-def _print_help(verb: Verb, kind: InputKind, line: str, common: Collection[str], without: str) -> NoReturn:
+def example_of(name: str, verb: Verb, kind: InputKind) -> str:
+    """Return a working command line of one kind of a verb's input."""
+    return f"deal-hw {verb.example}" if kind.example is None else f"deal-hw {name} {kind.example}".rstrip()
+
+
+def _print_help(
+    verb: Verb, kind: InputKind, line: str, example: str, common: Collection[str], without: str
+) -> NoReturn:
     """Print the options of one kind of a verb's input."""
     rules = Rules(helps=True, common=common, without=without)
     text = inspect.cleandoc(kind.settings.__doc__ or "") or f"{verb.help[:1].upper()}{verb.help[1:]}."
-    if f"deal-hw {verb.example}" not in text:
-        text = f"{text}\n\nExample:  deal-hw {verb.example}"
+    text = f"{text}\n\nExample:  {example}"
     with contextlib.suppress(SystemExit):
         tyro.cli(
             kind.settings,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from deal_hw.workflows.kinds import sub_verbs
+from deal_hw.workflows.kinds import InputKind, sub_verbs
 from deal_hw.workflows.robot import CheckRobotSettings, NewRobotSettings, RobotCheck, check_robot, new_robot
 
 
@@ -25,7 +25,10 @@ class Check(CheckRobotSettings):
     robot: tyro.conf.Positional[Path]
 
 
-KINDS = sub_verbs(new=New, check=Check)
+KINDS = sub_verbs(
+    new=InputKind(New, example="new robot.xml"),
+    check=InputKind(Check, example="check robot.yaml"),
+)
 
 
 def robot(config: New | Check) -> int | RobotCheck:

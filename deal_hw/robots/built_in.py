@@ -70,7 +70,7 @@ CARTPOLE: Final = RobotEntry(
         WireEntry(
             name="serial",
             transport="serial",
-            emulator="deal_hw.drivers.cartpole.emulator.emulator:serial_emulator",
+            emulator="deal_hw.drivers.cartpole.emulator.serial_emulator:serial_emulator",
         ),
         WireEntry(
             name="can",

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from pathlib import Path
+from typing import Any, Protocol
 
-from deal_hw.testing.faults import FaultRates
+import numpy as np
+
+from deal_hw.testing.faults import FaultRates, FrameFaults
+from deal_hw.testing.pseudo_terminal import PortFaults, PseudoTerminal, SteppedDevice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +28,11 @@ class EmulatorRequest:
         freeze_after_s: The firmware hangs this long after the first command; None: never [s].
         cut_after_s: The wire is cut this long after the first command; None: never [s].
         cut_s: How long it is cut [s].
+        port: Where to listen, as after ``--port``; "": at the wire's ``emulator_port``, or at a
+            pseudo-terminal.
+        link: A symbolic link to make to the pseudo-terminal; None for none.
+        vanish_after_s: The pseudo-terminal vanishes this long after the first command; None: never [s].
+        return_after_s: It comes back under the link this long after that; None: it does not [s].
     """
 
     wire: str
@@ -36,6 +45,10 @@ class EmulatorRequest:
     freeze_after_s: float | None = None
     cut_after_s: float | None = None
     cut_s: float = 1.0
+    port: str = ""
+    link: Path | None = None
+    vanish_after_s: float | None = None
+    return_after_s: float | None = None
 
 
 class Emulation(Protocol):
@@ -67,48 +80,6 @@ class Emulation(Protocol):
         ...
 
 
-class SteppedDevice(Protocol):
-    """A device in virtual device time: bytes in, bytes out. It also fits a ``VirtualTransport``."""
-
-    @property
-    def device_ns(self) -> int:
-        """Device time at which the next tick runs [ns]."""
-        ...
-
-    @property
-    def armed(self) -> bool:
-        """Whether the motor follows commands; times of faults count from its first moment."""
-        ...
-
-    @property
-    def mode(self) -> str:
-        """State of the motor, one word."""
-        ...
-
-    @property
-    def watchdog(self) -> bool:
-        """Whether the device stopped its motor because no commands came."""
-        ...
-
-    @property
-    def trouble(self) -> str:
-        """Current fault; "" for none."""
-        ...
-
-    @property
-    def received_bytes(self) -> int:
-        """Number of bytes from the host."""
-        ...
-
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the host."""
-        ...
-
-    def advance_to(self, device_ns: int) -> bytes:
-        """Run every tick up to and including a time [ns]; return the bytes sent meanwhile."""
-        ...
-
-
 def on_pseudo_terminal(
     device: SteppedDevice, request: EmulatorRequest, truth: Mapping[str, Any]
 ) -> Emulation:
@@ -119,28 +90,29 @@ def on_pseudo_terminal(
         request: What was asked for.
         truth: The hidden parameters, for the report at the end.
     """
-    import numpy as np
-
-    from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
-    from deal_hw.drivers.cartpole.emulator.faults import Hazards
-    from deal_hw.testing.faults import FrameFaults
-
     faults = None
     if request.rates != FaultRates():
         faults = FrameFaults(request.rates, np.random.default_rng([request.seed, 0xFA]), None)
-    hazards = Hazards(
+    hazards = PortFaults(
         freeze_after_s=request.freeze_after_s,
         cut_after_s=request.cut_after_s,
         cut_s=request.cut_s,
+        vanish_after_s=request.vanish_after_s,
+        return_after_s=request.return_after_s,
         faults=faults,
     )
+    return _OnPseudoTerminal(device, truth, request.link, hazards)
 
-    class OnPseudoTerminal(CartpoleEmulator):
-        """The runner of the cart-pole's emulators, with the truth in its report."""
 
-        def report(self) -> dict[str, Any]:
-            """Return the truth and what happened."""
-            return {**truth, **super().report()}
+class _OnPseudoTerminal(PseudoTerminal):
+    """A device behind a pseudo-terminal, with its truth in the report."""
 
-    # It uses what `SteppedDevice` has, and nothing else of its own devices.
-    return OnPseudoTerminal(cast(Any, device), None, hazards)
+    def __init__(
+        self, device: SteppedDevice, truth: Mapping[str, Any], link: Path | None, hazards: PortFaults
+    ) -> None:
+        super().__init__(device, link, hazards)
+        self._truth = truth
+
+    def report(self) -> dict[str, Any]:
+        """Return the truth and what happened."""
+        return {**self._truth, **super().report()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -17,30 +18,20 @@ from deal_hw.types import FloatArray
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawingSettings:
-    """Settings of :func:`draw_robot`.
-
-    Attributes:
-        directions: Points of the outline of round shapes.
-        views: Moments of the motion that choose the view.
-        planar: Largest share of motion across the plane of a planar motion.
-        elevation: Downward angle of the view of spatial motion [rad].
-        margin: Margin around moving parts, share of their size.
-        finest: Precision of outlines, share of the picture.
-        round_size: Least share of the picture's other side: a thin robot is not drawn as a line.
-    """
-
-    directions: int = 240
-    views: int = 40
-    planar: float = 0.02
-    elevation: float = 0.2
-    margin: float = 0.08
-    finest: float = 1e-3
-    round_size: float = 0.35
-
-
-SETTINGS = DrawingSettings()
+OUTLINE_POINTS: Final = 240
+"""Points of the outline of round shapes."""
+VIEWS: Final = 40
+"""Moments of the motion that choose the view."""
+PLANAR_SHARE: Final = 0.02
+"""Largest share of motion across the plane of a planar motion."""
+ELEVATION_RAD: Final = 0.2
+"""Downward angle of the view of spatial motion [rad]."""
+MARGIN: Final = 0.08
+"""Margin around moving parts, share of their size."""
+FINEST: Final = 1e-3
+"""Precision of outlines, share of the picture."""
+LEAST_SIDE: Final = 0.35
+"""Least share of the picture's other side: a thin robot is not drawn as a line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,8 +85,8 @@ def draw_robot(
     still = [robot.model.body_weldid[shape.body] == 0 for shape in shapes]
     if all(still):
         return None
-    seen = motion[:: max(len(motion) // SETTINGS.views, 1)]
-    many = None if reference is None else reference[:-1][:: max(len(motion) // SETTINGS.views, 1)]
+    seen = motion[:: max(len(motion) // VIEWS, 1)]
+    many = None if reference is None else reference[:-1][:: max(len(motion) // VIEWS, 1)]
     centres = _placed(robot, shapes, seen, many)[0][:, np.logical_not(still)]
     view = _view(centres)
     tip = None if reference is None else np.repeat(reference[-1:], len(states), axis=0)
@@ -140,11 +131,11 @@ def _view(centres: FloatArray) -> FloatArray:
     strength, axes = np.linalg.eigh(moved.T @ moved)
     total = max(float(strength.sum()), 1e-300)
     outward = axes[:, 0]
-    if strength[1] < SETTINGS.planar * total:
+    if strength[1] < PLANAR_SHARE * total:
         # Along one line, or at rest, any view across it will do; the one from the side is usual.
         along = axes[:, 2] if abs(axes[2, 2]) < 0.9 and strength[2] > 0 else np.array([1.0, 0, 0])
         outward = np.cross(along, UP)
-    flat = strength[0] < SETTINGS.planar * total
+    flat = strength[0] < PLANAR_SHARE * total
     if abs(outward[2]) > 0.9 and flat:
         outward, up = UP, np.array([0.0, 1.0, 0.0])
     else:
@@ -152,7 +143,7 @@ def _view(centres: FloatArray) -> FloatArray:
         level = level / np.hypot(*level)
         # The world's x or y to the right.
         level = level if level @ (0.3, -1.0) > 0 else -level
-        tilt = 0.0 if flat else SETTINGS.elevation
+        tilt = 0.0 if flat else ELEVATION_RAD
         outward, up = np.array([*(np.cos(tilt) * level), np.sin(tilt)]), UP
     right = np.cross(up, outward)
     right /= np.linalg.norm(right)
@@ -167,7 +158,7 @@ def _outlines(
     found = []
     for shape, centre, frame in zip(shapes, where, turned, strict=True):
         flat = (_surface(shape) @ frame.T + centre) @ view[:2].T
-        found.append(Outline(name=shape.name, points=_hull(flat, SETTINGS.finest * size)))
+        found.append(Outline(name=shape.name, points=_hull(flat, FINEST * size)))
     return tuple(found)
 
 
@@ -179,11 +170,11 @@ def _surface(shape: Shape) -> FloatArray:
         return np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T * shape.size
     radius, half = shape.size[:2]
     if shape.kind == "cylinder":
-        turn = np.linspace(0, 2 * np.pi, SETTINGS.directions // 4, endpoint=False)
+        turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS // 4, endpoint=False)
         ring = radius * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
         return np.concatenate([ring + half * UP, ring - half * UP])
     # Points of a sphere on a spiral from pole to pole.
-    n = SETTINGS.directions
+    n = OUTLINE_POINTS
     z = np.linspace(1 - 1 / n, 1 / n - 1, n)
     angle = np.pi * (1 + 5**0.5) * np.arange(n)
     sphere = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
@@ -216,7 +207,7 @@ def _box(outlines: list[Outline]) -> tuple[float, float, float, float]:
     points = np.concatenate([o.points for o in outlines])
     low, high = points.min(axis=0), points.max(axis=0)
     extent = np.maximum(high - low, 1e-6)
-    size = (1 + 2 * SETTINGS.margin) * np.maximum(extent, SETTINGS.round_size * extent.max())
+    size = (1 + 2 * MARGIN) * np.maximum(extent, LEAST_SIDE * extent.max())
     middle = (low + high) / 2
     left, bottom = middle - size / 2
     return float(left), float(bottom), float(size[0]), float(size[1])

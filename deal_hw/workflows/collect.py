@@ -118,10 +118,12 @@ class CollectSimulatedSettings(MotionOptions):
 
 
 COLLECT = robot_kinds(
-    {"cartpole": CollectCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), CollectGo2Settings)},
+    {"cartpole": CollectCartpoleSettings, "go2": CollectGo2Settings},
     plain=CollectSettings,
     legged=CollectLeggedSettings,
     file=CollectSimulatedSettings,
+    example="--port {port} --out runs/first",
+    file_example="--simulated --out runs/first",
 )
 """The kinds of :func:`collect`."""
 

@@ -81,10 +81,11 @@ class DeployGo2Settings(Go2RunOptions, DeployLeggedSettings):
 
 
 DEPLOY = robot_kinds(
-    {"cartpole": DeployCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), DeployGo2Settings)},
+    {"cartpole": DeployCartpoleSettings, "go2": DeployGo2Settings},
     plain=DeploySettings,
     legged=DeployLeggedSettings,
     no_file=f"; {page('how-to/add.md')} shows how to write one",
+    example="--port {port} --policy runs/first/policies/policy.onnx",
 )
 """The kinds of :func:`deploy`."""
 

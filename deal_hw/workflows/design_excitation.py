@@ -191,8 +191,13 @@ _SETTINGS: dict[str, type[ExcitationSettings]] = {
     "steps": StepsSettings,
     "sway": SwaySettings,
 }
+_ROBOTS = {"sway": "go2"}
 _TABLE = {
-    family: InputKind(settings, usage="ROBOT" if family == "optimal" else f"ROBOT --family {family}")
+    family: InputKind(
+        settings,
+        usage="ROBOT" if family == "optimal" else f"ROBOT --family {family}",
+        example=f"{_ROBOTS.get(family, 'cartpole')} --family {family} --out runs/first/excitation.json",
+    )
     for family, settings in _SETTINGS.items()
 }
 DESIGN_EXCITATION = Kinds(

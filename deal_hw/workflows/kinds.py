@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -25,11 +25,13 @@ class InputKind:
         settings: Its settings: a frozen dataclass that holds the options that apply, and no other.
         help: One line; by default the first line of the settings' docstring.
         usage: What names this kind behind the verb, such as ``--model robot.xml``; by default its own name.
+        example: Working arguments of this kind behind the verb; None: the verb's own example shows it.
     """
 
     settings: type[Any]
     help: str = ""
     usage: str = ""
+    example: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,8 @@ class Kinds:
         find: Returns the name of the kind from the arguments; by default the first argument is the name.
             Empty if the arguments name none. It may raise a DealHwError that tells more than "unknown robot".
             It must not fail because a file is absent: return the kind that will report it.
+        doubt: Returns why ``find`` could only guess, such as a file that is not there; empty if it knew. It
+            comes before what is wrong with the options, which may fit another kind.
         argument: The field that takes the first argument. Empty if that only names the kind, as in
             ``deal-hw data info DIR``; it is then no part of the settings.
     """
@@ -68,6 +72,7 @@ class Kinds:
     noun: str
     table: Callable[[], Mapping[str, InputKind]]
     find: Callable[[Arguments], str] = first_argument
+    doubt: Callable[[Arguments], str] = lambda arguments: ""
     argument: str = ""
 
     def choose(self, arguments: Arguments) -> tuple[str, InputKind]:
@@ -97,20 +102,28 @@ class Kinds:
         """Return settings, as :meth:`settings`; messages name the function that was called."""
         options = dict(named)
         first = values[0] if values else options.pop(self.argument, None)
+        arguments = Arguments(first, options)
         try:
-            kind, chosen = self.choose(Arguments(first, options))
+            kind, chosen = self.choose(arguments)
         except MissingKindError:
             raise TypeError(f"{function}(): missing a required argument: {self.argument!r}") from None
         signature = inspect.signature(chosen.settings)
         for name in named:
             if name not in signature.parameters:
-                raise self._unknown(f"{function} {kind}".rstrip(), chosen.settings, name, function)
+                error = self._unknown(f"{function} {kind}".rstrip(), chosen.settings, name, function)
+                error.args = (self.doubted(arguments, str(error)),)
+                raise error
         try:
             signature.bind(*values, **named)
         except TypeError as error:
             raise TypeError(f"{function}(): {error}") from None
         fitting = {name: _fitting(chosen.settings, name, value) for name, value in named.items()}
         return chosen.settings(*values, **fitting)
+
+    def doubted(self, arguments: Arguments, message: str) -> str:
+        """Return what is wrong with the options, after the reason why their kind may be another one."""
+        reason = self.doubt(arguments)
+        return f"{reason}; {message}" if reason else message
 
     def having(self, name: str) -> list[str]:
         """Return the kinds with a field of that name, in a group of options, too."""
@@ -145,13 +158,20 @@ class Kinds:
         return dataclasses.replace(self, table=table)
 
 
+def fitting(table: Mapping[str, InputKind], options: Iterable[str]) -> str:
+    """Return the first kind that has all these options; empty if none has."""
+    wanted = set(options)
+    found: list[tuple[str, Any]] = [(name, kind.settings) for name, kind in table.items()]
+    return next((name for name, settings in found if wanted <= field_names(settings)), "")
+
+
 class MissingKindError(ConfigurationError):
     """The arguments name no kind."""
 
 
-def sub_verbs(**kinds: type[Any]) -> Kinds:
+def sub_verbs(**kinds: type[Any] | InputKind) -> Kinds:
     """Return the kinds of a verb with sub-verbs, such as ``deal-hw data info``."""
-    table = {name: InputKind(settings) for name, settings in kinds.items()}
+    table = {name: kind if isinstance(kind, InputKind) else InputKind(kind) for name, kind in kinds.items()}
     return Kinds(noun="sub-verb", table=lambda: table)
 
 

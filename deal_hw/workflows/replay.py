@@ -90,16 +90,22 @@ class ReplaySimulatedSettings(ReplayOptions):
 
 
 _ROBOTS = robot_kinds(
-    {"cartpole": ReplayCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), ReplayGo2Settings)},
+    {"cartpole": ReplayCartpoleSettings, "go2": ReplayGo2Settings},
     plain=ReplaySettings,
     legged=ReplayLeggedSettings,
     file=ReplaySimulatedSettings,
+    example="--port {port}",
+    file_example="--simulated",
 )
 
 
 def _table() -> dict[str, InputKind]:
     return {
-        name: dataclasses.replace(kind, usage=f"EPISODE --robot {name}")
+        name: dataclasses.replace(
+            kind,
+            usage=f"EPISODE --robot {name}",
+            example=f"runs/first/dataset/episodes/000000.mcap --robot {kind.example}",
+        )
         for name, kind in _ROBOTS.table().items()
     }
 
@@ -129,7 +135,19 @@ def _takes(settings: Any, options: Mapping[str, Any]) -> bool:
     return "transport" not in options or not transports or options["transport"] in transports
 
 
-REPLAY = Kinds(noun="episode", argument="episode", table=_table, find=_find)
+def _doubt(arguments: Arguments) -> str:
+    """Return why the robot of a recording is not known; empty if it is."""
+    if arguments.first is None or arguments.options.get("robot"):
+        return ""
+    try:
+        path = episode_of(arguments.first)
+        known = _robot_of(path, read_metadata(path))
+    except DealHwError as error:
+        return str(error)
+    return "" if known else f"{path} does not name its robot (--robot)"
+
+
+REPLAY = Kinds(noun="episode", argument="episode", table=_table, find=_find, doubt=_doubt)
 """The kinds of :func:`replay`."""
 
 

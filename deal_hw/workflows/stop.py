@@ -107,9 +107,10 @@ class StopGo2Settings(StopSettings):
 
 
 STOP = robot_kinds(
-    {"cartpole": StopCartpoleSettings, **dict.fromkeys(("go2", "go2_on_stand"), StopGo2Settings)},
+    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings},
     plain=StopSettings,
     legged=StopSettings,
+    example="--port {port}",
 )
 """The kinds of :func:`stop`."""
 

@@ -116,8 +116,9 @@ class TrainOwnSettings(TrainSettings):
 
 
 def _table() -> dict[str, InputKind]:
-    robots = {name: InputKind(TrainRobotSettings) for name in trained_robots()}
-    return {**robots, FILE: InputKind(TrainOwnSettings)}
+    drawn = "--distribution runs/first/calibration/distribution.json --out runs/first"
+    robots = {name: InputKind(TrainRobotSettings, example=f"{name} {drawn}") for name in trained_robots()}
+    return {**robots, FILE: InputKind(TrainOwnSettings, example=f"{FILE} --env my_tasks:MyRobot-v0 {drawn}")}
 
 
 def _find(arguments: Arguments) -> str:

@@ -19,7 +19,7 @@ from typing import Final
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
-from deal_hw.drivers.go2.messages.topics import CLAIM
+from deal_hw.drivers.transports.topics import CLAIM
 from deal_hw.errors import PortBusyError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 

@@ -10,8 +10,8 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.command_echo import CommandEcho
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import FrameError, SafetyError
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand

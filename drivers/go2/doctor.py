@@ -16,13 +16,13 @@ from deal_hw.clock import Clock
 from deal_hw.control.safety.leg_checks import tilt
 from deal_hw.data.checks.clock_rate import judge_clock
 from deal_hw.documentation import page
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.drivers.go2.messages.remote import decode_remote
 from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_simulated
 from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, ServiceClient
 from deal_hw.drivers.go2.state_stream import PERIOD_MS
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Message, TopicTransport

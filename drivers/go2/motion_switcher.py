@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_response, encode_request
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import FrameError, ProtocolError, SafetyError, TransportTimeoutError
 from deal_hw.transport import Message
 

@@ -46,15 +46,15 @@ class Support(enum.Enum):
     """The states do not decide."""
 
 
+WINDOW_S: Final = 0.3
+"""The median of the states in this time is used [s]."""
+LEAST_STATES: Final = 50
+"""Least number of states in that time."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SupportConfig:
     """Limits between floor and stand. They come from the emulator; no real robot was measured."""
-
-    window_s: float = 0.3
-    """The median of the states in this time is used [s]."""
-
-    least_states: int = 50
-    """Least number of states in that time."""
 
     level_rad: float = HELD_TILT_RAD
     """Largest tilt of a body that lies level or hangs level [rad]."""
@@ -121,8 +121,8 @@ def read_support(
         config: The limits between floor and stand.
     """
     config = config or SupportConfig()
-    if len(states) < config.least_states:
-        return _undecided(f"only {len(states)} states came within {config.window_s:g} s", "check the cable")
+    if len(states) < LEAST_STATES:
+        return _undecided(f"only {len(states)} states came within {WINDOW_S:g} s", "check the cable")
     position = np.median([state.position for state in states], axis=0)
     effort = np.median([state.effort for state in states], axis=0)
     orientation = np.median([state.orientation for state in states], axis=0)
@@ -266,7 +266,7 @@ class SupportGuard:
     def _read(self, config: SupportConfig) -> SupportReading:
         """Receive new states for the window's length, and decide."""
         states: list[LowStateFrame] = []
-        until_ns = self._clock.now_ns() + round(config.window_s * 1e9)
+        until_ns = self._clock.now_ns() + round(WINDOW_S * 1e9)
         self._states = states
         try:
             while (left_ns := until_ns - self._clock.now_ns()) > 0:

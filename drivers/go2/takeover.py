@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, ServiceClient
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray

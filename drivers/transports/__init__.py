@@ -1,1 +1,1 @@
-"""Paths for bytes and messages to a robot, one module each, independent of the protocol."""
+"""Paths for bytes and messages to a robot, one module each; DDS needs the Go2's topics and their types."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages.topics import TYPES
 from deal_hw.drivers.transports.dds_discovery import DdsSurvey
 from deal_hw.drivers.transports.dds_domain import acquire_domain, dds_errors, release_domain
 from deal_hw.drivers.transports.dds_session import DdsSession
 from deal_hw.drivers.transports.dds_types import load_types
 from deal_hw.drivers.transports.interfaces import find_interface
+from deal_hw.drivers.transports.topics import TYPES
 from deal_hw.errors import (
     ConfigurationError,
     FrameError,

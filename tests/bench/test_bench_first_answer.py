@@ -8,7 +8,7 @@ import mujoco
 import pytest
 
 from deal_hw.bench import first_answer
-from deal_hw.bench.first_answer import FirstAnswerSettings, line, run_cell, summary
+from deal_hw.bench.first_answer import NEAR, FirstAnswerSettings, line, run_cell, summary
 from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget
 from deal_hw.cli.bench import bench
@@ -35,7 +35,7 @@ def test_both_answer_on_the_double_pendulum() -> None:
     stages = {one["stage"]: one for one in row["shown"]}
     assert stages["end"]["heldout_rmse"] == row["heldout_rmse"]
     assert 0 < row["first_s"] <= row["seconds"] and 0 < row["first_cpu_s"] <= row["cpu_s"]
-    assert stages[row["first_stage"]]["heldout_rmse"] <= SHORT.near * row["heldout_rmse"]
+    assert stages[row["first_stage"]]["heldout_rmse"] <= NEAR * row["heldout_rmse"]
     assert row["seconds_ratio"] == row["first_s"] / row["sysid_s"]
     assert row["heldout_ratio"] == row["heldout_rmse"] / row["heldout_rmse_sysid"]
     assert row["latency_sysid"] == pytest.approx(row["latency_found"], abs=1e-3)
@@ -80,7 +80,7 @@ def test_the_go2s_files_are_those_that_its_page_makes(tmp_path: Path) -> None:
     for name in ("columns.yaml", *(f"traj_0_part{k}.npz" for k in range(1, 5))):
         (folder / name).touch()
     config = first_answer.PROBLEMS["go2-suspended"](first_answer._Ask(tmp_path, 0, tmp_path, 1.0))
-    assert [path.name for path in config.recordings.data] == [f"traj_0_part{k}.npz" for k in (1, 2, 3)]
+    assert [path.name for path in config.data] == [f"traj_0_part{k}.npz" for k in (1, 2, 3)]
     assert config.holdout == (folder / "traj_0_part4.npz",)
     page = (Path(__file__).parents[2] / "docs/results/example-go2-suspended.md").read_text(encoding="utf-8")
     assert "--out go2 --parts 4" in page and "traj_0_part4.npz" in page

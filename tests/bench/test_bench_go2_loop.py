@@ -11,6 +11,7 @@ import pytest
 from deal_hw.bench import go2_loop
 from deal_hw.bench.settings import Go2Loop
 from deal_hw.drivers.go2.emulator.truth import draw_truth
+from deal_hw.workflows.emulation.walk_script import HELDOUT, Walk
 
 
 def row(seed: int, udr_more: float, calibrated: float, falls: int = 0) -> dict[str, Any]:
@@ -62,15 +63,11 @@ def test_a_truth_outside_its_range_is_refused(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_a_walk_tells_gains_payload_and_what_is_to_come(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_walk_tells_gains_payload_and_what_is_to_come(tmp_path: Path) -> None:
     """From 4 s of walking: gains nearer than nominal ones, the payload, and other walks half as wrong."""
-    monkeypatch.setattr(go2_loop, "PROFILE", ((0.0, (0.8, 0.0, 0.0)), (2.0, (0.0, 0.4, 0.8))))
-    monkeypatch.setattr(go2_loop, "PROFILE_S", 4.0)
-    monkeypatch.setattr(go2_loop, "HELDOUT_S", 4.0)
-    monkeypatch.setattr(go2_loop, "WALKS", 1)
-    found = go2_loop.loop_row("realistic", 4, 0, folder=tmp_path, threads=1)
+    first = Walk(((0.0, (0.8, 0.0, 0.0)), (2.0, (0.0, 0.4, 0.8))), 4.0)
+    walks = go2_loop.Walks(first, Walk(HELDOUT, 4.0), repeats=1)
+    found = go2_loop.loop_row("realistic", 4, 0, folder=tmp_path, threads=1, walks=walks)
     assert found["error"] == ""
     assert found["heldout_ratio"] < 0.6
     assert found["stiffness_log_error"] < 0.5 * found["stiffness_log_error_nominal"]
@@ -78,6 +75,6 @@ def test_a_walk_tells_gains_payload_and_what_is_to_come(
     assert found["payload_error_kg"] == pytest.approx(0.0, abs=0.3)
     assert found["velocity_error_udr"] < 0.2 and found["falls_udr"] == 0
     # Resumed, it takes the recordings that are there.
-    assert go2_loop.recorded(draw_truth("realistic", 4), tmp_path / "realistic_4") == (
+    assert go2_loop.recorded(draw_truth("realistic", 4), tmp_path / "realistic_4", walks) == (
         tmp_path / "realistic_4" / "dataset"
     )

@@ -218,7 +218,7 @@ def test_the_walk_follows_growing_speeds() -> None:
     truth = ParameterDistribution.point(distribution.space, distribution.mean, 0.0)
     profile = transfer_target.commands(ahead_m_s=(0.5,), aside_m_s=(0.3,))
     policy = OnnxPolicy(required_policy("go2"))
-    row = transfer_target.speed_profile(truth, policy, 0, count=2, profile=profile)
+    row = transfer_target.speed_profile("go2", truth, policy, 0, count=2, profile=profile)
     speed = row["speed"]
     assert row["falls"] == 0
     assert speed["wanted_x_m_s"] == [0.5] * 5 + [0.0] * 5

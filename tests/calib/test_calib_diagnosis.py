@@ -36,7 +36,7 @@ from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, wr
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
 DAMPING = 2.0
@@ -406,8 +406,7 @@ Truth = tuple[PlainRobot, Problem, Refined]
 def problem_of(robot: PlainRobot, folder: Path) -> Problem:
     """Return the problem of two recordings of 3 s of a robot."""
     model, paths, held_out = write(robot, folder, seconds=3.0)
-    recordings = Recordings(model=model, data=tuple(paths))
-    work = calibration_input(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

@@ -161,6 +161,6 @@ def test_bad_names_and_settings_are_refused(problem: Problem) -> None:
     """Each error says what is known or allowed."""
     with pytest.raises(UnknownNameError, match="unknown fitness 'crtic'; known: critic, trajectory"):
         make_fitness("crtic", problem, np.random.default_rng(0))
-    for name, value in (("window_ticks", 0), ("ticks", 0), ("replay_generations", 0), ("bandwidth", -1.0)):
+    for name, value in (("window_ticks", 0), ("ticks", 0), ("replay_generations", 0)):
         with pytest.raises(ConfigurationError, match=name):
             FitnessSettings(**{name: value})  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.workflows.calibration.intake import CalibrationInput, usual_method
-from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.settings import DriverDatasetSettings
 
 SHARE = 0.04
 """Standard deviation of each parameter before."""
@@ -97,7 +97,7 @@ def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
 
     def method(*, walks: bool, **settings: str) -> str:
         work = cast("CalibrationInput", SimpleNamespace(robot=robot, walks=walks))
-        return usual_method(CalibrateSettings(**settings), work)  # type: ignore[arg-type]
+        return usual_method(DriverDatasetSettings(dataset="d", **settings), work)  # type: ignore[arg-type]
 
     assert method(walks=True) == "gait"
     assert method(walks=False) == "default"

@@ -33,8 +33,8 @@ from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import NEAR_SPREAD, Eki
 from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
-from deal_hw.calib.validation.checks import Validation
-from deal_hw.calibration import EXPLAINED_CHI2, Budget, Progress
+from deal_hw.calib.validation.settings import Validation
+from deal_hw.calibration import EXPLAINED_CHI2, Budget, CalibrationResult, Progress
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
@@ -177,14 +177,16 @@ class TestDealPaperReplayed(MethodSuite):
     @classmethod
     def case(cls) -> MethodCase:
         """Return the method under test."""
-        case = case_of("deal-paper-replay", Budget(population=100, generations=25), 0.4)
+        case = case_of("deal-paper-replay", Budget(population=10, generations=2), None)
         make = functools.partial(dataclasses.replace, small_problem(), policy=None)
         return dataclasses.replace(case, make_problem=make)
 
-    def test_recovers_a_known_cartpole(self, case: MethodCase) -> None:
+    def test_with_the_same_commands_it_is_the_closed_loop_method(
+        self, case: MethodCase, short: CalibrationResult
+    ) -> None:
         """The small problem's policy sends what was recorded, so both methods end at the same place."""
         closed = case_of("deal-paper", case.budget, case.tolerance).run(case.short_budget)
-        np.testing.assert_array_equal(case.run(case.short_budget).estimate, closed.estimate)
+        np.testing.assert_array_equal(short.estimate, closed.estimate)
 
 
 class TestDealPaperLiteral(MethodSuite):
@@ -199,6 +201,7 @@ class TestDealPaperLiteral(MethodSuite):
         return dataclasses.replace(case, grows=True)
 
 
+@pytest.mark.slow
 class TestDealPaperLiteralWithoutNoiseAdaptation(MethodSuite):
     """`deal-paper-literal-fn` keeps the contract."""
 
@@ -210,6 +213,7 @@ class TestDealPaperLiteralWithoutNoiseAdaptation(MethodSuite):
         return dataclasses.replace(case, grows=True)
 
 
+@pytest.mark.slow
 class TestDealPaperLiteralWithoutNormalisation(MethodSuite):
     """`deal-paper-literal-pn` keeps the contract in SI units from zero."""
 
@@ -231,6 +235,7 @@ class TestDealPaperLiteralFlat(MethodSuite):
         return case_of("deal-paper-literal-flat", Budget(population=10, generations=3), None)
 
 
+@pytest.mark.slow
 class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
     """`deal-paper-fn` keeps the contract."""
 
@@ -241,6 +246,7 @@ class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
         return case_of("deal-paper-fn", Budget(population=10, generations=2), None)
 
 
+@pytest.mark.slow
 class TestDealPaperWithoutNormalisation(MethodSuite):
     """`deal-paper-pn` keeps the contract in raw units."""
 
@@ -410,6 +416,16 @@ def test_the_search_of_the_default_is_adversarial() -> None:
     made = make_method("default", refine=True)
     assert isinstance(made, CalibrationPipeline) and isinstance(made.search, Deal)
     assert made.search.settings.features and made.search.settings.trained
+    assert made.search.adversarial
+
+
+def test_a_method_knows_whether_a_critic_learns_and_whether_it_searches() -> None:
+    """The messages follow from the method, whatever its name is."""
+    learning = {name for name in METHODS if make_method(name).adversarial}
+    assert learning >= {"default", "deal", "deal-critic", "deal-paper", "deal-unaligned"}
+    assert not learning & {"eki", "deal-untrained", "deal-no-critic", "deal-paper-mmd", "mmd-unaligned"}
+    assert not learning & NO_DATA_METHODS
+    assert {name for name in METHODS if not make_method(name).moves} == {"nominal"}
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])

@@ -31,13 +31,13 @@ from deal_hw.calib.pipeline.output_error_fits import (
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 HINGE = """
 <mujoco model="hinge">
@@ -88,13 +88,14 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     (folder / "params.yaml").write_text(PARAMETERS)
     for name, phase in (("first", 1.0), ("second", 2.3)):
         (folder / f"{name}.csv").write_text(recording(phase))
-    source = Recordings(
+    source = FilesSettings(
         model=folder / "hinge.xml",
         data=(folder / "first.csv", folder / "second.csv"),
         parameters=folder / "params.yaml",
         holdout_part=0.0,
+        threads=1,
     )
-    work = calibration_input(CalibrateSettings(recordings=source, threads=1))
+    work = calibration_input(source)
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 
@@ -200,8 +201,12 @@ def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationRes
     assert result.latency_s == pytest.approx(LATE_S, abs=2e-3)
 
 
-def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_start(problem: Problem) -> None:
-    """A first fit that stays at wrong nominal values: the folds search, and the truth is still found."""
+Watched = tuple[CalibrationResult, list[tuple[str, float]]]
+
+
+@pytest.fixture(scope="module")
+def stuck_at_first(problem: Problem) -> Watched:
+    """Run the method with a first fit that stays at wrong nominal values; return its result and offers."""
     stuck = OutputErrorSettings(first=Recipe(seconds=0.2, iterations=0), windows_s=(0.4, 2.0))
     method = CalibrationPipeline(
         Eki(), "output-error", Validation(local_first=False), fits=OutputErrorFits(stuck)
@@ -212,7 +217,14 @@ def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_star
         if progress.estimate is not None:
             offered.append((progress.stage, float(progress.estimate[0])))
 
-    found = method.run(problem, BUDGET, np.random.default_rng(0), watch)
+    return method.run(problem, BUDGET, np.random.default_rng(0), watch), offered
+
+
+def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_start(
+    problem: Problem, stuck_at_first: Watched
+) -> None:
+    """A first fit that stays at wrong nominal values: the folds search, and the truth is still found."""
+    found, offered = stuck_at_first
     assert [stage for stage, _ in offered] == ["fit of short windows", "fit of long windows", "search"]
     assert offered[0][1] == problem.space.nominal[0]
     assert offered[1][1] == pytest.approx(TRUTH[0], rel=0.03)
@@ -262,9 +274,9 @@ def test_a_walks_search_runs_only_where_its_fits_explain_nothing(problem: Proble
     )
 
 
-def test_halves_of_a_right_model_agree(problem: Problem, result: CalibrationResult) -> None:
+def test_halves_of_a_right_model_agree(problem: Problem, stuck_at_first: Watched) -> None:
     """Two motions of one hinge: every parameter and the latency are compared, none is flagged."""
-    halves = result.provenance["split_half"]
+    halves = stuck_at_first[0].provenance["split_half"]
     assert set(halves["parameters"]) == {*problem.space.names, "latency"} and halves["flagged"] == []
 
 

@@ -16,7 +16,8 @@ from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import with_finer_step
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.validation.checks import unexplained
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import (
     CLEARLY,
     MOST_STEPS,
@@ -29,7 +30,7 @@ from deal_hw.calib.validation.time_steps import (
 from deal_hw.calibration import Budget
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 HINGE = """
 <mujoco model="hinge">
@@ -73,13 +74,14 @@ def checked(
     (folder / "hinge.xml").write_text(HINGE.format(step=STEP_S, damping="0.07", armature="0.003"))
     (folder / "params.yaml").write_text(PARAMETERS)
     (folder / "data.csv").write_text(recording(step_s))
-    source = Recordings(
+    source = FilesSettings(
         model=folder / "hinge.xml",
         data=(folder / "data.csv",),
         parameters=folder / "params.yaml",
         holdout_part=0.0,
+        threads=1,
     )
-    work = calibration_input(CalibrateSettings(recordings=source, threads=1))
+    work = calibration_input(source)
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = local_fit(problem, None)
     assert fit is not None
@@ -141,8 +143,7 @@ def test_a_step_that_fine_encoders_show_is_halved_before_a_search(tmp_path: Path
     With 2.5 ms chi2 is 1.12, correlated over 4 samples, and play in the gears was named.
     """
     model, paths, held_out = write(make_robot("cart-pole", 0, "encoders"), tmp_path, seconds=3.0)
-    recordings = Recordings(model=model, data=tuple(paths))
-    work = calibration_input(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
     local = local_fit(problem)
     assert local is not None and local.chi2 > 1.1

@@ -43,8 +43,8 @@ from deal_hw.calib.pipeline.stages import (
     conclusive,
     lower_minimum,
 )
-from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import HeldOut
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import LatencyScan
 from deal_hw.calibration import BEFORE_SEARCH, Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space

@@ -14,7 +14,7 @@ from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.validation.time_steps import scan_latency
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 
 def stepped(shooting: Shooting, problem: Problem) -> tuple[Point, Point]:
@@ -74,8 +74,7 @@ def test_a_start_state_behind_a_kink_starts_again(tmp_path: Path) -> None:
     """
     robot = make_robot("pendulum", 0)
     model, paths, held_out = write(robot, tmp_path, seconds=3.0)
-    recordings = Recordings(model=model, data=tuple(paths))
-    work = calibration_input(CalibrateSettings(recordings=recordings, holdout=(held_out,)))
+    work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
     theta = np.array([robot.truth[name] for name in problem.space.names])
     right = at_parameters(problem, theta, robot.delay_s, 40)

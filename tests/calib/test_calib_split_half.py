@@ -19,7 +19,6 @@ from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.checks import (
     HALVES,
     SplitHalf,
-    Validation,
     agreement,
     check_split_half,
     half_of,
@@ -27,6 +26,7 @@ from deal_hw.calib.validation.checks import (
     judge,
     widened_by_split_half,
 )
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Z90, Budget, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 

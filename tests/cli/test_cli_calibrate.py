@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import json
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 from fakes.simulated_episode import simulated_episode
 
 from deal_hw.calibration import read_result
-from deal_hw.cli.calibrate import Calibrate, calibrate, calibrate_or_write_parameters
+from deal_hw.cli.calibrate import CalibrateDataset, CalibrateFiles, calibrate, calibrate_or_write_parameters
 from deal_hw.cli.calibrate_output import print_files
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -22,7 +24,7 @@ from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.workflows.calibration.dataset import choose_episodes
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import Recordings
+from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.calibration.space import without_speed_limits
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
@@ -68,7 +70,7 @@ def realistic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("realistic") / "dataset", [("rich", rich, 4.6)], "realistic")
 
 
-def settings(folder: Path, **changes: object) -> Calibrate:
+def settings(folder: Path, **changes: object) -> CalibrateDataset:
     """Settings of a short calibration of two parameters."""
     values: dict[str, object] = {
         "dataset": folder,
@@ -77,45 +79,60 @@ def settings(folder: Path, **changes: object) -> Calibrate:
         "generations": 12,
         "quiet": True,
     }
-    return Calibrate(**{**values, **changes})  # type: ignore[arg-type]
+    return CalibrateDataset(**{**values, **changes})  # type: ignore[arg-type]
 
 
 def test_a_file_adds_parameters_to_a_robots_own_set(dataset: Path, tmp_path: Path) -> None:
     """Alarms advise to free an encoder's zero or a gear's play: also for robots with a driver."""
     extra = tmp_path / "extra.yaml"
     extra.write_text("parameters:\n  - {kind: encoder_bias, elements: cart}\n")
-    chosen = Recordings(parameters=extra)
-    space = calibration_input(settings(dataset, free=(), recordings=chosen)).space
+    space = calibration_input(settings(dataset, free=(), parameters=extra)).space
     assert space.names == (*k9_space().names, "cart.encoder_bias")
     freed = calibration_input(
-        settings(dataset, free=("cart.mass", "cart.encoder_bias"), recordings=chosen)
+        settings(dataset, free=("cart.mass", "cart.encoder_bias"), parameters=extra)
     ).space
     assert freed.names == ("cart.mass", "cart.encoder_bias")
     extra.write_text("parameters:\n  - {kind: dof_damping, elements: pole, name: twice}\n")
     with pytest.raises(ConfigurationError, match="both set dof_damping of 'pole'"):
-        calibration_input(settings(dataset, free=(), recordings=chosen))
+        calibration_input(settings(dataset, free=(), parameters=extra))
 
 
-def test_writes_everything_a_user_needs(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@dataclasses.dataclass(frozen=True)
+class Calibrated:
+    """A calibration with --json: its report, and what it printed."""
+
+    report: CalibrateReport
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="module")
+def calibrated(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
+    """Calibrate once for all tests that look at the same calibration."""
+    out, err = io.StringIO(), io.StringIO()
+    asked = settings(dataset, out=tmp_path_factory.mktemp("calibrated"), json=True, quiet=False)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        report = calibrate_or_write_parameters(asked)
+    assert not isinstance(report, int)
+    return Calibrated(report, out.getvalue(), err.getvalue())
+
+
+def test_writes_everything_a_user_needs(calibrated: Calibrated) -> None:
     """Two parameters are found within 5 %; result, distribution and model are there and agree.
 
     With --json the output is one document, and the text is on the error output.
     """
-    report = calibrate_or_write_parameters(settings(dataset, out=tmp_path, json=True, quiet=False))
-    assert not isinstance(report, int)
-    printed = capsys.readouterr()
-    document = json.loads(printed.out)
+    report = calibrated.report
+    document = json.loads(calibrated.out)
     assert document.pop("files") == {name: str(path) for name, path in report.files.items()}
     assert document == json.loads(report.files["result.json"].read_text())
-    assert "calibration by default" in printed.err and "written to" in printed.err
+    assert "calibration by default" in calibrated.err and "written to" in calibrated.err
     found = dict(zip(report.result.space.names, report.result.estimate, strict=True))
     assert found["cart.mass"] == pytest.approx(0.3, rel=0.05)
     assert found["servo.stiffness"] == pytest.approx(80.0, rel=0.05)
     assert report.result.latency_s == pytest.approx(9e-3, abs=1.1e-3)
     assert report.result.heldout_nrmse["calibrated"] < report.result.heldout_nrmse["null"]
-    again = read_result(tmp_path / "calibration")
+    again = read_result(report.files["result.json"].parent)
     np.testing.assert_allclose(again.estimate, report.result.estimate)
     model = mujoco.MjModel.from_xml_path(str(report.files["calibrated.xml"]))
     assert model.body("cart").mass[0] == pytest.approx(found["cart.mass"], rel=1e-4)
@@ -145,9 +162,9 @@ def test_a_realistic_robot_is_searched_adversarially(
 
 def test_no_document_of_a_calibration_that_does_not_run(tmp_path: Path) -> None:
     """--write-parameters writes a file and calibrates nothing."""
-    recordings = Recordings(model=tmp_path / "arm.xml", write_parameters=tmp_path / "p.yaml")
+    config = CalibrateFiles(model=tmp_path / "arm.xml", write_parameters=tmp_path / "p.yaml", json=True)
     with pytest.raises(ConfigurationError, match="--json would have no effect: --write-parameters"):
-        calibrate_or_write_parameters(Calibrate(recordings=recordings, json=True))
+        calibrate_or_write_parameters(config)
 
 
 def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -164,11 +181,11 @@ def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().out == f"written to {folder}: result.json\n"
 
 
-def test_same_seed_same_result(dataset: Path, tmp_path: Path) -> None:
+def test_same_seed_same_result(dataset: Path, calibrated: Calibrated, tmp_path: Path) -> None:
     """Everything random comes from the seed."""
-    a, b = (calibrate(settings(dataset, out=tmp_path / name)).result for name in ("a", "b"))
-    np.testing.assert_array_equal(a.estimate, b.estimate)
-    np.testing.assert_array_equal(a.interval, b.interval)
+    again = calibrate(settings(dataset, out=tmp_path)).result
+    np.testing.assert_array_equal(again.estimate, calibrated.report.result.estimate)
+    np.testing.assert_array_equal(again.interval, calibrated.report.result.interval)
 
 
 def test_unknown_parameter_lists_the_names(dataset: Path) -> None:

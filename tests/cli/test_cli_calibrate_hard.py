@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.calib.pipeline.methods import SEARCHES
 from deal_hw.cli.main import EXIT_OK, main
 
 HINGE = """
@@ -64,7 +63,7 @@ def calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Calibrated
 UNSTABLE = "parameters: [{kind: servo_stiffness, elements: servo, nominal: 3.0e+5, range: [2, 1.0e+6]}]"
 
 
-@pytest.mark.parametrize("search", SEARCHES[:2])
+@pytest.mark.parametrize("search", ["eki", pytest.param("deal", marks=pytest.mark.slow)])
 def test_a_local_fit_that_diverges_is_said_and_leaves_it_to_the_search(
     calibrated: Calibrated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, search: str
 ) -> None:

@@ -311,7 +311,7 @@ def test_bad_recordings_are_refused(
         (["--heldout-window", "4"], "held-out recordings are too short"),
         (["--leave-out", "nothing.csv", "0", "1"], "no such recording; known are rec.csv"),
         (["--leave-out", "rec.csv", "0", "99"], "--leave-out removes all of rec.csv"),
-        (["--space", "k9"], "--parameters"),
+        (["--space", "k9"], "`calibrate dataset` has it"),
         (["--latency", "12"], "--latency 12.0 s: allowed are 0 to 1 s"),
         (["--latency-range", "0.1", "0.05"], "--latency-range 0.1 0.05: give the lower one first"),
         (["--latency", "0.02", "--latency-range", "0", "0.1"], "--latency gives the latency"),

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, CalibrateFiles, calibrate
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
-from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, InsufficientDataError
-from deal_hw.workflows.calibration.settings import Recordings
+from deal_hw.errors import ConfigurationError, DatasetError, InsufficientDataError
+from deal_hw.policies.demonstration import PopulationDemonstration
+from deal_hw.workflows.calibration.intake import calibration_input
+from deal_hw.workflows.calibration.policy import say_other_range
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, check_plan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.train import udr_distribution
 
 POLICY = shipped_policy("cartpole") or Path()
 
@@ -46,7 +50,7 @@ def record(folder: Path, *changes: Mapping[str, Any]) -> Path:
     return folder
 
 
-def settings(folder: Path, **changes: Any) -> Calibrate:
+def settings(folder: Path, **changes: Any) -> CalibrateDataset:
     """A calibration by the paper's method that is over in two generations."""
     values: dict[str, Any] = {
         "dataset": folder,
@@ -59,7 +63,7 @@ def settings(folder: Path, **changes: Any) -> Calibrate:
         "quiet": True,
         "free": ("cart.mass", "servo.stiffness"),
     }
-    return Calibrate(**{**values, **changes})
+    return CalibrateDataset(**{**values, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -107,21 +111,32 @@ def test_another_policy_than_the_recordings_is_refused(dataset: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"search": "eki", "policy": POLICY}, "eki runs no policy"),
-        (
-            {"dataset": None, "recordings": Recordings(model=Path("robot.xml"), data=(Path("a.csv"),))},
-            "which is unknown for --model",
-        ),
-    ],
+    ("range_ratio", "words"), [(None, ""), (3.0, "trained in another range of cart.mass, servo.stiffness.")]
 )
-def test_a_policy_that_would_do_nothing_is_refused(
-    dataset: Path, changes: dict[str, Any], words: str
-) -> None:
+def test_a_policy_of_another_range_is_said(dataset: Path, range_ratio: float | None, words: str) -> None:
+    """Nothing is said where it was trained in the range that is searched."""
+    printed: list[str] = []
+    calibration_input(settings(dataset, range_ratio=range_ratio), say=printed.append)
+    found = [line for line in printed if "The DEAL paper trains it" in line]
+    assert len(found) == bool(words) and all(words in line for line in found)
+
+
+def test_a_policy_of_another_training_is_said() -> None:
+    """Its spec names another distribution."""
+    other = SimpleNamespace(trained_under="0123456789abcdef")
+    printed: list[str] = []
+    space = udr_distribution("cartpole").space
+    say_other_range(cast("PopulationDemonstration", other), "cartpole", space, printed.append)
+    assert len(printed) == 1 and "another distribution than uniform randomisation" in printed[0]
+
+
+def test_a_policy_that_would_do_nothing_is_refused(dataset: Path) -> None:
     """Methods without rollouts take none, and recordings of a model have none."""
-    with pytest.raises(DealHwError, match=words):
-        calibrate(settings(dataset, **changes))
+    with pytest.raises(ConfigurationError, match="eki runs no policy"):
+        calibrate(settings(dataset, search="eki", policy=POLICY))
+    files = CalibrateFiles(model=Path("robot.xml"), data=(Path("a.csv"),), search="deal-paper")
+    with pytest.raises(ConfigurationError, match="which is unknown for --model"):
+        calibrate(files)
 
 
 def test_a_policy_is_kept_once_and_as_it_was_checked(tmp_path: Path) -> None:

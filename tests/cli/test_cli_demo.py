@@ -23,7 +23,7 @@ from deal_hw.calib.pipeline import output_error_fits
 from deal_hw.calibration import percent
 from deal_hw.cli import demo_cartpole, demo_go2, demo_runs
 from deal_hw.cli import deploy as deploy_verb
-from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.demo import KINDS as DEMO
 from deal_hw.cli.demo import Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
@@ -36,6 +36,7 @@ from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutErro
 from deal_hw.findings import Finding, Severity
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
@@ -43,7 +44,7 @@ from deal_hw.workflows.running.settings import LegOptions
 pytestmark = pytest.mark.real_time
 
 
-def beside_in_short(config: Calibrate) -> CalibrateReport:
+def beside_in_short(config: CalibrateDataset) -> CalibrateReport:
     """Calibrate; the search beside it, whose estimates are only noted, gets 20 members and 4 generations."""
     beside = not config.refine
     return calibrate(dataclasses.replace(config, population=20, generations=4) if beside else config)

@@ -25,8 +25,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Severity
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.workflows.doctor import machine
-from deal_hw.workflows.doctor.examine import DoctorReport, judge_interfaces
-from deal_hw.workflows.doctor.robot import examine_robot
+from deal_hw.workflows.doctor.examine import DoctorReport, examine_robot, judge_interfaces
 
 pytestmark = pytest.mark.real_time
 

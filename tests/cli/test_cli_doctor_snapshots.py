@@ -30,8 +30,7 @@ from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
-from deal_hw.drivers.go2.messages import topics
-from deal_hw.drivers.transports import interfaces
+from deal_hw.drivers.transports import interfaces, topics
 from deal_hw.drivers.transports.dds_discovery import DdsEndpoint, DdsPeer, DdsSurvey
 from deal_hw.drivers.transports.dds_types import COMPLETE, UINT8
 from deal_hw.drivers.transports.interfaces import Interface

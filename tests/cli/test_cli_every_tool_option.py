@@ -222,12 +222,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = mujoco.MjModel.from_xml_string(MJCF.replace('damping="0.2"', 'damping="0.3"'))
     for seed, name in enumerate(("fit", "more", "hold")):
         data, rng, rows = mujoco.MjData(model), np.random.default_rng(seed), []
-        for time_s in np.arange(0, 4, 0.02):
+        for time_s in np.arange(0, 2.4, 0.02):
             wanted = 0.5 * np.sin((3 + seed) * time_s)
             rows.append((time_s, data.qpos[0] + 1e-3 * rng.standard_normal(), wanted))
             data.ctrl[0] = wanted
             mujoco.mj_step(model, data, 4)
-        rows[100] = (rows[100][0], rows[100][1] + 0.4, rows[100][2])
+        rows[60] = (rows[60][0], rows[60][1] + 0.4, rows[60][2])
         head = "time,shoulder_pos,shoulder_cmd"
         np.savetxt(folder / f"{name}.csv", rows, "%.6f", ",", header=head, comments="")
     with pytest.MonkeyPatch.context() as patch:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
 from deal_hw.cli.design_excitation import design_excitation
 from deal_hw.clock import VirtualClock
@@ -33,6 +33,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.motions.excitation.limits import room
 from deal_hw.motions.excitation.plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.robots import parameter_spaces
+from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness", "damping"))
@@ -94,7 +95,7 @@ def dataset(truth: Go2Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def calibrated(dataset: Path) -> CalibrateReport:
     """Calibrate the hips."""
-    config = Calibrate(
+    config = CalibrateDataset(
         dataset=dataset,
         holdout=(1,),
         method="local",

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import inspect
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import pytest
 
+import deal_hw
 from deal_hw.cli import main as cli
 from deal_hw.cli.completion import completion
+from deal_hw.cli.parsing import example_of
 from deal_hw.errors import UnknownNameError
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, from_settings
@@ -185,6 +188,50 @@ def test_help_lists_the_kinds_and_then_the_options_of_one(
     )
     assert "--speed" in cart and "--stride" not in cart and "--say" not in cart and "ROBOT" not in cart
     assert "--stride" in dog and "--gentle, --no-gentle" in dog and "--quiet" in dog
+
+
+def kinds_of_verbs() -> Iterator[tuple[str, str]]:
+    """Yield each verb with kinds, and each of its kinds."""
+    for name, verb in cli.VERBS.items():
+        kinds = getattr(importlib.import_module(verb.module), verb.config)
+        if isinstance(kinds, Kinds):
+            yield from ((name, kind) for kind in kinds.table())
+
+
+@pytest.mark.parametrize(("name", "kind"), [*kinds_of_verbs()])
+def test_the_help_of_a_kind_shows_an_example_of_that_kind(
+    name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It parses, as settings of that kind, and its own help page shows it."""
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "runs/mine/dataset" / "robot" / "files.json"
+    own.parent.mkdir(parents=True)
+    own.touch()
+    verb = cli.VERBS[name]
+    entry = getattr(importlib.import_module(verb.module), verb.config).table()[kind]
+    line = example_of(name, verb, entry)
+    settings, _ = cli.parse(name, line.split()[2:])
+    assert type(settings) is entry.settings
+    with pytest.raises(SystemExit):
+        cli.main([*line.split()[1:], "--help"])
+    # Without a kind the page lists all of them, this one included.
+    assert (f"Example:  {line}\n" if kind else f"  {line} ") in capsys.readouterr().out
+
+
+def test_a_file_that_is_not_there_is_named_before_the_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its kind is not known, so the options may be right."""
+    recording, dataset = str(tmp_path / "nothere.mcap"), str(tmp_path / "dataset")
+    for words in (["replay", recording], ["calibrate", dataset, "--columns", "x.yaml"]):
+        assert cli.main(words) == cli.EXIT_ERROR
+    replayed, calibrated = capsys.readouterr().err.splitlines()
+    assert f"error: {recording} cannot be read: there is no such file; `deal-hw replay" in replayed
+    assert f"error: {dataset} does not exist; --columns: `deal-hw calibrate dataset` has no" in calibrated
+    with pytest.raises(UnknownNameError, match=r"nothere\.mcap cannot be read.*; unknown argument of replay"):
+        deal_hw.replay(recording, hand_back=True)
+    with pytest.raises(UnknownNameError, match="dataset does not exist; unknown argument of calibrate"):
+        deal_hw.calibrate(dataset=dataset, columns="x.yaml")
 
 
 def test_python_takes_the_same_kinds() -> None:

@@ -129,7 +129,11 @@ def test_the_sweep_sees_the_options() -> None:
     """The list of numeric options is not empty by a mistake of the test."""
     names = {(settings.__name__, name) for settings, name, _ in FIELDS}
     assert len(names) > 80
-    assert names >= {("CollectGo2Settings", "seconds"), ("Calibrate", "known"), ("WireOptions", "domain")}
+    assert names >= {
+        ("CollectGo2Settings", "seconds"),
+        ("CalibrateDataset", "known"),
+        ("WireOptions", "domain"),
+    }
 
 
 @pytest.mark.parametrize(("settings", "name", "hint"), FIELDS, ids=lambda v: getattr(v, "__name__", str(v)))
@@ -216,8 +220,8 @@ def test_a_refused_number_gets_one_line(line: str, words: str, capsys: pytest.Ca
             "--seconds: '4s' is no number; --seconds is: Length",
         ),
         (
-            "calibrate --nosuch",
-            "--nosuch: `deal-hw calibrate` has no such option; all",
+            "calibrate d --nosuch",
+            "d does not exist; --nosuch: `deal-hw calibrate dataset` has no such option; all",
         ),
         ("data info", "`deal-hw data info` needs PATH; PATH is: A dataset (DIR) or an episode"),
         ("data info d e", "`deal-hw data info` takes no 'e' there; options begin with --"),
@@ -237,6 +241,7 @@ def test_words_that_do_not_parse_get_one_line(
     assert printed.err.startswith(f"deal-hw: error: {words}") and printed.err.count("\n") == 1
     verb, *others = line.split()
     kind = [f" {word}" for word in others[:1] if word in ("cartpole", "info")]
+    kind += [" dataset"] * (verb == "calibrate")
     page = f"deal-hw {verb}{''.join(kind)} --help{'-all' if VERBS[verb].common and others else ''}"
     assert printed.err.endswith(f"; all options: {page}\n") and not printed.out
 
@@ -244,12 +249,6 @@ def test_words_that_do_not_parse_get_one_line(
 @pytest.mark.parametrize(
     ("line", "option"),
     [
-        ("calibrate d --columns nothere.yaml", "--columns"),
-        ("calibrate d --leave-out nosuch 0 99", "--leave-out"),
-        ("calibrate d --fit-seconds 3", "--fit-seconds"),
-        ("calibrate d --feet a", "--feet"),
-        ("calibrate d --holdout-part 0.5", "--holdout-part"),
-        ("calibrate --model m.xml --data r.csv --sample-hz 50", "--sample-hz"),
         ("collect go2 --port p --out o --velocity 0.3,0,0", "--velocity"),
         ("deploy go2 --port lo --simulator unitree_mujoco --hand-back", "--hand-back"),
         ("deploy go2 --port lo --simulator unitree_mujoco --state-check length", "--state-check"),
@@ -295,7 +294,7 @@ def test_help_explains_common_options_and_names_rare_ones(
     verb: str, robot: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Together these are the options that --help-all explains, and each common one exists."""
-    line = verb if verb == "calibrate" else f"{verb} {robot}".strip()
+    line = "calibrate --model robot.xml" if verb == "calibrate" else f"{verb} {robot}".strip()
     common, _, end = help_page(line, capsys, "--help").partition("Rarely needed ")
     all_options = options_of(help_page(line, capsys))
     rare = set(re.findall(r"--[\w-]+", end.partition("):")[2]))
@@ -303,13 +302,14 @@ def test_help_explains_common_options_and_names_rare_ones(
     assert 0 < len(options_of(common)) <= 15 and rare
     assert " ".join(end.split()).startswith(f"(explained by deal-hw {line} --help-all): --")
     if robot == "go2" or verb == "calibrate":
-        named = {name.replace("_", "-") for name in VERBS[verb].common} - {"env"}
+        # A user's robot has no sets of parameters.
+        named = {name.replace("_", "-") for name in VERBS[verb].common} - {"env", "space"}
         assert named <= {option.removeprefix("--") for option in options_of(common)}
 
 
 def test_the_help_of_calibrate_lists_each_method(capsys: pytest.CaptureFixture[str]) -> None:
     """A user need not mistype a name to see the names; searches stand at their own option."""
-    page = " ".join(help_page("calibrate", capsys, "--help").replace("│", " ").split())
+    page = " ".join(help_page("calibrate d", capsys, "--help").replace("│", " ").split())
     named, _, rest = page.partition("--method STR")[2].partition("--search {deal,eki,deal-paper}")
     assert set(METHODS) - set(SEARCHES) <= set(re.findall(r"[a-z][\w-]*", named))
     assert f"{DEFAULT_SEARCH}" in rest
@@ -318,7 +318,7 @@ def test_the_help_of_calibrate_lists_each_method(capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("line", "flags"),
     [
-        ("calibrate", ("refine", "report", "advise")),
+        ("calibrate d", ("refine", "report", "advise")),
         ("replay e --robot go2", ("record-wire", "support-check")),
     ],
 )

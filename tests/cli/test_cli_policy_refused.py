@@ -16,7 +16,7 @@ from deal_hw.cli.show import Terminal
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_export import write_policy
-from deal_hw.policies.onnx_runtime import SPEC_KEY
+from deal_hw.policies.onnx_runtime import SPEC_KEY, OnnxPolicy
 from deal_hw.policy import VERDICT
 from deal_hw.workflows.running.plan import RunPlan, check_plan
 from deal_hw.workflows.shipped import shipped_policy
@@ -67,10 +67,21 @@ def test_an_unknown_quantity_never_reaches_a_robot(
 
 @pytest.mark.parametrize("name", ["stiffness", "damping", "action_scale", "default_position"])
 @pytest.mark.parametrize("value", [[], ["1"], [None], [float("nan")], [1.0, 1.0, 1.0], "1", None])
+def test_wrong_numbers_are_refused_with_their_field(tmp_path: Path, name: str, value: object) -> None:
+    """Text, null, NaN, too many, none: they came as far as the armed robot, or ended in a traceback."""
+    path = edited(tmp_path / "p.onnx", lambda spec: spec.update({name: value}))
+    with pytest.raises(PolicyError, match=f"field {name}"):
+        OnnxPolicy(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("stiffness", []), ("damping", [None]), ("action_scale", "1"), ("default_position", [float("nan")])],
+)
 def test_wrong_numbers_never_reach_a_robot(
     tmp_path: Path, deploy: Callable[..., str], name: str, value: object
 ) -> None:
-    """Text, null, NaN, too many, none: they came as far as the armed robot, or ended in a traceback."""
+    """The process that tries the policy first refuses it."""
     printed = deploy(edited(tmp_path / "p.onnx", lambda spec: spec.update({name: value})))
     assert f"field {name}" in printed and "no-port" not in printed
 

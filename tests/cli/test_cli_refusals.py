@@ -54,6 +54,8 @@ VELOCITY_ARM = ARM.replace(
     '<position name="servo" joint="elbow" kp="12" kv="0.1"/>', '<velocity name="servo" joint="elbow" kv="2"/>'
 )
 MODEL = "calibrate --model arm.xml --out o --data"
+OTHERS = "`deal-hw calibrate dataset` has no such option;"
+FILES = "`calibrate --model robot.xml`"
 Lines = list[tuple[str, str]]
 
 
@@ -162,7 +164,10 @@ def refused(
 SETTINGS: Lines = [
     ("calibrate", "name a dataset (deal-hw calibrate runs/first/dataset), or a model"),
     ("calibrate run/dataset --model arm.xml", "not both"),
-    ("calibrate run/dataset --holdout rec.csv", "with a dataset give episode numbers"),
+    (
+        "calibrate run/dataset --holdout rec.csv",
+        "--holdout is: Held-out episodes, which only test the result, by number",
+    ),
     ("calibrate run/dataset --method nosuch", "unknown calibration method 'nosuch'; known: default"),
     ("calibrate --model arm.xml --data gone.csv --method nosuch", "unknown calibration method 'nosuch'"),
     ("data verify gone.mcap", "gone.mcap does not exist; name a dataset (DIR) or an episode"),
@@ -170,7 +175,10 @@ SETTINGS: Lines = [
     ("calibrate run/dataset --episodes 7", "has 1 episodes; there is no number 7"),
     ("calibrate run/dataset --residual-std much", "'much' is no number [rad or m]"),
     ("calibrate run/dataset --residual-std knee 0.1", "unknown joint 'knee'; known: cart, pole"),
-    ("calibrate run/dataset --write-parameters p.yaml", "--write-parameters needs --model robot.xml"),
+    (
+        "calibrate run/dataset --write-parameters p.yaml",
+        f"{OTHERS} `calibrate own-robot` and {FILES} have it",
+    ),
     ("calibrate --model arm.xml --write-parameters empty.json", "empty.json exists; name another file"),
     ("calibrate --model arm.xml", "--model needs recordings to fit: --data rec.csv"),
     (f"{MODEL} rec.csv --holdout rec.csv", "a held-out recording must not be fitted"),
@@ -218,14 +226,12 @@ SETTINGS: Lines = [
     ("demo --out folder/../run", "does not hold a former demo; name another folder with --out"),
     ("emulate go2 --transport zenoh --port tcp/192.0.2.1:0 --duration-s 0", "port 'tcp/192.0.2.1:0': "),
 ]
-NO_EFFECT = "would have no effect: a dataset defines it; use that option with --model and --data"
 REVIEWED: Lines = [
-    ("calibrate run/dataset --columns nothere.yaml", f"--columns {NO_EFFECT}"),
-    ("calibrate run/dataset --columns nothere.yaml", f"--columns {NO_EFFECT}"),
-    ("calibrate run/dataset --leave-out nosuch 0 99", f"--leave-out {NO_EFFECT}"),
-    ("calibrate run/dataset --fit-seconds 2", f"--fit-seconds {NO_EFFECT}"),
-    ("calibrate run/dataset --feet toe", f"--feet {NO_EFFECT}"),
-    ("calibrate run/dataset --holdout-part 0.3", f"--holdout-part {NO_EFFECT}"),
+    ("calibrate run/dataset --columns nothere.yaml", f"--columns: {OTHERS} {FILES} has it"),
+    ("calibrate run/dataset --leave-out nosuch 0 99", f"--leave-out: {OTHERS} {FILES} has it"),
+    ("calibrate run/dataset --fit-seconds 2", f"{OTHERS} `calibrate own-robot` and {FILES} have it"),
+    ("calibrate run/dataset --feet toe", f"--feet: {OTHERS} {FILES} has it"),
+    ("calibrate run/dataset --holdout-part 0.3", f"{OTHERS} `calibrate own-robot` and {FILES} have it"),
     (f"{MODEL} rec.csv --parameters nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
     (f"{MODEL} rec.csv --columns nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
     (f"{MODEL} rec.csv --leave-out nosuch 0 99", "no such recording; known are rec.csv"),
@@ -412,7 +418,9 @@ def mistyped() -> Iterator[tuple[str, str]]:
             # Some kinds are found from another option or from a file; their tests are with their verbs.
             if word.endswith(".yaml") or config.choose(Arguments(word, {}))[0] != word:
                 continue
-            yield from slips(f"{name} {word}", kind.settings, config.argument)
+            by_option = kind.usage.startswith("--")
+            stated = kind.usage.split()[0].removeprefix("--") if by_option else config.argument
+            yield from slips(f"{name} {kind.usage if by_option else word}", kind.settings, stated)
 
 
 def slips(begin: str, settings: type, stated: str) -> Iterator[tuple[str, str]]:

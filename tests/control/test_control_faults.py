@@ -107,7 +107,8 @@ def test_a_second_run_is_refused_and_never_takes_over(
     measure: Any, robot: str, wire: str, phase: str
 ) -> None:
     """It ends with 2 and says who commands; the first goes on until Ctrl-C, and then nobody moves it."""
-    row = measure(robot, wire, "a second run while the first connects, starts or runs", phase)
+    # Ctrl-C ends it when the second is refused, however long that takes on a busy machine.
+    row = measure(robot, wire, "a second run while the first connects, starts or runs", phase, seconds=300.0)
     assert_passive(row)
     assert row["exit_code"] == 130
 

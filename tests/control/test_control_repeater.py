@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.repeater import Repeater
+from deal_hw.control.loop.control_loop import Repeater
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 
 MS = 1_000_000

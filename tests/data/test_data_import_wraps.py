@@ -16,7 +16,7 @@ from deal_hw.data.importing.columns import JointKinds, parse_column_map
 from deal_hw.data.importing.grid import to_trajectories
 from deal_hw.data.importing.load import load_tables, tables_of
 from deal_hw.data.importing.memory_source import read_memory
-from deal_hw.data.importing.wraps import unwrap
+from deal_hw.data.importing.table import unwrap
 from deal_hw.data.table import Table
 from deal_hw.errors import ConfigurationError
 from deal_hw.findings import Severity

@@ -22,7 +22,6 @@ from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator.can_emulator import can_device, can_devices, can_emulator
-from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, Hazards
 from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
@@ -45,6 +44,7 @@ from deal_hw.errors import (
 from deal_hw.robots import claim_name, make_robot
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, OneBadFrame, RecordFaults
+from deal_hw.testing.pseudo_terminal import PseudoTerminal
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, WireOptions
 from deal_hw.types import RobotState, Status
@@ -357,7 +357,7 @@ def test_python_can_reads_the_emulated_bus() -> None:
     """Another program's slcan client finds states of node 1."""
     clock = VirtualClock()
     adapter = SlcanAdapter([can_device(nominal_truth("ideal"))], CanFaults())
-    emulator = CartpoleEmulator(adapter, clock=clock)
+    emulator = PseudoTerminal(adapter, clock=clock)
     bus = can.Bus(
         interface="slcan", channel=emulator.open(), bitrate=500_000, sleep_after_open=0, ignore_config=True
     )

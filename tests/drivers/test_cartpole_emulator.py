@@ -12,7 +12,6 @@ from deal_hw.cli.emulate import KINDS as EMULATE
 from deal_hw.cli.emulate import emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
-from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
@@ -26,6 +25,7 @@ from deal_hw.errors import (
     UnknownNameError,
 )
 from deal_hw.robots import adopt_robot, make_robot
+from deal_hw.testing.pseudo_terminal import PseudoTerminal
 from deal_hw.testing.robot_suite import default_command
 from deal_hw.transport import Message
 from deal_hw.types import Status
@@ -42,7 +42,7 @@ class Bench:
     def __init__(self, hazards: Hazards | None = None, link: Path | None = None) -> None:
         self.clock = VirtualClock()
         self.device = CartpoleDevice(nominal_truth())
-        self.emulator = CartpoleEmulator(self.device, link=link, hazards=hazards, clock=self.clock)
+        self.emulator = PseudoTerminal(self.device, link=link, hazards=hazards, clock=self.clock)
         self.port = SerialTransport(self.emulator.open())
         self.port.open()
         self.decoder = protocol.FrameDecoder()
@@ -209,7 +209,7 @@ def test_a_link_is_made_replaced_and_removed(tmp_path: Path) -> None:
     bench.close()
     assert not link.is_symlink()
     link.write_text("mine")
-    emulator = CartpoleEmulator(CartpoleDevice(nominal_truth()), link=link)
+    emulator = PseudoTerminal(CartpoleDevice(nominal_truth()), link=link)
     with pytest.raises(ConfigurationError, match="not a symbolic link"):
         emulator.open()
     assert link.read_text() == "mine"

@@ -8,10 +8,10 @@ import uuid
 
 import pytest
 
-from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, TYPES
 from deal_hw.drivers.transports import dds_discovery
 from deal_hw.drivers.transports.dds_discovery import DdsEndpoint, DdsPeer, _unicast, _vendor
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL, UINT8
+from deal_hw.drivers.transports.topics import LOW_COMMAND, TYPES
 
 pytestmark = pytest.mark.real_time
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.drivers.go2.messages.topics import TYPES
 from deal_hw.drivers.transports.dds_types import (
     COMPLETE,
     MINIMAL,
@@ -20,6 +19,7 @@ from deal_hw.drivers.transports.dds_types import (
     load_types,
     type_hashes,
 )
+from deal_hw.drivers.transports.topics import TYPES
 from deal_hw.errors import VersionMismatchError
 
 pytestmark = pytest.mark.skipif(

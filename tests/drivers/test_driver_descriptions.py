@@ -23,9 +23,9 @@ from deal_hw.robots import (
     robot_description,
     robots,
 )
-from deal_hw.robots.ant import model as ant_model
+from deal_hw.robots.ant import description as ant_model
 from deal_hw.robots.ant.description import DEFAULT, PAPER
-from deal_hw.robots.humanoid import model as humanoid_model
+from deal_hw.robots.humanoid import description as humanoid_model
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.sim.parameters import KIND_TABLE, check_space

@@ -213,13 +213,10 @@ def test_doctor_tells_what_is_wrong(faults: ServoFaults, says: str, remedy: str,
     assert re.search(remedy, wrong[0].do)
 
 
-def test_doctor_finds_servos_of_another_rate_on_a_port(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_doctor_finds_servos_of_another_rate_on_a_port(tmp_path: Path) -> None:
     """The port itself is set to each rate in turn, and is free again at its end."""
-    monkeypatch.setattr("deal_hw.drivers.cartpole.dynamixel.doctor.BAUD_RATES", (57600, 1_000_000))
     with emulated(ServoFaults(servo_baud_rate=57600)) as (path, _):
-        found = examine_servos(path + PATIENT, MonotonicClock(), tmp_path)
+        found = examine_servos(path + PATIENT, MonotonicClock(), tmp_path, rates=(57600, 1_000_000))
         assert [f.seen for f in found if f.severity is Severity.FAIL] == [
             f"id {servo} is set to 57600 baud, but deal-hw expects 1000000" for servo in (1, 2)
         ]

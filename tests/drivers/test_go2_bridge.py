@@ -25,6 +25,9 @@ from deal_hw.types import JointCommand
 from deal_hw.workflows import stop as stop_workflow
 from deal_hw.workflows.stop import StopReport
 
+IMPATIENT = {"connect/timeout_ms": 500}
+"""Setting of a session that never comes, so that nobody waits long for it."""
+
 pytestmark = [
     pytest.mark.real_time,
     pytest.mark.skipif(
@@ -222,11 +225,10 @@ def test_stop_damps_through_the_bridge_and_fights_nobody(
     ],
 )
 def test_others_are_refused_and_told_why(
-    rig: BridgeRig, monkeypatch: pytest.MonkeyPatch, name: str, kind: type[Exception], words: str
+    rig: BridgeRig, name: str, kind: type[Exception], words: str
 ) -> None:
     """An expired certificate, and none."""
-    monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.5)
-    with pytest.raises(kind, match=words), BridgeClient(rig.port, rig.options(name)):
+    with pytest.raises(kind, match=words), BridgeClient(rig.port, rig.options(name), IMPATIENT):
         pass
 
 
@@ -234,11 +236,10 @@ def test_the_robots_side_refuses_an_expired_certificate_itself(
     rig: BridgeRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A client that does not look at its own, such as another program: the peer's verdict is put in words."""
-    monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.5)
     monkeypatch.setattr(zenoh_session, "own_certificate_trouble", lambda options: (0, ""))
     with (
         pytest.raises(PortNotFoundError, match="it finds our certificate expired"),
-        BridgeClient(rig.port, rig.options("expired")),
+        BridgeClient(rig.port, rig.options("expired"), IMPATIENT),
     ):
         pass
 

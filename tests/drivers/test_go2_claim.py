@@ -15,8 +15,8 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2 import claim as module
 from deal_hw.drivers.go2.claim import ASKING, HELD, RELEASED, WireClaim
 from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, Request, encode_request, read_note
-from deal_hw.drivers.go2.messages.topics import CLAIM
 from deal_hw.drivers.transports.interfaces import list_interfaces
+from deal_hw.drivers.transports.topics import CLAIM
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import PortBusyError, TransportLostError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport, WireOptions

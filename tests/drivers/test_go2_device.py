@@ -14,10 +14,10 @@ from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as R
 from deal_hw.drivers.go2.descriptions.on_stand_recording import parameter_space
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.sport_state import decode_sport_state
+from deal_hw.drivers.transports import topics
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.types import FloatArray
 

@@ -18,10 +18,10 @@ from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
 from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, Go2Faults
 from deal_hw.drivers.go2.emulator.sport_controller import STANDING
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
 from deal_hw.robots import make_topic_transport
 from deal_hw.transport import Message, WireOptions

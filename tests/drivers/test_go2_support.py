@@ -24,10 +24,10 @@ from deal_hw.drivers.go2.descriptions.leg_geometry import (
 )
 from deal_hw.drivers.go2.emulator.device import LEGS_DOWN, Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.go2.support import Support, SupportConfig, read_support
+from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
@@ -175,12 +175,12 @@ def test_a_stand_is_level(axis: int, angle: float, support: Support) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"window_s": 0.0}, {"loaded": 0.2}, {"held_reach_m": 0.1}, {"level_rad": math.nan}]
+    "changes", [{"force_m_s2": 0.0}, {"loaded": 0.2}, {"held_reach_m": 0.1}, {"level_rad": math.nan}]
 )
 def test_settings_that_mean_nothing_are_refused(changes: dict[str, float]) -> None:
     """Neither negative, nor in the wrong order."""
     with pytest.raises(ConfigurationError):
-        SupportConfig(**changes)  # type: ignore[arg-type]
+        SupportConfig(**changes)
 
 
 @pytest.mark.parametrize("profile", ["sensor", "realistic"])

@@ -17,7 +17,6 @@ from deal_hw.control.safety.passive import make_passive
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import encode_low_state
 from deal_hw.drivers.go2.messages.simulated import is_unitree_mujoco
@@ -27,6 +26,7 @@ from deal_hw.drivers.go2.unitree_mujoco import (
     UnitreeMujocoOnStandRobot,
     UnitreeMujocoRobot,
 )
+from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import (
     ConfigurationError,

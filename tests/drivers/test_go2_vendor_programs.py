@@ -15,10 +15,10 @@ import pytest
 from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.wire import SLOT
+from deal_hw.drivers.transports import topics
 from deal_hw.types import FloatArray
 
 PERIOD_MS = 2

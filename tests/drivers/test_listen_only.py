@@ -13,8 +13,8 @@ from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth as go2_truth
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.robot import Go2Robot
+from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.listen_only import ListenOnly, ListenOnlyTopics, listen_only
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport

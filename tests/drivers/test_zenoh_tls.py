@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.drivers.transports import zenoh_session
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError
 from deal_hw.testing.transport_suite import TopicPair, meet
 from deal_hw.transport import WireOptions
+
+IMPATIENT = {"connect/timeout_ms": 500}
+"""Setting of a session that never comes, so that nobody waits long for it."""
 
 COMMAND, STATE = "rt/lowcmd", "rt/lowstate"
 pytestmark = [
@@ -114,12 +116,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, WireOptions]:
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the wait for a session that never comes."""
-    monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.5)
-
-
-@pytest.fixture
 def endpoint() -> str:
     """Return an end point that nobody uses."""
     with socket.socket() as probe:
@@ -144,7 +140,6 @@ def test_both_ends_with_certificates_of_one_authority_talk(
         meet(TopicPair(near=near, far=far, down=STATE, up=COMMAND, payload=lambda topic, n: bytes([n]) * 812))
 
 
-@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize(
     ("robot", "controller", "words"),
     [
@@ -160,15 +155,14 @@ def test_others_get_no_session_and_are_told_why(
     """A foreign or absent certificate, a foreign authority, a certificate for another address."""
     with ZenohTransport(endpoint, options=listening(files[robot])):
         with pytest.raises(PortNotFoundError, match=words):
-            ZenohTransport(endpoint, options=files[controller]).open()
+            ZenohTransport(endpoint, options=files[controller], settings=IMPATIENT).open()
 
 
-@pytest.mark.usefixtures("impatient")
 def test_plain_text_finds_no_session_where_tls_listens(files: dict[str, WireOptions], endpoint: str) -> None:
     """Who forgets TLS gets a message that the protocol may be the reason."""
     with ZenohTransport(endpoint, options=listening(files["robot"])):
         with pytest.raises(PortNotFoundError, match="uses the other protocol of tls/ and tcp/"):
-            ZenohTransport(endpoint.replace("tls", "tcp")).open()
+            ZenohTransport(endpoint.replace("tls", "tcp"), settings=IMPATIENT).open()
 
 
 def test_a_key_of_another_certificate_is_refused(files: dict[str, WireOptions], endpoint: str) -> None:

@@ -21,9 +21,15 @@ DOCS = ROOT / "docs"
 FOLDERS = ("deal_hw", "calib", "drivers", "policies")
 
 
-def test_documents_link_to_files_that_exist() -> None:
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    """The pages that are made, by their place; the whole tree is read for them."""
+    return docs_pages.pages()
+
+
+def test_documents_link_to_files_that_exist(pages: dict[str, str]) -> None:
     """Relative links in the README, CONTRIBUTING and docs lead to a file, or to a page that is made."""
-    made = {(DOCS / place).resolve() for place in docs_pages.pages()}
+    made = {(DOCS / place).resolve() for place in pages}
     broken = []
     for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")):
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
@@ -33,17 +39,17 @@ def test_documents_link_to_files_that_exist() -> None:
     assert broken == []
 
 
-def test_each_page_is_in_the_navigation() -> None:
+def test_each_page_is_in_the_navigation(pages: dict[str, str]) -> None:
     """Every page that is written or made has its place, and the navigation names no other."""
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = re.findall(r": ([\w/-]+\.md)$", text.partition("\nnav:")[2], flags=re.M)
-    pages = {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")} | set(docs_pages.pages())
-    assert sorted(named) == sorted(pages)
+    written = {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
+    assert sorted(named) == sorted(written | set(pages))
 
 
-def test_each_verb_is_in_the_reference() -> None:
+def test_each_verb_is_in_the_reference(pages: dict[str, str]) -> None:
     """Each verb has its section with the line that runs, and its options have rows."""
-    page = docs_pages.cli_page()
+    page = pages["reference/cli.md"]
     for name, verb in VERBS.items():
         assert f"\n## deal-hw {name}\n\n    deal-hw {verb.example}\n" in page
     assert "| `--latency FLOAT` | Total latency [s] if it is known" in page.replace("&#91;", "[")
@@ -68,7 +74,7 @@ def test_each_refusal_is_on_the_page_of_errors() -> None:
     )
 
 
-def test_each_alarm_is_on_its_page() -> None:
+def test_each_alarm_is_on_its_page(pages: dict[str, str]) -> None:
     """Alarms of all folders are found with their three parts, and causes beside them."""
     found = docs_pages.alarms()
     assert {path for path, *_ in found} >= {
@@ -77,7 +83,7 @@ def test_each_alarm_is_on_its_page() -> None:
         "deal_hw/workflows/calibration/best_so_far.py",
     }
     assert all(part.strip("… ") for row in found for part in row)
-    page = docs_pages.alarms_page()
+    page = pages["reference/alarms.md"]
     assert "| Residuals are … times the sensor's noise…. | The model does not explain the recording: " in page
     assert "\n| backlash | play in the gear | " in page
 
@@ -168,26 +174,26 @@ def test_no_site_is_a_complaint(tmp_path: Path) -> None:
     assert "make docs" in check_site.complaints(tmp_path)[0]
 
 
-def test_the_reference_has_the_arguments_of_each_function() -> None:
+def test_the_reference_has_the_arguments_of_each_function(pages: dict[str, str]) -> None:
     """A function of settings shows in a signature that it takes settings; its arguments are the class's."""
-    text = "\n".join(docs_pages.api_pages().values())
+    text = "\n".join(text for place, text in pages.items() if place.startswith("reference/api"))
     for name in ("collect", "deploy", "train", "emulate", "inspect", "replay", "design_excitation"):
         assert re.search(rf"heading: Arguments of deal_hw\.{name}( for .*)?\n", text)
     assert "::: deal_hw.workflows.collect.CollectGo2Settings\n" in text
 
 
-def test_each_public_name_is_on_one_page_of_the_api() -> None:
+def test_each_public_name_is_on_one_page_of_the_api(pages: dict[str, str]) -> None:
     """The start page lists all of them; no page has everything."""
-    pages = docs_pages.api_pages()
-    start = pages.pop("reference/api.md")
-    assert "::: " not in start and len(pages) >= 8
-    described = [line for text in pages.values() for line in text.splitlines() if line.startswith("::: ")]
+    api = {place: text for place, text in pages.items() if place.startswith("reference/api")}
+    start = api.pop("reference/api.md")
+    assert "::: " not in start and len(api) >= 8
+    described = [line for text in api.values() for line in text.splitlines() if line.startswith("::: ")]
     assert len(described) == len(set(described))
     names = docs_pages.public_names(deal_hw)
     assert {f"::: {name}" for name in names} <= set(described)
     for name in names:
         assert f"#{name})" in start
-    assert max(text.count("::: ") for text in pages.values()) <= 12
+    assert max(text.count("::: ") for text in api.values()) <= 12
 
 
 def test_names_in_docstrings_are_names() -> None:

@@ -59,6 +59,7 @@ ROOMS = {
         {"design"},
         {"pipeline", "report"},
     ),
+    "drivers": ({"command_echo", "servo_bus", "transports"}, {"cartpole", "go2"}),
     "drivers.cartpole": (
         {"description"},
         {"wire", "plant"},
@@ -231,6 +232,7 @@ def test_repository_keeps_the_order() -> None:
         ("calib/data/x.py", "from deal_hw.calib.fit import solver", "calib/data imports calib/fit"),
         ("calib/data/x.py", "from deal_hw.calib import fit", "calib/data imports calib/fit"),
         ("calib/data/x.py", "import deal_hw.calib.newroom.y", "calib/newroom is in no room"),
+        ("drivers/transports/x.py", "from deal_hw.drivers.go2 import robot", "drivers/transports imports"),
         ("drivers/go2/messages/x.py", "from deal_hw.drivers.go2 import robot", "go2/messages imports"),
         (
             "drivers/go2/robot.py",

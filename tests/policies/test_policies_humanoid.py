@@ -17,8 +17,7 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.vector_env import Mirror
 from deal_hw.policy import ObservationTerm
 from deal_hw.robots import robot_description
-from deal_hw.robots.humanoid.description import GEAR_NM
-from deal_hw.robots.humanoid.model import joint_type
+from deal_hw.robots.humanoid.description import GEAR_NM, joint_type
 from deal_hw.types import FloatArray
 from deal_hw.workflows.train import nominal_distribution
 

@@ -11,7 +11,7 @@ from deal_hw.sim.recordings.gravity_gain import GravityGain, gravity_gain
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration import checks
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -19,7 +19,7 @@ def test_the_truth_lies_within_four_standard_errors(seed: int, tmp_path: Path) -
     """An arm of three joints, 6 s of motion: both loaded joints, and the vertical one says nothing."""
     robot = make_robot("arm", seed)
     model, paths, _ = write(robot, tmp_path, seconds=6.0)
-    work = calibration_input(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
+    work = calibration_input(FilesSettings(model=model, data=paths))
     found = gravity_gain(work.robot, list(work.episodes))
     assert found is not None
     truth = np.array([robot.truth[f"{joint}.servo_stiffness"] for joint in ("shoulder", "elbow")])
@@ -31,7 +31,7 @@ def test_the_truth_lies_within_four_standard_errors(seed: int, tmp_path: Path) -
 def test_a_gain_that_chance_explains_is_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same gain, far outside the search range: with a small error a warning, with a large one none."""
     model, paths, _ = write(make_robot("pendulum", 0), tmp_path, seconds=3.0)
-    work = calibration_input(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
+    work = calibration_input(FilesSettings(model=model, data=paths))
     for error, warned in ((0.1, True), (0.6, False)):
         found = GravityGain(*(np.array([v]) for v in (0.5, error, 0.6, 0.1, 0.03)))
         monkeypatch.setattr("deal_hw.sim.recordings.gravity_gain.gravity_gain", lambda *_, f=found: f)

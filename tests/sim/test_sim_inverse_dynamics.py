@@ -10,13 +10,13 @@ import pytest
 from deal_hw.sim.engine.inverse_dynamics import link_torques
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 
 def test_a_pendulums_torque_is_its_weight_and_its_inertia(tmp_path: Path) -> None:
     """A rod of 0.25 kg and 0.3 m: its weight times 0.15 m sin q, and its inertia without the rotor's."""
     model, paths, _ = write(make_robot("pendulum", 3), tmp_path, seconds=3.0)
-    work = calibration_input(CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths))))
+    work = calibration_input(FilesSettings(model=model, data=paths))
     robot = work.robot
     angle, acceleration = np.array([[0.0], [0.5], [0.5]]), np.array([[0.0], [0.0], [2.0]])
     found = link_torques(robot, angle, np.ones_like(angle), acceleration)[:, 0]

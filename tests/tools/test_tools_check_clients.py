@@ -82,8 +82,11 @@ def test_keys_are_pressed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatc
 
 def test_a_program_that_never_ends_is_stopped(tmp_path: Path) -> None:
     """By Ctrl-C, where it is endless on purpose, or by force at its limit."""
-    code = "import time\ntry: time.sleep(60)\nexcept KeyboardInterrupt: print('stopped by hand')"
-    endless = Client(name="x", source="", command=(), emulator=(), stop_after_s=0.3)
+    code = (
+        "import time\ntry: print('begun', flush=True); time.sleep(600)\n"
+        "except KeyboardInterrupt: print('stopped by hand')"
+    )
+    endless = Client(name="x", source="", command=(), emulator=(), stop_after_s=0.1, limit_s=120.0)
     assert (
         "stopped by hand" in run_in_terminal([sys.executable, "-c", code], endless, tmp_path, os.environ)[0]
     )

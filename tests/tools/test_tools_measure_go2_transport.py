@@ -6,17 +6,17 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
 import pytest
+from fakes.waiting import PATIENCE_S, until
 from go2_transport_sides import Arrivals, mark, read_mark
 from hypothesis import given
 from hypothesis import strategies as st
 from measure_go2_transport import TransportBench, bench_transport, lines, main, summary
 
-from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
+from deal_hw.drivers.transports.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import ConfigurationError, TransportError
 from deal_hw.transport import WireOptions
 
@@ -161,18 +161,14 @@ def test_ctrl_c_leaves_no_process_behind() -> None:
     command = [sys.executable, str(tool), *"--transport zenoh --seconds 60".split()]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as bench:
         try:
-            children: list[psutil.Process] = []
-            for _ in range(1500):
-                children = psutil.Process(bench.pid).children()
-                if len(children) == 2:
-                    break
-                time.sleep(0.02)
-            assert len(children) == 2
+            tool_process = psutil.Process(bench.pid)
+            until(lambda: len(tool_process.children()) == 2, "both sides are started")
+            children = tool_process.children()
             bench.send_signal(signal.SIGINT)
-            _, errors = bench.communicate(timeout=30)
+            _, errors = bench.communicate(timeout=PATIENCE_S)
         finally:
             bench.kill()
     assert bench.returncode == 130, errors
     # One that was just being started learns of it at the end of its imports.
-    _, alive = psutil.wait_procs(children, timeout=30)
+    _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
     assert not alive

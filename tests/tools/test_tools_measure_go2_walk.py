@@ -13,6 +13,7 @@ from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import CheckpointError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import ObservationBuilder
+from deal_hw.workflows.emulation.walk_script import Walk
 from deal_hw.workflows.shipped import shipped_policy
 
 
@@ -24,14 +25,10 @@ def policy() -> OnnxPolicy:
     return OnnxPolicy(path)
 
 
-def test_the_shipped_policy_walks_where_it_is_told(
-    policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_shipped_policy_walks_where_it_is_told(policy: OnnxPolicy) -> None:
     """A hidden robot of the profile `realistic`: no trip, ahead at 1 m/s within 0.2 m/s and 0.2 rad/s."""
-    monkeypatch.setattr(measure_go2_walk, "PROFILE", ((0.0, (0.0, 0.0, 0.0)), (1.5, (1.0, 0.0, 0.0))))
-    monkeypatch.setattr(measure_go2_walk, "PROFILE_S", 4.5)
-    monkeypatch.setattr(measure_go2_walk, "NAMES", ("stand", "ahead"))
-    row = measure_go2_walk.measure(policy, "realistic", 0, 1)
+    script = Walk(((0.0, (0.0, 0.0, 0.0)), (1.5, (1.0, 0.0, 0.0))), 4.5)
+    row = measure_go2_walk.measure(policy, "realistic", 0, 1, script, ("stand", "ahead"))
     assert (row["outcome"], row["reason"]) == ("finished", "the run is over")
     assert row["parts"]["ahead"]["ahead"] == pytest.approx(1.0, abs=0.2)
     assert row["velocity_error_m_s"] < 0.2 and row["yaw_error_rad_s"] < 0.2

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-import time
+import select
+import subprocess
+from typing import Any
 
 import pytest
+from fakes.waiting import PATIENCE_S
 from measure_go2_transport import TransportBench, lines, summary
 from stall_monitor import Account, Pause, watch_stalls
 
@@ -14,6 +17,7 @@ from deal_hw.errors import ConfigurationError
 pytestmark = pytest.mark.real_time
 
 MS = 1_000_000
+POPEN = subprocess.Popen
 
 
 def test_time_outside_pauses_is_counted() -> None:
@@ -68,11 +72,20 @@ def test_a_late_cycle_that_the_machine_slept_through_is_not_held_against_the_wir
     assert "10.00 ms: NOT kept" in "\n".join(lines(row))
 
 
-def test_each_processor_is_watched_until_the_block_ends() -> None:
+def test_each_processor_is_watched_until_the_block_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """With no least length every wake-up is a pause: all processors are received, in order."""
+    begun: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: Any, **options: Any) -> subprocess.Popen[str]:
+        begun.append(POPEN(*arguments, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
     try:
         with watch_stalls(-1) as seen:
-            time.sleep(0.05)
+            for monitor in begun:
+                assert monitor.stdout is not None
+                assert select.select([monitor.stdout], [], [], PATIENCE_S)[0], "it reports no pause"
     except ConfigurationError:
         pytest.skip("SCHED_FIFO is refused here")
     assert {pause.processor for pause in seen.pauses} == os.sched_getaffinity(0)

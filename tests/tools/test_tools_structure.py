@@ -61,8 +61,18 @@ SETTINGS = {
         "    reach: float = 1.0\n    far: int = 2\n"
         "@dataclass(frozen=True)\nclass LongSettings(FitSettings):\n    late: bool = False\n"
         "@dataclass(frozen=True)\nclass FixedSettings:\n    share: float = 0.5\n"
+        "@dataclass(frozen=True)\nclass ShownOptions:\n    shown: int = 1\n"
+        "@dataclass(frozen=True)\nclass ReadSettings:\n    read: int = 1\n"
+        "@dataclass(frozen=True)\nclass TableConfig:\n    rate: float = 1.0\n    rest: float = 1.0\n"
+        "class Trainer:\n    config = TableConfig\n"
+        "TASKS = {'one': {'rate': 2.0}, 'rest': 3}\n"
+        "def read(values):\n    return from_values(ReadSettings, values)\n"
         "class Settings:\n    pass\n"
         "FIXED = FixedSettings()\nlong = partial(LongSettings, late=True)\n"
+    ),
+    "deal_hw/cli/effort.py": (
+        "from dataclasses import dataclass\nfrom deal_hw.calib.effort import ShownOptions\n"
+        "@dataclass\nclass Effort:\n    rules: ShownOptions\n"
     ),
     "tests/test_effort.py": (
         "from deal_hw.calib import effort\n"
@@ -151,7 +161,7 @@ def test_least_squares_candidates(counted: dict[str, Any]) -> None:
 
 
 def test_settings_and_who_sets_them(tree: Path) -> None:
-    """A keyword, a value in order and `replace` set a field, also of a base class; a default does not."""
+    """A keyword, a value in order, `replace`, an option, text and a table set a field; a default does not."""
     for name, text in SETTINGS.items():
         (tree / name).parent.mkdir(exist_ok=True)
         (tree / name).write_text(text, encoding="utf-8")
@@ -160,9 +170,12 @@ def test_settings_and_who_sets_them(tree: Path) -> None:
         "FitSettings": {"steps": ["tests"], "reach": [], "far": ["tools"]},
         "LongSettings": {"late": ["product"]},
         "FixedSettings": {"share": []},
+        "ShownOptions": {"shown": ["command line"]},
+        "ReadSettings": {"read": ["text"]},
+        "TableConfig": {"rate": ["product"], "rest": []},
     }
     assert counted["summary"]["calib/ settings classes that nobody gives an argument"] == 1
-    assert counted["summary"]["calib/ settings fields that nobody sets"] == 2
+    assert counted["summary"]["calib/ settings fields that nobody sets"] == 3
     assert counted["replaced_by_tests"] == [
         "tests/test_effort.py:3 effort.LIMIT",
         "tests/test_effort.py:5 deal_hw.calib.effort.FitSettings",

@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.viz.scales import SETTINGS, clear_corner, time_columns, visible_range
+from deal_hw.viz.scales import (
+    FRAME_PX,
+    LABEL_PX,
+    LEAST_SHARE,
+    LEAST_SPAN,
+    LEAST_TICKS,
+    WINDOW_PX,
+    clear_corner,
+    time_columns,
+    visible_range,
+)
 
 
 def curve(*values: float) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +46,7 @@ def test_the_axis_is_not_twice_the_data(middle: float, span: float) -> None:
     0.9 spans. At worst one label is in the middle, and the next one is 0.9 - 0.56 spans beyond an end.
     """
     low, high = visible_range([curve(middle - span / 2, middle + span / 2)])
-    if span > 2 * (SETTINGS.least_share * abs(middle) + SETTINGS.least_span):
+    if span > 2 * (LEAST_SHARE * abs(middle) + LEAST_SPAN):
         assert high - low <= 1.55 * span
 
 
@@ -59,11 +69,11 @@ def test_labels_fit(middle: float, span: float, rows: int) -> None:
     """Of any values, all are inside, with two labels at least and none too close to the next."""
     low, high = visible_range([curve(middle - span / 2, middle + span / 2)], rows=rows)
     assert low < middle - span / 2 and middle + span / 2 < high
-    height = SETTINGS.window_px / rows - SETTINGS.frame_px
+    height = WINDOW_PX / rows - FRAME_PX
     steps = 10.0 ** np.arange(-6, 6)
     labels = np.floor(high / steps + 1e-9) - np.ceil(low / steps - 1e-9) + 1
     apart = height * steps / (high - low)
-    assert ((labels >= SETTINGS.ticks) & (apart >= 0.5 * SETTINGS.label_px)).any()
+    assert ((labels >= LEAST_TICKS) & (apart >= 0.5 * LABEL_PX)).any()
 
 
 def test_the_legend_keeps_out_of_the_way() -> None:

@@ -94,7 +94,9 @@ def test_its_recording_is_calibrated(recorded: Recorded) -> None:
 
 def test_its_transport_reaches_the_robot(installed: Path, tmp_path: Path) -> None:
     """The same bytes through TCP; the control process goes on with the connection that its parent opened."""
-    with EmulatorProcess(ROBOT, "--seed", "2") as emulator, forwarded(emulator.port) as port:
+    link = str(tmp_path / "cart")
+    with EmulatorProcess(ROBOT, "--seed", "2", "--link", link) as emulator, forwarded(emulator.port) as port:
+        assert emulator.port == link
         wire = ["--transport", "tcp", "--port", port]
         assert f"{ROBOT} answers" in deal_hw("doctor", ROBOT, *wire, "--seconds", 3)
         deal_hw("collect", ROBOT, *wire, "--out", tmp_path, "--motion", "hold", "--seconds", 1)

@@ -15,7 +15,7 @@ import deal_hw
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, PolicyError, UnknownNameError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.calibration.space import searched_space
 
 Arrays = dict[str, FloatArray]
@@ -156,7 +156,7 @@ def test_what_the_model_has_as_zero_is_said(pendulum: tuple[Path, Path, Path]) -
     model = mujoco.MjModel.from_xml_path(str(pendulum[0]))
     model.dof_frictionloss[:] = 0
     printed: list[str] = []
-    searched_space(CalibrateSettings(), model, printed.append)
+    searched_space(FilesSettings(model=pendulum[0]), model, printed.append)
     assert printed == [
         "not searched, because they are 0 in the model: dof_frictionloss of pivot. If the robot has them, "
         "write values above 0 into the MJCF"
@@ -182,7 +182,7 @@ def test_a_copy_is_neither_fitted_twice_nor_held_out(
     [
         ({"known": ["pivot.damping"]}, "known={"),
         ({"known": {"pivot.damping": "soft"}}, "could not convert string to float: 'soft'"),
-        ({"ranges": {"pivot.damping": (1, 2, 3)}}, "ranges={"),
+        ({"range": {"pivot.damping": (1, 2, 3)}}, "range={"),
         ({"leave_out": ("rec.csv", 1, 2)}, "leave_out="),
         ({"free": "pivot.dampin"}, "unknown parameter 'pivot.dampin'"),
         ({"holdout": 1}, "--holdout 1: with --model give recordings; episode numbers go with a dataset"),
@@ -203,10 +203,14 @@ def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, P
         deal_hw.calibrate()
     with pytest.raises(ConfigurationError, match="not both"):
         deal_hw.calibrate(model, fit, dataset="runs/first/dataset")
-    with pytest.raises(ConfigurationError, match="--episodes would have no effect: only datasets take that"):
+    with pytest.raises(UnknownNameError, match=r"unknown argument of calibrate model 'episodes'.* have it"):
         deal_hw.calibrate(model, fit, episodes=[0])
-    with pytest.raises(ConfigurationError, match="--feet, --data would have no effect: a dataset defines it"):
-        deal_hw.calibrate(None, fit, dataset="d", feet=["FL"])
+    with pytest.raises(
+        UnknownNameError, match=r"argument of calibrate dataset 'feet'.*`calibrate model` has"
+    ):
+        deal_hw.calibrate(dataset="d", feet=["FL"])
+    with pytest.raises(ConfigurationError, match=r"--holdout r\.csv: with a dataset give episode numbers"):
+        deal_hw.calibrate(dataset="d", holdout="r.csv")
     with pytest.raises(PolicyError, match=r"no such policy file: pi\.onnx"):
         deal_hw.calibrate(model, fit, search="eki", policy="pi.onnx")
     with pytest.raises(ConfigurationError, match="which is unknown for --model"):

@@ -12,7 +12,7 @@ from deal_hw.control.process.supervisor import ChildEnd
 from deal_hw.robots import on_this_computer
 from deal_hw.workflows import causes
 from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
-from deal_hw.workflows.running.episode_end import account
+from deal_hw.workflows.running.episode import account
 
 pytestmark = pytest.mark.real_time
 

@@ -13,7 +13,7 @@ from deal_hw.calib.data.noise import HELD_STD, white_noise_std
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings, OwnDatasetSettings
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
 
 PENDULUM = """<mujoco>
@@ -90,8 +90,8 @@ def test_a_free_swing_shows_friction_damping_and_inertia(
 def test_a_model_needs_no_actuator(swing: dict[str, FloatArray], tmp_path: Path) -> None:
     """Its three parameters are searched."""
     printed: list[str] = []
-    settings = CalibrateSettings(recordings=Recordings(model=write_model(tmp_path, "")), threads=1)
-    inputs = calibration_input(settings, data=[swing], say=printed.append)
+    settings = FilesSettings(model=write_model(tmp_path, ""), data=[swing], threads=1)
+    inputs = calibration_input(settings, say=printed.append)
     assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
     assert any("the model has no actuators" in text for text in printed)
 
@@ -108,10 +108,10 @@ def test_a_free_swing_beside_a_driven_recording(
     columns.write_text(
         "time: time\njoints: [{name: hub, position: hub_pos, target: hub_cmd, target_unit: Nm}]\n"
     )
-    config = Recordings(model=write_model(tmp_path, MOTOR), columns=None if command is None else columns)
+    model, named = write_model(tmp_path, MOTOR), None if command is None else columns
     # Torques up to 1.6 N·m, so that none is taken for a share of full power.
     data = [free, recording(4.0, 1)]
-    inputs = calibration_input(CalibrateSettings(recordings=config, threads=1), data=data)
+    inputs = calibration_input(FilesSettings(model=model, data=data, columns=named, threads=1))
     assert "drive.gain" in [p.name for p in inputs.space]
     still = [e for e in inputs.episodes if not np.any(e.target)]
     assert still and len(still) < len(inputs.episodes)
@@ -119,9 +119,9 @@ def test_a_free_swing_beside_a_driven_recording(
 
 def test_servos_without_commands_are_refused(swing: dict[str, FloatArray], tmp_path: Path) -> None:
     """A servo holds its joint: the message says what to do if it was off."""
-    settings = CalibrateSettings(recordings=Recordings(model=write_model(tmp_path, SERVO)))
+    settings = FilesSettings(model=write_model(tmp_path, SERVO), data=[swing])
     with pytest.raises(DatasetError, match="remove the actuators from a copy of the MJCF"):
-        calibration_input(settings, data=[swing])
+        calibration_input(settings)
 
 
 def test_a_free_swing_is_imported(swing: dict[str, FloatArray], tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_free_swing_is_imported(swing: dict[str, FloatArray], tmp_path: Path) 
     assert dataset is not None
     trajectory = dataset.read(0).trajectory
     assert trajectory.actuated == ("hub",) and not trajectory.position_target.any()
-    inputs = calibration_input(CalibrateSettings(dataset=tmp_path / "data", threads=1))
+    inputs = calibration_input(OwnDatasetSettings(dataset=tmp_path / "data", threads=1))
     assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
 
 

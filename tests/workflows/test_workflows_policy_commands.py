@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import deal_hw
+from deal_hw.calib.data.innovations import Members
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.paper.rollouts import control_ticks, rollout_population
 from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
@@ -15,7 +19,7 @@ from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
+from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import required_policy
@@ -41,8 +45,13 @@ def facts() -> JointFacts:
 @pytest.fixture(scope="module")
 def table(policy: Path) -> Table:
     """Five seconds of balancing with noise and a latency, as a file of states and commands would be read."""
+    return balanced(policy, "sensor")
+
+
+def balanced(policy: Path, profile: str) -> Table:
+    """Five seconds of balancing, as a file of states and commands would be read."""
     plan = RunPlan(robot="cartpole", motion="balance", seconds=5.0, policy=str(policy))
-    robot = VirtualCartpole(draw_truth("sensor", 1, range_ratio=2.0))
+    robot = VirtualCartpole(draw_truth(profile, 1, range_ratio=2.0))
     run = robot.run(make_behaviour(plan, DESCRIPTION), plan.seconds).trajectory
     rows = np.flatnonzero(run.command_sequence >= 0)
     # A host that sends a command notes its own time; the robot's first states come before it.
@@ -68,6 +77,15 @@ def table(policy: Path) -> Table:
 def without_commands(table: Table) -> Table:
     """The same states alone."""
     return dataclasses.replace(table, actuated=(), command_s=np.empty(0), target=np.empty((0, 0)))
+
+
+def states_file(table: Table, folder: Path) -> Path:
+    """The same states alone, in a file; positions alone where there are no velocities."""
+    file, names, columns = folder / "states.csv", "time,cart.pos,pole.pos", [table.time_s, table.position]
+    if table.velocity is not None:
+        names, columns = f"{names},cart.vel,pole.vel", [*columns, table.velocity]
+    np.savetxt(file, np.column_stack(columns), delimiter=",", header=names, comments="")
+    return file
 
 
 def test_states_alone_get_the_commands_that_were_sent(table: Table, policy: Path, facts: JointFacts) -> None:
@@ -159,14 +177,61 @@ def test_a_policy_that_does_not_fit_is_refused(table: Table, policy: Path, facts
 
 def test_a_file_of_states_is_prepared_with_its_policy(table: Table, policy: Path, tmp_path: Path) -> None:
     """`calibrate --model --data states.csv --policy`: the episodes have the policy's commands."""
-    assert table.velocity is not None
-    file = tmp_path / "states.csv"
-    columns = np.column_stack([table.time_s, table.position, table.velocity])
-    np.savetxt(file, columns, delimiter=",", header="time,cart.pos,pole.pos,cart.vel,pole.vel", comments="")
-    settings = CalibrateSettings(recordings=Recordings(model=DESCRIPTION.mjcf, data=(file,)))
+    file = states_file(table, tmp_path)
+    settings = FilesSettings(model=DESCRIPTION.mjcf, data=(file,))
     with pytest.raises(DatasetError, match="--policy"):
         calibration_input(settings)
     printed: list[str] = []
     work = calibration_input(dataclasses.replace(settings, policy=str(policy)), say=printed.append)
     assert any("no commands, so they are those of" in line for line in printed)
     assert sum(len(np.unique(e.target)) for e in work.episodes) > 50
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_states_alone_are_compared_as_distributions(
+    table: Table, policy: Path, tmp_path: Path, velocities: bool
+) -> None:
+    """The policy runs in every simulator; a clock in common is said, and a poor result is red."""
+    if not velocities:
+        table = dataclasses.replace(table, velocity=None)
+    printed: list[str] = []
+    found = deal_hw.calibrate(
+        DESCRIPTION.mjcf,
+        [states_file(table, tmp_path)],
+        policy=policy,
+        method="moments-unaligned",
+        free=("cart.frictionloss", "cart.servo_stiffness"),
+        population=8,
+        generations=2,
+        threads=1,
+        say=printed.append,
+    )
+    assert any("no commands, so they are those of" in line for line in printed)
+    assert any("have one clock" in line and "leave --method out" in line for line in printed)
+    assert found.result.provenance["compares"] == "distributions" and found.colour == "red"
+    space = found.result.space
+    assert np.all((space.low <= found.result.estimate) & (found.result.estimate <= space.high))
+
+
+def test_simulators_go_on_from_the_policys_past(policy: Path, tmp_path: Path) -> None:
+    """A file begins while the policy runs: the first command of a rollout is the one that it gave there."""
+    found = deal_hw.calibrate(
+        DESCRIPTION.mjcf,
+        [states_file(balanced(policy, "ideal"), tmp_path)],
+        policy=policy,
+        method="moments-unaligned",
+        free=("cart.frictionloss",),
+        population=4,
+        generations=1,
+        threads=1,
+    )
+    work = found.inputs
+    assert work.policy is not None and work.policy.history > 0
+    problem = Problem(work.robot, work.space, work.episodes, threads=1, policy=work.policy)
+    members = Members(work.space.nominal[None], np.zeros(1))
+    for index, episode in enumerate(work.episodes):
+        ticks = control_ticks(problem, index, 20, work.policy.history, ran_before=work.policy.ran_before)
+        _, _, action = rollout_population(problem, members, index, ticks)
+        wanted = episode.target[ticks.action[0]]
+        assert len(ticks.past) == work.policy.history
+        assert abs(action[0, 0, 0] - wanted[0]) < 0.01 * np.ptp(episode.target)

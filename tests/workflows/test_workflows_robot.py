@@ -208,8 +208,11 @@ REFUSED: list[tuple[str, str]] = [
         "data import {made}/other.csv --robot {made}/robot.yaml --out d",
         "cannot tell which channels are the joints'",
     ),
-    ("calibrate {made}/run/dataset --columns c.yaml", "--columns would have no effect"),
-    ("calibrate {made}/run/dataset --space k9", "--space would have no effect: this robot has one set"),
+    (
+        "calibrate {made}/run/dataset --columns c.yaml",
+        "`deal-hw calibrate own-robot` has no such option",
+    ),
+    ("calibrate {made}/run/dataset --space k9", "--space: `deal-hw calibrate own-robot` has no"),
     (
         "calibrate {made}/run/dataset --holdout 1 --holdout-part 0.5",
         "give --holdout or --holdout-part, not both",

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from fakes.waiting import PATIENCE_S, until
 
 from deal_hw.cli.main import main
-from deal_hw.clock import MonotonicClock, VirtualClock
+from deal_hw.clock import VirtualClock
 from deal_hw.control.process.claim import LocalClaim
 from deal_hw.control.process.run_note import RunNote, find_runs
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
@@ -24,7 +25,6 @@ from deal_hw.workflows.stop import _claimed, stop
 
 pytestmark = pytest.mark.real_time
 
-PATIENCE_S = 60.0
 HOLDER = """
 import sys, time
 from deal_hw.control.process.run_note import RunNote
@@ -37,15 +37,6 @@ with RunNote("go2", {"claim": "x"}) as note:
     print("said", flush=True)
     sys.stdin.readline()
 """
-
-
-def until(ready: Callable[[], bool]) -> None:
-    """Wait until something is so."""
-    clock = MonotonicClock()
-    end_ns = clock.now_ns() + round(PATIENCE_S * 1e9)
-    while not ready():
-        assert clock.now_ns() < end_ns
-        clock.sleep_until_ns(clock.now_ns() + 10_000_000)
 
 
 class Rig:
@@ -71,7 +62,10 @@ class Rig:
             process_group=0,
         )
         self.runs.append(process)
-        until(lambda: bool({STIFF, "armed"} & {*self.reported()[before:]}) or process.poll() is not None)
+        until(
+            lambda: {STIFF, "armed"} & {*self.reported()[before:]} or process.poll() is not None,
+            "the robot obeys the run",
+        )
         assert process.poll() is None
         return process
 

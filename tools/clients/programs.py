@@ -34,7 +34,7 @@ class Client:
         keys: Pairs: what is printed, and the keys to press then; each once, in this order.
         must: Regular expressions that its output must contain.
         must_not: Texts that its output must not contain.
-        stop_after_s: An endless program is stopped by Ctrl-C after this time [s].
+        stop_after_s: An endless program is stopped by Ctrl-C this long after its first output [s].
         limit_s: Longest run [s].
         exit_codes: Allowed exit codes.
     """

@@ -17,10 +17,12 @@ class RecordedCommands:
     Attributes:
         commands: The command of each control period, (T, A).
         history: Number of past control periods that it claims to use.
+        ran_before: Whether it claims to have run before the recordings began.
     """
 
     commands: FloatArray
     history: int = 0
+    ran_before: bool = False
 
     @classmethod
     def of(cls, target: FloatArray, period: int) -> Self:

@@ -1,27 +1,150 @@
-"""The control loop: one class for collecting, deploying and replaying, and for benches in virtual time."""
+"""The control loop: one class for collecting, deploying and replaying, and for benches in virtual time.
+
+Settings and report come first, then the repeater of commands, then the loop; nothing else uses the parts.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import enum
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.loop.repeater import Repeater
-from deal_hw.control.loop.report import LoopConfig, LoopReport, Outcome
 from deal_hw.control.loop.timing import LoopTiming, LoopTimingReport
 from deal_hw.control.process.channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
-from deal_hw.control.safety.passive import make_passive
+from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
-from deal_hw.errors import TransportError, TransportTimeoutError
+from deal_hw.errors import ConfigurationError, TransportError, TransportTimeoutError
 from deal_hw.motions.behaviours import Behaviour
 from deal_hw.motions.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.robot import Robot
+from deal_hw.schema import plain
 from deal_hw.transport import Message
 from deal_hw.types import Event, JointCommand, RobotState
+
+
+class Outcome(enum.Enum):
+    """How a run ended."""
+
+    FINISHED = "finished"
+    STOPPED = "stopped"
+    """Ended by the operator."""
+    TRIPPED = "tripped"
+    """Ended by the safety module."""
+    FAILED = "failed"
+    """Ended by an error."""
+
+
+HOME_TIMEOUT_S: Final = 20.0
+"""Longest homing [s]."""
+ARM_TIMEOUT_S: Final = 1.0
+"""Longest wait until the robot reports that its motors follow commands [s]."""
+STATE_TIMEOUT_S: Final = 1.0
+"""Longest wait for the first state sample [s]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopConfig:
+    """Settings of one run."""
+
+    duration_s: float
+    """Length of the run, counted in control periods [s]."""
+    dry_run: bool = False
+    """Compute everything but send no command: the robot is neither homed nor armed."""
+    home: bool = True
+    """Bring the robot to its start pose first."""
+    passive: PassiveConfig = field(default_factory=PassiveConfig)
+    """How the passive command is repeated at the end, until the robot confirms it."""
+    record_wire: bool = True
+    """Also record the raw bytes."""
+    hand_back: bool = False
+    """At the end, return the robot to its own controller."""
+    hand_back_timeout_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not self.duration_s > 0:
+            raise ConfigurationError(f"a run of {self.duration_s!r} s is too short; give a length above 0 s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopReport:
+    """Result of one run.
+
+    Attributes:
+        outcome: How it ended.
+        reason: The reason, for the operator.
+        passive_confirmed: Whether the robot itself reported that its motors no longer follow commands; also
+        True if it was never commanded.
+        loop_timing: How regular the loop's cycles were.
+        clipped: Number of cycles in which a limit changed the command, by limit.
+        cycles_sent: Commands sent.
+        error: Name of the error's class, after a failure.
+        flags: Failed checks of the safety module that ended it.
+    """
+
+    outcome: Outcome
+    reason: str
+    passive_confirmed: bool
+    loop_timing: LoopTimingReport
+    clipped: dict[str, int]
+    cycles_sent: int
+    error: str = ""
+    flags: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        values: dict[str, Any] = plain(self)
+        return values
+
+
+class Repeater:
+    """Repeats the current command when it is due; in the loop's thread, between its cycles.
+
+    A robot's motors hold the last command for ever, but should get it often. The same command is repeated, so
+    recording and calibration have one command per cycle.
+
+    Attributes:
+        sent_ns: Time of the last sent command, new or repeated [ns]; -1 before the first.
+
+    Args:
+        robot: The robot; ``description.repeat_rate_hz`` 0 means that nothing is repeated.
+        clock: The loop's clock.
+    """
+
+    def __init__(self, robot: Robot, clock: Clock) -> None:
+        rate_hz = robot.description.repeat_rate_hz
+        self._robot, self._clock = robot, clock
+        self._period_ns = round(1e9 / rate_hz) if rate_hz > 0 else 0
+        self._due_ns = -1
+        self.sent_ns = -1
+
+    def note_sent(self, now_ns: int) -> None:
+        """Note that a new command was sent."""
+        self.sent_ns = now_ns
+        self._due_ns = now_ns + self._period_ns if self._period_ns else -1
+
+    def stop(self) -> None:
+        """Repeat nothing until the next new command."""
+        self._due_ns = -1
+
+    def wake_ns(self, deadline_ns: int) -> int:
+        """Return the latest wake-up time, at most ``deadline_ns`` [ns]."""
+        return deadline_ns if self._due_ns < 0 else min(deadline_ns, self._due_ns)
+
+    def repeat_if_due(self) -> None:
+        """Send the command again if it is due; missed periods are skipped."""
+        now_ns = self._clock.now_ns()
+        if self._due_ns < 0 or now_ns < self._due_ns:
+            return
+        self._robot.repeat()
+        self.sent_ns = now_ns
+        self._due_ns += self._period_ns * ((now_ns - self._due_ns) // self._period_ns + 1)
+
 
 __all__ = ["RUNNING", "ControlLoop", "LoopConfig", "LoopReport", "OperatorStop", "Outcome", "Sink"]
 
@@ -147,15 +270,15 @@ class ControlLoop:
         if c.home and not c.dry_run:
             # Reported before it happens, so that a supervisor that finds this process dead knows whether to
             # send damping.
-            self._progress(HOMING, c.home_timeout_s + c.state_timeout_s + 2.0)
+            self._progress(HOMING, HOME_TIMEOUT_S + STATE_TIMEOUT_S + 2.0)
             self._commanding = self._robot.homes_by_motor
-            self._robot.home(c.home_timeout_s)
+            self._robot.home(HOME_TIMEOUT_S)
         self._await_state()
         if not c.dry_run:
             self._safety.arm(self._input())
-            self._progress(ARMING, c.arm_timeout_s + c.state_timeout_s + 2.0)
+            self._progress(ARMING, ARM_TIMEOUT_S + STATE_TIMEOUT_S + 2.0)
             self._commanding = True
-            self._robot.arm(c.arm_timeout_s)
+            self._robot.arm(ARM_TIMEOUT_S)
             self.note("armed", "the motors follow commands")
             # States that waited in buffers are old; the first cycle uses only newer ones.
             self._drain()
@@ -165,7 +288,7 @@ class ControlLoop:
         self._pending = self._pending[-1:]
 
     def _await_state(self) -> None:
-        self._receive(self._robot.read_state(self._config.state_timeout_s))
+        self._receive(self._robot.read_state(STATE_TIMEOUT_S))
         self._drain()
 
     def _cycles(self) -> tuple[Outcome, str]:

@@ -38,12 +38,16 @@ class LegChecks:
     Args:
         description: The robot, for joint names.
         limits: The limits.
+        lost_window_s: Lost commands are counted over this time [s].
     """
 
-    def __init__(self, description: RobotDescription, limits: LegLimits) -> None:
+    def __init__(
+        self, description: RobotDescription, limits: LegLimits, lost_window_s: float = LOST_WINDOW_S
+    ) -> None:
         self._names, self._limits = description.joint_names, limits
         self._flail_velocity = np.asarray(limits.flail_velocity)
-        self._lost_most = limits.lost_rate * LOST_WINDOW_S
+        self._lost_window_s = lost_window_s
+        self._lost_most = limits.lost_rate * lost_window_s
         self.reset()
 
     def reset(self) -> None:
@@ -122,8 +126,8 @@ class LegChecks:
         most = int(np.argmax(lost))
         if lost[most] > self._lost_most:
             found["lost_commands"] = (
-                f"the motor of joint {self._names[most]!r} missed {lost[most]} commands in {LOST_WINDOW_S:g} "
-                f"s, at most {self._lost_most:g} are allowed"
+                f"the motor of joint {self._names[most]!r} missed {lost[most]} commands in "
+                f"{self._lost_window_s:g} s, at most {self._lost_most:g} are allowed"
             )
 
     def _lost_in_window(self, now_ns: int, lost: IntArray) -> IntArray:
@@ -132,7 +136,7 @@ class LegChecks:
         self._lost_total = self._lost_total + np.maximum(lost - last, 0)
         self._lost_last = lost.copy()
         self._lost.append((now_ns, self._lost_total))
-        while now_ns - self._lost[0][0] > LOST_WINDOW_S * 1e9:
+        while now_ns - self._lost[0][0] > self._lost_window_s * 1e9:
             self._lost.popleft()
         return self._lost_total - self._lost[0][1]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -26,6 +27,11 @@ _DRIFT = 5e-4
 """Largest rate difference between host and device clock that counts as drift (a bad crystal has 1e-4)."""
 
 
+LINK_ERROR_SHARE: Final = 0.3
+"""Share of errors among the state frames due in the window that trips; a corrupt frame counts twice
+(itself and its gap)."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyConfig:
     """Limits of the safety module beside those of the robot."""
@@ -34,14 +40,11 @@ class SafetyConfig:
     """A device clock that runs ahead of the host's by this much has jumped [s]."""
     transport_error_window_s: float = 1.0
     """Time over which transport errors are counted [s]."""
-    link_error_share: float = 0.3
-    """Share of errors among the state frames due in the window that trips; a corrupt frame counts twice
-    (itself and its gap)."""
     confirm_s: float = 0.2
     """The device must report itself armed within this time after arming [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("clock_jump_s", "transport_error_window_s", "link_error_share", "confirm_s"):
+        for name in ("clock_jump_s", "transport_error_window_s", "confirm_s"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)!r}; it must be above 0")
 
@@ -110,7 +113,7 @@ class Safety:
         self._command_age_ns = 0 if legs is None else round(legs.command_age_s * 1e9)
         self._index = list(description.actuated_index)
         self._errors_due = (
-            self._config.link_error_share * self._config.transport_error_window_s * description.state_rate_hz
+            LINK_ERROR_SHARE * self._config.transport_error_window_s * description.state_rate_hz
         )
         self.reason = ""
         """Why it is passive, as text."""

@@ -22,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,14 @@ from deal_hw.types import FloatArray, Trajectory
 
 Mask = npt.NDArray[np.bool_]
 _TOLD = 5
+
+
+LONGEST: Final = 3
+"""Number of samples of the longest spike."""
+AROUND: Final = 6
+"""Number of steps before, and after, for the median speed."""
+MOST: Final = 0.02
+"""With a larger share of spikes the recording is refused: that sensor cannot be used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,15 +57,6 @@ class SpikeSettings:
 
     least: Mapping[str, float] = field(default_factory=lambda: {"rad": 0.1, "m": 0.01})
     """Smaller jumps are never spikes, at any sampling rate [rad or m]: coarse encoders, noise."""
-
-    longest: int = 3
-    """Number of samples of the longest spike."""
-
-    around: int = 6
-    """Number of steps before, and after, for the median speed."""
-
-    most: float = 0.02
-    """With a larger share of spikes the recording is refused: that sensor cannot be used."""
 
 
 DEFAULT_SPIKES = SpikeSettings()
@@ -90,7 +90,7 @@ def find_spikes(
     """
     rows = np.flatnonzero(np.isfinite(time_s) & np.isfinite(position).all(axis=1))
     rows = rows[np.diff(time_s[rows], prepend=-np.inf) > 0]
-    if rows.size < 2 * settings.longest + 2:
+    if rows.size < 2 * LONGEST + 2:
         return ()
     found = [
         Spike(tuple(int(rows[k]) for k in one.rows), joint, one.size)
@@ -112,7 +112,7 @@ class _Run:
 
 def _of_joint(time_s: FloatArray, position: FloatArray, unit: str, settings: SpikeSettings) -> list[_Run]:
     # Mirrored at both ends, so that a wrong first sample has neighbours on two sides, too.
-    pad = settings.longest
+    pad = LONGEST
     t = np.pad(time_s, pad, mode="reflect", reflect_type="odd")
     x = np.pad(position, pad, mode="reflect")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -150,7 +150,7 @@ def _runs(
     through = np.abs(after - before) / (2 * half)
     far = (off > settings.least[unit]) & (needed > settings.speed[unit]) & (needed > settings.ratio * through)
     for at in np.flatnonzero(far):
-        beside = (speed[max(at - settings.around, 0) : at], speed[at + length + 1 :][: settings.around])
+        beside = (speed[max(at - AROUND, 0) : at], speed[at + length + 1 :][:AROUND])
         if needed[at] > settings.ratio * float(np.median(np.concatenate(beside))):
             share = (t[at + 1 : at + length + 1] - t[at]) / (2 * half[at])
             deviation = run[:, at] - before[at] - share * (after[at] - before[at])
@@ -185,7 +185,7 @@ def check_spikes(
         f"{count} samples jump and come back, faster than the joint ever moves otherwise: "
         f"{describe(found, time_s, joints, units)}"
     )
-    if count > settings.most * time_s.size:
+    if count > MOST * time_s.size:
         text += f"; that is {count / time_s.size:.1%} of all samples: the sensor or its cable fails."
         return Finding("spikes", Severity.FAIL, text, "Repair it and record again")
     text += ". Calibration leaves them out (--spike-ratio)"

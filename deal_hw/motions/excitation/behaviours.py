@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -148,21 +148,23 @@ class RichBehaviour:
         return segment_command(command, self._config.segments, time_s / self._config.duration_s)
 
 
+CHIRP_AMPLITUDE: Final = 0.08
+"""Amplitude of a chirp about the default position [m or rad]; small enough for the cart-pole's balance."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChirpConfig:
     """Held-out motion family `chirp`: a sine sweep of the set-point."""
 
     duration_s: float = 4.0
     """Length of the sweep [s]."""
-    amplitude: float = 0.08
-    """Amplitude about the default position [m or rad]."""
     low_hz: float = 0.3
     """Frequency at the start [Hz]."""
     high_hz: float = 4.0
     """Frequency at the end [Hz]."""
 
     def __post_init__(self) -> None:
-        if not (self.duration_s > 0 and self.amplitude > 0 and 0 < self.low_hz <= self.high_hz):
+        if not (self.duration_s > 0 and 0 < self.low_hz <= self.high_hz):
             raise ConfigurationError(f"not a usable chirp: {self}")
 
 
@@ -184,5 +186,5 @@ class ChirpBehaviour:
         c = self._config
         slope = (c.high_hz - c.low_hz) / c.duration_s
         phase = 2 * math.pi * (c.low_hz * time_s + 0.5 * slope * time_s**2)
-        target = self._centring.added(self._centre + c.amplitude * math.sin(phase), state)
+        target = self._centring.added(self._centre + CHIRP_AMPLITUDE * math.sin(phase), state)
         return position_command(self._description, target)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -47,19 +47,21 @@ class Wanted:
     end_s: float
 
 
+STEP_S: Final = 0.4
+"""Velocities are averaged over this time, one step of the gait, within which the base sways [s]."""
+EVERY_S: Final = 0.01
+"""Time between two comparisons [s]."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityErrorSettings:
     """How velocities are compared.
 
     Attributes:
-        step_s: Velocities are averaged over this time, one step of the gait, within which the base sways [s].
         settle_s: Time after a change of the requested velocity that is not judged [s].
-        every_s: Time between two comparisons [s].
     """
 
-    step_s: float = 0.4
     settle_s: float = 1.0
-    every_s: float = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,17 +130,17 @@ def velocity_error(
         The errors; None if no requested velocity lasted long enough to be judged.
     """
     settings = settings or VelocityErrorSettings()
-    begin = np.arange(track.time_s[0], track.time_s[-1] - settings.step_s, settings.every_s)
+    begin = np.arange(track.time_s[0], track.time_s[-1] - STEP_S, EVERY_S)
     turned = np.unwrap(track.heading)
 
     def at(time_s: FloatArray, values: FloatArray) -> FloatArray:
         return np.interp(time_s, track.time_s, values)
 
     def change(values: FloatArray) -> FloatArray:
-        return np.asarray((at(begin + settings.step_s, values) - at(begin, values)) / settings.step_s)
+        return np.asarray((at(begin + STEP_S, values) - at(begin, values)) / STEP_S)
 
     x, y = change(track.place[:, 0]), change(track.place[:, 1])
-    middle = at(begin + 0.5 * settings.step_s, turned)
+    middle = at(begin + 0.5 * STEP_S, turned)
     base = np.stack(
         (np.cos(middle) * x + np.sin(middle) * y, np.cos(middle) * y - np.sin(middle) * x, change(turned)),
         axis=1,
@@ -148,7 +150,7 @@ def velocity_error(
     part = np.searchsorted(starts, begin, side="right") - 1
     judged = part >= 0
     ends = np.append(starts[1:], wanted.end_s)
-    judged &= (begin >= starts[part] + settings.settle_s) & (begin + settings.step_s <= ends[part])
+    judged &= (begin >= starts[part] + settings.settle_s) & (begin + STEP_S <= ends[part])
     if not judged.any():
         return None
     part, base = part[judged], base[judged]
@@ -160,6 +162,6 @@ def velocity_error(
     return VelocityError(
         velocity_m_s=float(over[0]),
         yaw_rad_s=float(over[1]),
-        seconds=float(moving.sum() * settings.every_s),
+        seconds=float(moving.sum() * EVERY_S),
         parts={str(n): rows[names == n].mean(axis=0).round(4).tolist() for n in dict.fromkeys(names)},
     )

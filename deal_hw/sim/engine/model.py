@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import hashlib
 from dataclasses import dataclass
 
 import mujoco
@@ -143,3 +144,10 @@ def model_with(robot: RobotModel, space: ParameterSpace, theta: FloatArray) -> m
     apply_parameters(ModelFields(model, robot.model), space, np.asarray(theta, dtype=float)[None])
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def model_digest(robot: RobotModel) -> str:
+    """Return the SHA-256 of the nominal model's compiled form, meshes and physics step included."""
+    buffer = np.empty(mujoco.mj_sizeModel(robot.model), dtype=np.uint8)
+    mujoco.mj_saveModel(robot.model, None, buffer)
+    return hashlib.sha256(buffer.tobytes()).hexdigest()

@@ -12,9 +12,9 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
 from deal_hw.sim.legged.velocity_filter import (
-    FILTER,
     GRAVITY,
-    FilterSettings,
+    HEIGHT_M,
+    LIFT_DRIFT,
     filtered_velocity,
     rotated,
     standing_feet,
@@ -131,7 +131,7 @@ def leg_odometry(
 
 
 def smoothed_height(
-    time_s: FloatArray, acceleration: FloatArray, height: FloatArray, settings: FilterSettings = FILTER
+    time_s: FloatArray, acceleration: FloatArray, height: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return height and vertical velocity of a base, (T,) each [m, m/s], by one fit over the recording.
 
@@ -143,13 +143,12 @@ def smoothed_height(
         time_s: (T,) [s], increasing; at least three samples.
         acceleration: Vertical specific force in the world, (T,) [m/s²].
         height: Over the standing feet, (T,) [m]; NaN where none stands.
-        settings: Weights.
     """
     before, after = np.diff(time_s)[:-1], np.diff(time_s)[1:]
     width = 0.5 * (before + after)
-    weight = np.sqrt(width) / settings.lift_drift
+    weight = np.sqrt(width) / LIFT_DRIFT
     curve = np.stack([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after]) * (weight / width)
-    seen = np.isfinite(height) / settings.height_m
+    seen = np.isfinite(height) / HEIGHT_M
     # The normal equations' lower diagonals; a curvature acts on three neighbours.
     normal = np.zeros((3, len(time_s)))
     normal[0], right = seen**2, seen**2 * np.nan_to_num(height)

@@ -6,7 +6,6 @@ accelerometers drift: the filter combines both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -18,35 +17,26 @@ GRAVITY: Final = np.array([0.0, 0.0, 9.81])
 """Reading of an accelerometer at rest, in the world [m/s²]."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilterSettings:
-    """Weights of feet and accelerometer; chosen on six emulated Go2 of profile `realistic`.
-
-    Attributes:
-        drift: Standard deviation that integrated accelerations gain in a second [m/s].
-        foot_m_s: Standard deviation of a standing foot's velocity [m/s].
-        gate: Deviation above which a foot slides or lands and weighs less [standard deviations].
-        start_m_s: Standard deviation of the first velocity [m/s].
-        share: Load below which a foot swings, as a share of the largest load.
-        borne: Total load below which no foot stands, as a share of the weight: the swing of legs looks like a
-            third of it.
-        lift_drift: The same as ``drift``, upwards, where the height corrects it
-            (:func:`deal_hw.sim.legged.leg_odometry.smoothed_height`) [m/s].
-        height_m: Standard deviation of the height over the standing feet in one sample [m]. It is larger than
-            the error, because the errors of one stance are alike.
-    """
-
-    drift: float = 0.5
-    foot_m_s: float = 0.1
-    gate: float = 2.0
-    start_m_s: float = 1.0
-    share: float = 0.5
-    borne: float = 0.5
-    lift_drift: float = 0.1
-    height_m: float = 0.03
-
-
-FILTER: Final = FilterSettings()
+DRIFT: Final = 0.5
+"""Standard deviation that integrated accelerations gain in a second [m/s]. This and the further weights of
+feet and accelerometer were chosen on six emulated Go2 of profile `realistic`."""
+FOOT_M_S: Final = 0.1
+"""Standard deviation of a standing foot's velocity [m/s]."""
+GATE: Final = 2.0
+"""Deviation above which a foot slides or lands and weighs less [standard deviations]."""
+START_M_S: Final = 1.0
+"""Standard deviation of the first velocity [m/s]."""
+SWING_SHARE: Final = 0.5
+"""Load below which a foot swings, as a share of the largest load."""
+BORNE_SHARE: Final = 0.5
+"""Total load below which no foot stands, as a share of the weight: the swing of legs looks like a third of
+it."""
+LIFT_DRIFT: Final = 0.1
+"""The same as :data:`DRIFT`, upwards, where the height corrects it
+(:func:`deal_hw.sim.legged.leg_odometry.smoothed_height`) [m/s]."""
+HEIGHT_M: Final = 0.03
+"""Standard deviation of the height over the standing feet in one sample [m]. It is larger than the error,
+because the errors of one stance are alike."""
 
 
 def rotated(orientation: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -56,18 +46,15 @@ def rotated(orientation: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors + 2.0 * (orientation[:, :1] * turned + np.cross(axis, turned)))
 
 
-def standing_feet(
-    load: FloatArray, weight_n: float, settings: FilterSettings = FILTER
-) -> npt.NDArray[np.bool_]:
+def standing_feet(load: FloatArray, weight_n: float) -> npt.NDArray[np.bool_]:
     """Return which feet stand, (T, F).
 
     Args:
         load: Vertical load on each foot, (T, F) [N].
         weight_n: Weight of the robot [N].
-        settings: Limits.
     """
-    enough = load.sum(axis=1, keepdims=True) > settings.borne * weight_n
-    return np.asarray((load > settings.share * load.max(axis=1, keepdims=True)) & enough)
+    enough = load.sum(axis=1, keepdims=True) > BORNE_SHARE * weight_n
+    return np.asarray((load > SWING_SHARE * load.max(axis=1, keepdims=True)) & enough)
 
 
 def filtered_velocity(
@@ -75,7 +62,6 @@ def filtered_velocity(
     acceleration: FloatArray,
     answers: FloatArray,
     stands: npt.NDArray[np.bool_],
-    settings: FilterSettings = FILTER,
 ) -> FloatArray:
     """Return the velocity of a base in the world, (T, 3) [m/s]: the mean of a pass forward and one backward.
 
@@ -84,13 +70,10 @@ def filtered_velocity(
         acceleration: Specific force in the world, (T, 3) [m/s²].
         answers: Velocity of the base by each foot, as if that foot stood, (T, F, 3) [m/s].
         stands: Which feet stand, (T, F).
-        settings: Weights.
     """
     pushed = acceleration - GRAVITY
-    forward = _passed(np.diff(time_s, prepend=time_s[0]), pushed, answers, stands, settings)
-    back = _passed(
-        np.diff(time_s[::-1], prepend=time_s[-1]), pushed[::-1], answers[::-1], stands[::-1], settings
-    )
+    forward = _passed(np.diff(time_s, prepend=time_s[0]), pushed, answers, stands)
+    back = _passed(np.diff(time_s[::-1], prepend=time_s[-1]), pushed[::-1], answers[::-1], stands[::-1])
     return 0.5 * (forward + back[::-1])
 
 
@@ -99,16 +82,15 @@ def _passed(
     pushed: FloatArray,
     answers: FloatArray,
     stands: npt.NDArray[np.bool_],
-    settings: FilterSettings,
 ) -> FloatArray:
-    found, speed, variance = np.empty_like(pushed), np.zeros(3), settings.start_m_s**2
-    foot = settings.foot_m_s**2
+    found, speed, variance = np.empty_like(pushed), np.zeros(3), START_M_S**2
+    foot = FOOT_M_S**2
     for t, step in enumerate(steps):
         speed = speed + pushed[t] * step
-        variance += settings.drift**2 * abs(step)
+        variance += DRIFT**2 * abs(step)
         for answer in answers[t, stands[t]]:
             off = answer - speed
-            doubt = max(1.0, float(off @ off) / (settings.gate**2 * (variance + foot)))
+            doubt = max(1.0, float(off @ off) / (GATE**2 * (variance + foot)))
             gain = variance / (variance + doubt**2 * foot)
             speed = speed + gain * off
             variance *= 1.0 - gain

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -12,17 +12,12 @@ from deal_hw.sim.engine.compiling import DIVERGED
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.types import FloatArray
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HoldSettings:
-    """Length of the test, and limits of stability."""
-
-    seconds: float = 1.0
-    """Length [s]."""
-    growth: float = 1.5
-    """Ratio of the speeds in the last and the second quarter above which a driven joint is unstable."""
-    least_speed: float = 0.05
-    """Least speed of an unstable joint [rad/s or m/s]."""
+SECONDS: Final = 1.0
+"""Length [s]."""
+UNSTABLE_GROWTH: Final = 1.5
+"""Ratio of the speeds in the last and the second quarter above which a driven joint is unstable."""
+LEAST_SPEED: Final = 0.05
+"""Least speed of an unstable joint [rad/s or m/s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,9 +39,8 @@ class Holding:
     speed: FloatArray
 
 
-def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
+def hold(robot: UserRobot) -> Holding:
     """Simulate a robot that is commanded to hold its start pose; motors get no effort."""
-    settings = settings or HoldSettings()
     model: Any = robot.model
     description = robot.description()
     data = mujoco.MjData(model)
@@ -59,7 +53,7 @@ def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
             joint = model.joint(int(model.actuator_trnid[actuator, 0])).name
             data.ctrl[actuator] = start[description.actuated.index(joint)]
     at, moving = [int(j.qposadr[0]) for j in driven], [int(j.dofadr[0]) for j in driven]
-    steps = max(round(settings.seconds / model.opt.timestep), 4)
+    steps = max(round(SECONDS / model.opt.timestep), 4)
     speed = np.empty((steps, len(driven)))
     for step in range(steps):
         mujoco.mj_step(model, data)
@@ -70,7 +64,7 @@ def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
     second, last = (
         np.sqrt(np.mean(np.square(speed[a : a + quarter]), axis=0)) for a in (quarter, steps - quarter)
     )
-    grows = (last > settings.growth * second) & (last > settings.least_speed)
+    grows = (last > UNSTABLE_GROWTH * second) & (last > LEAST_SPEED)
     grows &= description.actuation == "position"
     return Holding(
         seconds=steps * float(model.opt.timestep),

@@ -7,14 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
 from deal_hw.data.checks.spikes import SpikeSettings
 from deal_hw.data.recording.episode_info import motion_of
+from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.policy import recorded_policy
-from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
+from deal_hw.workflows.calibration.settings import (
+    DatasetSettings,
+    DriverDatasetSettings,
+    OwnDatasetSettings,
+)
 from deal_hw.workflows.calibration.source import Source
 from deal_hw.workflows.calibration.space import (
     extended,
@@ -34,12 +38,11 @@ SAMPLES_A_PERIOD = 4
 """Fitted states per control period."""
 
 
-def read_driver_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> Source:
+def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
     """Read a dataset of a robot with a driver.
 
     Args:
-        settings: The settings; they name a dataset.
-        holdout: Held-out episodes; empty: those of the motion `chirp`.
+        settings: The settings. Without held-out episodes those of the motion `chirp` are.
         say: Called with sentences on findings in the recordings.
 
     Raises:
@@ -49,17 +52,18 @@ def read_driver_dataset(settings: CalibrateSettings, holdout: Sequence[int], say
 
     dataset, description = _opened(settings)
     robot_name = dataset.description["name"]
-    fit, held = choose_episodes(dataset, settings.episodes, holdout, say)
+    fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
     robot = load_model(description)
     space = named_space(robot_name, settings.space)
-    if settings.recordings.parameters is not None:
-        space = extended(space, settings.recordings.parameters, robot)
+    if settings.parameters is not None:
+        space = extended(space, Path(settings.parameters), robot)
     space = settings.searched(space)
     episodes = {i: dataset.read(i) for i in (*fit, *held)}
     policy = None
-    if search_of(settings.named()) in CLOSED_LOOP_METHODS:
+    if settings.in_closed_loop:
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
+        say_other_range(policy, robot_name, space, say)
     trajectories, telemetry = sound_recordings(
         {i: episode.trajectory for i, episode in episodes.items()}, dataset.folder, settings.spikes, say
     )
@@ -80,7 +84,7 @@ def read_driver_dataset(settings: CalibrateSettings, holdout: Sequence[int], say
     )
 
 
-def read_own_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: Say) -> Source:
+def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
     """Read a dataset with its own robot.yaml, whose recordings are used like those of files.
 
     Arguments and errors are those of :func:`read_driver_dataset`.
@@ -89,19 +93,18 @@ def read_own_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: S
     from deal_hw.sim.engine.model import load_model
     from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
 
-    config = settings.recordings
-    division = settings.division(holdout)
+    division = settings.division(judged=bool(settings.judges))
     dataset, description = _opened(settings)
-    fit, held = choose_episodes(dataset, settings.episodes, holdout, say)
-    if held and config.holdout_part is None:
+    fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
+    if held and settings.holdout_part is None:
         division = dataclasses.replace(division, share=0.0)
     trajectories, telemetry = sound_recordings(
         {i: dataset.read(i).trajectory for i in (*fit, *held)}, dataset.folder, settings.spikes, say
     )
     model = compile_mjcf(description.mjcf)
     space = searched_space(settings, model, say)
-    timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
-    rates = sampling(1.0 / description.state_rate_hz, timestep, config.window)
+    timestep = float(model.opt.timestep) if settings.physics_step is None else settings.physics_step
+    rates = sampling(1.0 / description.state_rate_hz, timestep, settings.window)
     description = dataclasses.replace(
         description,
         device_rate_hz=1.0 / rates.step_s,
@@ -125,10 +128,10 @@ def read_own_dataset(settings: CalibrateSettings, holdout: Sequence[int], say: S
     )
 
 
-def _opened(settings: CalibrateSettings) -> tuple[Dataset, RobotDescription]:
+def _opened(settings: DatasetSettings) -> tuple[Dataset, RobotDescription]:
     from deal_hw.data.recording.dataset import Dataset
 
-    dataset = Dataset.open(Path(str(settings.dataset)))
+    dataset = Dataset.open(Path(settings.dataset))
     return dataset, recorded_robot(dataset.description, dataset.folder)
 
 
@@ -184,7 +187,7 @@ def choose_episodes(
         ConfigurationError: No episode is left to fit, or one is in both lists.
     """
     every = range(len(dataset.episodes))
-    metadata = [dataset.read(i).metadata for i in every]
+    metadata = [read_metadata(dataset.path(i)) for i in every]
     judges = (i for i in every if motion_of(metadata[i]) == HELDOUT_MOTION and i not in episodes)
     # An episode that is named twice must not count twice.
     episodes, holdout = tuple(dict.fromkeys(episodes)), tuple(dict.fromkeys(holdout))

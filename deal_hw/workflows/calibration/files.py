@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import examine_recording
-from deal_hw.workflows.calibration.policy_commands import with_policy_commands
+from deal_hw.workflows.calibration.policy_commands import (
+    at_policy_rate,
+    policy_of_files,
+    with_policy_commands,
+)
 from deal_hw.workflows.calibration.recordings import (
     Recorded,
     at_rest_without_commands,
@@ -20,7 +24,7 @@ from deal_hw.workflows.calibration.recordings import (
     refuse_copies,
     without,
 )
-from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.calibration.source import Source
 from deal_hw.workflows.calibration.space import searched_space
 from deal_hw.workflows.say import Say
@@ -30,15 +34,11 @@ if TYPE_CHECKING:
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
-def read_files(
-    settings: CalibrateSettings, holdout: Sequence[Recorded], data: Sequence[Recorded], say: Say
-) -> Source:
+def read_files(settings: FilesSettings, say: Say) -> Source:
     """Read recordings of any robot from files or memory, with its model.
 
     Args:
-        settings: The settings; they name a model.
-        holdout: Recordings that only judge the result.
-        data: More recordings to fit, also from memory.
+        settings: The settings; their model is a file.
         say: Called with sentences on guesses and doubts.
 
     Raises:
@@ -51,25 +51,30 @@ def read_files(
     from deal_hw.sim.mjcf.describe import describe, with_speed_limits
     from deal_hw.sim.mjcf.joint_facts import joint_facts
 
-    config, spikes = settings.recordings, settings.spikes
-    division, data = settings.division(holdout), (*config.data, *data)
-    if config.model is None or not data:
+    data: Sequence[Recorded] = settings.data
+    holdout: Sequence[Recorded] = settings.holdout
+    spikes, division = settings.spikes, settings.division(judged=bool(holdout))
+    if not data:
         raise ConfigurationError("--model needs recordings to fit: --data rec.csv [more ...]")
     _refuse_same(data, holdout)
-    model = compile_mjcf(config.model)
+    path = Path(settings.model)
+    model = compile_mjcf(path)
     space = searched_space(settings, model, say)
-    facts = joint_facts(config.model, model)
+    facts = joint_facts(path, model)
     fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), facts, say)
-    rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
-    description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
+    rates = common_rates([*fitted, *held], model, settings.physics_step, settings.window)
+    in_loop = None if settings.policy is None or not settings.in_closed_loop else Path(settings.policy)
+    if in_loop is not None:
+        rates = at_policy_rate(rates, in_loop)
+    description = describe(path, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
     parts = without(
-        config.leave_out, *([despiked(table, spikes) for table in tables] for tables in (fitted, held))
+        settings.leave_out, *([despiked(table, spikes) for table in tables] for tables in (fitted, held))
     )
     servo = description.actuation == "position"
     verdicts = {
         table.name: examine_recording(
-            table, facts, config.force, servo=servo, kept=kept, spikes=spikes, say=say
+            table, facts, settings.force, servo=servo, kept=kept, spikes=spikes, say=say
         )
         for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }
@@ -82,22 +87,23 @@ def read_files(
         held=named_on_grid(held, robot, rates),
         division=division,
         sample_hz=None,
-        feet=config.feet,
+        feet=tuple(settings.feet),
         telemetry=[
             f"{name}: {verdict.severity} {verdict.code}: {verdict.message}"
             for name, found in verdicts.items()
             for verdict in found
         ],
         provenance={
-            "model": str(config.model),
+            "model": str(path),
             "description_digest": description.digest(),
             "recordings": [dict(table.source) for table in fitted],
             "holdout": [dict(table.source) for table in held]
             or f"last {division.share:.0%} of each recording",
-            "left_out": [list(entry) for entry in config.leave_out],
+            "left_out": [list(entry) for entry in settings.leave_out],
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
+        policy=None if in_loop is None else policy_of_files(in_loop, description),
     )
 
 
@@ -114,7 +120,7 @@ def _refuse_same(data: Sequence[Recorded], holdout: Sequence[Recorded]) -> None:
 
 
 def _tables(
-    settings: CalibrateSettings,
+    settings: FilesSettings,
     groups: Sequence[tuple[str, Sequence[Recorded]]],
     facts: JointFacts,
     say: Say,
@@ -122,8 +128,8 @@ def _tables(
     """Return each group's recordings in SI units, with the commands that their policy or rest gives."""
     from deal_hw.data.importing.columns import read_column_map
 
-    path = settings.recordings.columns
-    columns = None if path is None else read_column_map(path)
+    path = settings.columns
+    columns = None if path is None else read_column_map(Path(path))
     printed: dict[str, str] = {}
     found = [read_tables(sources, columns, facts, say, name, printed) for name, sources in groups]
     if settings.policy is not None:

@@ -9,18 +9,26 @@ only they can see. All that follows is here, once.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.errors import ConfigurationError, MissingExtraError
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
-from deal_hw.workflows.calibration.dataset import read_driver_dataset, read_own_dataset
-from deal_hw.workflows.calibration.files import read_files
-from deal_hw.workflows.calibration.recordings import Recorded
-from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.policy import say_that_alignment_is_better
+from deal_hw.workflows.calibration.settings import (
+    CalibrateSettings,
+    DriverDatasetSettings,
+    FilesSettings,
+    OwnDatasetSettings,
+    UserRobotSettings,
+)
 from deal_hw.workflows.calibration.source import Division, Source
 from deal_hw.workflows.calibration.walking import (
     GAIT_SMOOTHING_S,
@@ -29,7 +37,6 @@ from deal_hw.workflows.calibration.walking import (
     weighed,
     while_walking,
 )
-from deal_hw.workflows.robot import carries_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -84,19 +91,11 @@ class CalibrationInput:
         return GAIT_SMOOTHING_S if self.walks else None
 
 
-def calibration_input(
-    settings: CalibrateSettings,
-    *,
-    data: Sequence[Recorded] = (),
-    holdout: Sequence[Any] | None = None,
-    say: Say = silent,
-) -> CalibrationInput:
+def calibration_input(settings: CalibrateSettings, *, say: Say = silent) -> CalibrationInput:
     """Read and check the input of a calibration, in a short time.
 
     Args:
-        settings: The settings.
-        data: More recordings to fit, also from memory.
-        holdout: Held-out recordings, also from memory; by default those of the settings.
+        settings: The settings of one kind of recordings.
         say: Called with sentences on guesses and doubts.
 
     Raises:
@@ -104,27 +103,23 @@ def calibration_input(
         DatasetError: A recording cannot be read, understood or trusted.
         InsufficientDataError: The recordings are too short, do not move, or do not depend on a parameter.
     """
-    settings.check(data)
+    settings.check()
     with _extra("calib"):
-        source = _read(settings, data, settings.holdout if holdout is None else holdout, say)
-        return _input_of(source, settings, say)
+        return _input_of(_read(settings, say), settings, say)
 
 
-def _read(settings: CalibrateSettings, data: Sequence[Recorded], judges: Sequence[Any], say: Say) -> Source:
-    if settings.recordings.model is not None:
-        numbers = " ".join(str(one) for one in judges if isinstance(one, int))
-        if numbers:
-            raise ConfigurationError(
-                f"--holdout {numbers}: with --model give recordings; episode numbers go with a dataset"
-            )
-        return read_files(settings, judges, data, say)
-    wrong = [str(one) for one in judges if not isinstance(one, int)]
-    if wrong:
-        raise ConfigurationError(
-            f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
-        )
-    reader = read_own_dataset if carries_robot(settings.dataset) else read_driver_dataset
-    return reader(settings, [int(one) for one in judges], say)
+def _read(settings: CalibrateSettings, say: Say) -> Source:
+    if isinstance(settings, FilesSettings):
+        from deal_hw.workflows.calibration.files import read_files
+
+        return read_files(settings, say)
+    from deal_hw.workflows.calibration.dataset import read_driver_dataset, read_own_dataset
+
+    if isinstance(settings, OwnDatasetSettings):
+        return read_own_dataset(settings, say)
+    if isinstance(settings, DriverDatasetSettings):
+        return read_driver_dataset(settings, say)
+    raise TypeError(f"settings of no kind of recordings: {type(settings).__name__}")
 
 
 @contextlib.contextmanager
@@ -144,8 +139,9 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
     trajectories = [trajectory for _, trajectory in (*source.fitted, *source.held)]
     if division is not None:
         require_base(robot, source.feet, trajectories)
-    known_std, provenance = settings.known_std(robot), dict(source.provenance)
+    known_std, provenance = expected_std(settings.residual_std, robot), dict(source.provenance)
     fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
+    say_that_alignment_is_better(settings.named(), say)
     shown = trajectories[0]
     walks = division is None and all_walk(robot, trajectories)
     if walks:
@@ -176,11 +172,12 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
 def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode:
     """Return a recording on the physics grid; a floating robot's one includes the base."""
     from deal_hw.sim.recordings.episode import align, fill_gaps, thin
-    from deal_hw.sim.recordings.standing import with_sensed_base
 
     robot = source.robot
     episode = align(trajectory, robot.description, name)
     if robot.base is not None and trajectory.body is not None:
+        from deal_hw.sim.recordings.standing import with_sensed_base
+
         episode = with_sensed_base(episode, robot, trajectory, source.feet)
         if source.division is None:
             episode = while_walking(episode, trajectory)
@@ -243,8 +240,8 @@ def usual_method(settings: CalibrateSettings, work: CalibrationInput, say: Say =
     if settings.method:
         return settings.named()
     facts = work.robot.description
+    own = isinstance(settings, UserRobotSettings)
     held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
-    own = settings.recordings.model is not None or carries_robot(settings.dataset)
     if settings.residual_std not in ((), None) or not settings.refine:
         method = "default"
     elif work.walks and settings.search is None:
@@ -256,3 +253,57 @@ def usual_method(settings: CalibrateSettings, work: CalibrationInput, say: Say =
     if method != "default":
         say(f"method: {method} (alternative: --method default, which refines to the sensor noise)")
     return settings.named(method)
+
+
+def expected_std(
+    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
+) -> FloatArray | None:
+    """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
+
+    Args:
+        given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
+            line as words; None or no words: none is expected.
+        robot: The robot.
+
+    Raises:
+        ConfigurationError: A number is missing, or is not above 0.
+        UnknownNameError: A joint is not known.
+    """
+    if given is None or given == ():
+        return None
+    if isinstance(given, tuple) and len(given) == 1:
+        given = _number(given[0])
+    elif isinstance(given, tuple):
+        # A last word without a number is a joint without a value.
+        found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
+        given = dict(zip(given[::2], found, strict=True))
+    names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
+    one = not isinstance(given, Mapping)
+    values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
+    for name in values:
+        if name not in names:
+            raise UnknownNameError("joint", name, names)
+    if (
+        set(values) != set(names)
+        or any(math.isnan(v) for v in values.values())
+        or (one and robot.base is not None)
+    ):
+        whole = "" if robot.base is not None else "one number, or "
+        raise ConfigurationError(
+            f"--residual-std: give {whole}a name and a number above 0 for each of {', '.join(names)}"
+        )
+    for value in values.values():
+        Range(1e-9, 1e3, "rad or m").check("--residual-std", float(value))
+    C = len(robot.coordinates)
+    std = np.ones(2 * C)
+    std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
+    if robot.base is not None:
+        std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
+    return std
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError as err:
+        raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err

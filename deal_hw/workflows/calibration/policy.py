@@ -6,38 +6,79 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, search_of
-from deal_hw.data.recording.episode_info import motion_of
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, UNALIGNED_METHODS, search_of
 from deal_hw.description import RobotDescription
+from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.motions.velocity import FixedVelocity, make_source
-from deal_hw.workflows.options import refuse
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.parameters import ParameterSpace
     from deal_hw.policies.demonstration import PopulationDemonstration
 
 
-def check_policy(method: str, *, given: bool, model: bool, files: bool = False) -> None:
-    """Check that a method suits the source of the recordings.
-
-    Args:
-        method: Name of the method.
-        given: Whether a policy was named.
-        model: Whether the robot is described by the user's own MJCF, named or in the dataset.
-        files: Whether recordings are files; for these a policy gives commands or checks their clock.
+def check_policy_runs(method: str) -> None:
+    """Check that a method runs the policy that moved the robot.
 
     Raises:
-        ConfigurationError: A policy would have no effect, or the method needs one that is unknown.
+        ConfigurationError: It does not, so a named policy would have no effect.
     """
     search = search_of(method)
     if search not in CLOSED_LOOP_METHODS:
-        refuse(["--policy"] if given and not files else [], f"{search} runs no policy")
-    elif model:
+        raise ConfigurationError(f"--policy would have no effect: {search} runs no policy")
+
+
+def refuse_closed_loop(method: str) -> None:
+    """Refuse a method that runs the policy that moved the robot, where nobody knows that policy.
+
+    Raises:
+        ConfigurationError: The method does.
+    """
+    search = search_of(method)
+    if search in CLOSED_LOOP_METHODS:
         raise ConfigurationError(
-            f"{search} runs the policy that moved the robot, which is unknown for --model and for "
-            "a dataset with its own robot.yaml; use eki, deal or deal-paper-replay"
+            f"{search} runs the policy that moved the robot, which is unknown for --model without --policy "
+            "FILE.onnx, and for a dataset with its own robot.yaml; name it, or use eki, deal or "
+            "deal-paper-replay"
         )
+
+
+def say_that_alignment_is_better(method: str, say: Say) -> None:
+    """Say it where a search compares distributions of recordings whose commands and states are aligned."""
+    if method in UNALIGNED_METHODS:
+        say(
+            f"{method} compares distributions of motion. In these recordings commands and states have one "
+            "clock, so predictions can be compared, too, and every robot that was measured was predicted "
+            f"better by that ({page('results/paper.md')}): leave --method out, unless the motion diverges "
+            "from any prediction"
+        )
+
+
+def say_other_range(policy: PopulationDemonstration, robot: str, space: ParameterSpace, say: Say) -> None:
+    """Say where a policy was not trained in the search's range, as the DEAL paper's is.
+
+    Args:
+        policy: The policy that moved the robot.
+        robot: Name of a robot with a driver.
+        space: What is searched.
+        say: Called with the sentence.
+    """
+    from deal_hw.workflows.train import udr_distribution
+
+    usual = udr_distribution(robot)
+    ranges = {p.name: (p.low, p.high) for p in usual.space}
+    other = [p.name for p in space if ranges.get(p.name) != (p.low, p.high)]
+    if policy.trained_under != usual.digest():
+        what = "under another distribution than uniform randomisation"
+    elif other:
+        what = f"in another range of {', '.join(other[:3])}{' and others' if len(other) > 3 else ''}"
+    else:
+        return
+    say(
+        f"the policy that moved the robot was trained {what}. The DEAL paper trains it in the range that is "
+        "searched. Simulators at the ends of the range may fall at once under this one, and then say little"
+    )
 
 
 def recorded_policy(
@@ -57,6 +98,7 @@ def recorded_policy(
         ConfigurationError: The file is another policy, or the dataset has no copy of it.
         PolicyError: The file cannot be run.
     """
+    from deal_hw.motions.velocity import FixedVelocity, make_source
     from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 
@@ -95,6 +137,8 @@ def recorded_policy(
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:
     """Refuse an episode in which not only the policy moved the robot."""
+    from deal_hw.data.recording.episode_info import motion_of
+
     motion, stands = motion_of(run), bool(run.get("stand", False))
     if motion == "balance" and not stands:
         return

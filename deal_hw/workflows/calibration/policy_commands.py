@@ -19,8 +19,11 @@ from deal_hw.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from deal_hw.data.table import Table
+    from deal_hw.description import RobotDescription
+    from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policy import PolicySpec
+    from deal_hw.sim.mjcf.describe import Sampling
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 AGREES: Final = 0.9
@@ -79,6 +82,37 @@ def with_policy_commands(
         else:
             found.append(_given(table, choices, policy.spec, file.name, say))
     return found
+
+
+def at_policy_rate(rates: Sampling, file: Path) -> Sampling:
+    """Return the sampling with the policy's control periods, for methods that run it in every simulator."""
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    return dataclasses.replace(rates, samples_per_tick=_samples_a_tick(OnnxPolicy(file).spec, rates.period_s))
+
+
+def policy_of_files(file: Path, description: RobotDescription) -> PopulationDemonstration:
+    """Return the policy that moved the robot, for methods that run it in every simulator.
+
+    Args:
+        file: The policy. :func:`with_policy_commands` took it for these recordings, so joints, units and rate
+            fit.
+        description: The robot by the user's model, sampled by :func:`at_policy_rate`.
+    """
+    from deal_hw.policies.demonstration import PopulationDemonstration
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    policy = OnnxPolicy(file)
+    spec = policy.spec
+    # A model's file has another name than the robot, and often another rest pose. Actions are around the
+    # policy's own pose, as in the commands that were computed.
+    own = dataclasses.replace(
+        description,
+        name=spec.robot,
+        default_position=spec.default_position,
+        control_rate_hz=spec.control_rate_hz,
+    )
+    return PopulationDemonstration(policy, own, ran_before=True)
 
 
 def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:

@@ -1,118 +1,49 @@
-"""Settings of a calibration."""
+"""Settings of a calibration: what all have, and what each kind of recordings has beside.
+
+A dataset of a robot with a driver, a dataset with its own robot.yaml, and a model with files each have a type
+with the options that apply to them. :func:`kind_of` chooses one from what was named.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import numpy as np
+from typing import Annotated, Any, Literal, TypeAlias
 
 from deal_hw.calib.pipeline.methods import (
+    CLOSED_LOOP_METHODS,
     DEFAULT_SEARCH,
     SEARCHES,
     SEARCHING,
     check_method,
+    search_of,
     usual_budget,
     with_search,
 )
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
 from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.data.files import dataset_of
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
-from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.policy import check_policy
-from deal_hw.workflows.calibration.recordings import Recorded
+from deal_hw.workflows.calibration.policy import check_policy_runs, refuse_closed_loop
 from deal_hw.workflows.calibration.source import Division
-from deal_hw.workflows.options import File, Ratio, Seed, Threads, given, refuse
+from deal_hw.workflows.kinds import InputKind, Kinds, fitting
+from deal_hw.workflows.options import File, Ratio, Seed, Threads
 from deal_hw.workflows.robot import carries_robot
-
-if TYPE_CHECKING:
-    from deal_hw.sim.engine.model import RobotModel
 
 HELDOUT_PART = 0.25
 HELDOUT_WINDOW_S = 0.2
 """The same as in :mod:`deal_hw.calib.validation.metrics`, which is loaded on need."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recordings(Checked):
-    """Any robot: its MuJoCo model and its recordings (docs/tutorials/your-robot.md)."""
-
-    model: Path | None = None
-    """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
-
-    data: tuple[Path, ...] = ()
-    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
-
-    columns: Path | None = None
-    """Column map (YAML; docs/how-to/import.md). Without one, the meaning of the
-    channels is guessed from their names."""
-
-    parameters: Path | None = None
-    """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
-    of every joint and gain of every actuator of the model. With a dataset of a robot with a driver: what to
-    search beside its set."""
-
-    write_parameters: Path | None = None
-    """Write a --parameters file for --model, to edit, and end."""
-
-    feet: tuple[str, ...] = ()
-    """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
-    recordings must contain the base's orientation and gyro."""
-
-    holdout_part: Annotated[float | None, Range(0, 0.95)] = None
-    """Share of each recording, its last part, that is held out to test the result, without --holdout; 0.25 by
-    default, 0 for none."""
-
-    leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
-    """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
-
-    fit_seconds: Annotated[float, Range(0.1, 1e5, "s")] = 60.0
-    """Fit this many seconds, in parts that lie evenly over the recordings; more is slower."""
-
-    window: Annotated[float, Range(1e-3, 60, "s")] = 0.4
-    """Length of the longest prediction windows of the search [s]; the search begins with a quarter of it.
-    Longer windows show slow effects (weight, static friction); their memory grows with the square of their
-    samples."""
-
-    physics_step: Annotated[float | None, Range(1e-6, 0.1, "s")] = None
-    """Requested physics step [s]; by default the MJCF's timestep. It is adjusted to a whole number of steps
-    per sampling period."""
-
-    force: bool = False
-    """Use recordings although a check of them failed."""
-
-
-OF_DATASETS = ("episodes", "space", "sample_hz")
-"""Settings for datasets only."""
-OF_OWN_ROBOTS = tuple(f.name for f in fields(Recordings) if f.name != "parameters")
-"""Settings without effect for datasets of robots with a driver."""
-FROM_FILES = ("data", "columns", "feet", "leave_out", "force")
-"""Settings on reading files, which have no effect for a dataset with its own robot.yaml."""
+Pairs: TypeAlias = tuple[tuple[str, float], ...]
+Triples: TypeAlias = tuple[tuple[str, float, float], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(Checked):
-    """Settings of ``deal-hw calibrate`` and :func:`deal_hw.calibrate`, with the same checks in both."""
-
-    dataset: File | None = None
-    """Dataset folder, such as runs/first/dataset; left out with --model."""
-
-    recordings: Recordings = field(default_factory=Recordings)
-
-    episodes: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
-    """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out
-    ones."""
-
-    holdout: Annotated[tuple[int | Path, ...], Range(0, 1_000_000)] = ()
-    """Held-out data, which only test the result: numbers of episodes of the dataset (the first is 0), or with
-    --model recordings. By default the episodes collected with --motion chirp; if there is none and the robot
-    is your own, the last part of each recording (--holdout-part)."""
+    """Settings that every calibration has."""
 
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
     """Held-out predictions restart from the measured state after this time [s]."""
@@ -135,23 +66,14 @@ class CalibrateSettings(Checked):
     apart, and the population moves to where it cannot. eki: an ensemble Kalman search, without a critic.
     deal-paper: the DEAL paper's Algorithm 1. With --no-refine the search alone."""
 
-    policy: File | None = None
-    """The policy (.onnx) that moved the robot. With --model it gives the commands of recordings without any,
-    and checks the clock of recorded ones. With a dataset: for deal-paper and other methods that run it in
-    every simulator; by default the copy in the dataset."""
-
-    space: str = ""
-    """Named parameter set of a robot with a driver, such as k9 or k11; by default the first.
-    docs/reference/parameters.md lists them."""
-
-    free: tuple[str, ...] = ()
+    free: str | tuple[str, ...] = ()
     """Search exactly these parameters; all others keep their nominal values."""
 
-    known: Annotated[tuple[tuple[str, float], ...], Range(-1e12, 1e12)] = ()
-    """Values that were measured by other means, as NAME VALUE pairs (SI)."""
+    known: Annotated[Mapping[str, float] | Pairs, Range(-1e12, 1e12)] = ()
+    """Values that were measured by other means, as NAME VALUE pairs (SI); from Python by name."""
 
-    range: Annotated[tuple[tuple[str, float, float], ...], Range(-1e12, 1e12)] = ()
-    """Other search ranges, as NAME LOW HIGH (SI)."""
+    range: Annotated[Mapping[str, tuple[float, float]] | Triples, Range(-1e12, 1e12)] = ()
+    """Other search ranges, as NAME LOW HIGH (SI); from Python low and high by name."""
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Search each parameter within a factor RANGE-RATIO to either side of its nominal value. By default as
@@ -173,10 +95,6 @@ class CalibrateSettings(Checked):
     or NAME VALUE pairs of joints; by default the sensor noise, estimated from the recordings. For real robots
     a few milliradians are often better."""
 
-    sample_hz: Annotated[float | None, Range(1, 1e5, "Hz")] = None
-    """Rate of the fitted and held-out states of a dataset, approximately [Hz]; by default four per control
-    period."""
-
     population: Annotated[int | None, Range(2, 100_000)] = None
     """Population size of the search; by default 100, for methods of the paper 200."""
 
@@ -197,92 +115,50 @@ class CalibrateSettings(Checked):
     """Simulation threads; by default all CPUs."""
 
     def __post_init__(self) -> None:
+        self._keep(free=_words(self.free), known=_pairs(self.known), range=_triples(self.range))
         super().__post_init__()
         low, high = self.latency_range
         if not low < high:
             raise ConfigurationError(f"--latency-range {low:g} {high:g}: give the lower one first")
 
-    def check(self, data: Sequence[Recorded] = ()) -> None:
+    def _keep(self, **values: Any) -> None:
+        """Set fields to what was given in another form."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def check(self) -> None:
         """Check the combination of settings before anything is read.
 
-        Args:
-            data: Recordings to fit that are not among the settings.
-
         Raises:
-            ConfigurationError: A setting would have no effect, or is missing.
+            ConfigurationError: A setting would have no effect.
             UnknownNameError: There is no such method.
         """
-        check_source(
-            dataset=self.dataset,
-            model=self.recordings.model is not None,
-            data=bool(data or self.recordings.data),
-        )
-        if self.dataset is not None:
-            object.__setattr__(self, "dataset", dataset_of(self.dataset))
-        if self.recordings.model is None:
-            carries = carries_robot(self.dataset)
-            foreign = given(self.recordings, Recordings(), FROM_FILES if carries else OF_OWN_ROBOTS)
-            if carries:
-                refuse(
-                    given(self, CalibrateSettings(), ("space",)), "this robot has one set; use --parameters"
-                )
-            foreign += ["--data"] if data and "--data" not in foreign else []
-            refuse(foreign, "a dataset defines it; use that option with --model and --data")
-        else:
-            refuse(
-                given(self, CalibrateSettings(), OF_DATASETS),
-                "only datasets take that; with --model use --data and --parameters",
-            )
-        if self.latency is not None:
-            refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency gives the latency")
+        if self.latency is not None and self.latency_range != LATENCY_RANGE_S:
+            raise ConfigurationError("--latency-range would have no effect: --latency gives the latency")
         if self.method in SEARCHES:
             raise ConfigurationError(
                 f"--method {self.method}: that is a search; --search {self.method} runs it where the local "
                 f"fit does not explain the recordings, --search {self.method} --no-refine runs it alone"
             )
         check_method(self.named())
-        if self.method and self.method not in SEARCHING:
-            refuse(
-                given(self, CalibrateSettings(), ("search",)), f"--method {self.method} has no search inside"
+        if self.search is not None and self.method and self.method not in SEARCHING:
+            raise ConfigurationError(
+                f"--search would have no effect: --method {self.method} has no search inside"
             )
-        own = self.recordings.model is not None or carries_robot(self.dataset)
-        files = self.recordings.model is not None
-        check_policy(self.named(), given=self.policy is not None, model=own, files=files)
 
     def named(self, pipeline: str = "") -> str:
         """Return the name of a pipeline, by default the one that is asked for, with its search."""
         return with_search(pipeline or self.method or "default", self.search or DEFAULT_SEARCH)
 
     @property
+    def in_closed_loop(self) -> bool:
+        """Whether the method runs the policy that moved the robot in every simulator."""
+        return search_of(self.named()) in CLOSED_LOOP_METHODS
+
+    @property
     def budget(self) -> Budget:
         """Budget of the method."""
         return usual_budget(self.named(), self.population, self.generations, refine=self.refine)
-
-    def division(self, holdout: Sequence[object]) -> Division:
-        """Return how recordings become parts to fit and parts that judge.
-
-        Args:
-            holdout: Recordings that only judge.
-
-        Raises:
-            ConfigurationError: A share of each recording is to be held out as well.
-        """
-        config = self.recordings
-        if holdout and config.holdout_part:
-            raise ConfigurationError("give --holdout or --holdout-part, not both")
-        share = HELDOUT_PART if config.holdout_part is None else config.holdout_part
-        return Division(
-            share=0.0 if holdout else share, fit_seconds=config.fit_seconds, window_s=config.window
-        )
-
-    def known_std(self, robot: RobotModel) -> FloatArray | None:
-        """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
-
-        Raises:
-            ConfigurationError: A number is missing, or is not above 0.
-            UnknownNameError: A joint is not known.
-        """
-        return residual_std(self.residual_std, robot)
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -316,8 +192,8 @@ class CalibrateSettings(Checked):
             space = space.with_free(self.free)
         if self.range_ratio is not None:
             space = space.with_ratio(self.range_ratio)
-        space = space.with_known(dict(self.known))
-        for parameter, low, high in self.range:
+        space = space.with_known(dict(_pairs(self.known)))
+        for parameter, low, high in _triples(self.range):
             space = space.with_range(parameter, low, high)
         if not len(space):
             raise ConfigurationError(
@@ -326,81 +202,292 @@ class CalibrateSettings(Checked):
         return space
 
 
-def check_source(*, dataset: Path | str | None, model: bool, data: bool) -> None:
-    """Check that there is one source of recordings.
+@dataclass(frozen=True, kw_only=True)
+class DatasetSettings(CalibrateSettings):
+    """Settings of a calibration from a dataset."""
+
+    dataset: File
+    """Dataset folder, such as runs/first/dataset."""
+
+    episodes: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
+    """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out
+    ones."""
+
+    holdout: Annotated[int | tuple[int, ...], Range(0, 1_000_000)] = ()
+    """Held-out episodes, which only test the result, by number (the first is 0). By default those collected
+    with --motion chirp."""
+
+    sample_hz: Annotated[float | None, Range(1, 1e5, "Hz")] = None
+    """Rate of the fitted and held-out states of a dataset, approximately [Hz]; by default four per control
+    period."""
+
+    def __post_init__(self) -> None:
+        self._keep(dataset=dataset_of(self.dataset), holdout=_listed(self.holdout))
+        self._keep(episodes=_listed(self.episodes))
+        wrong = [str(one) for one in _listed(self.holdout) if not isinstance(one, int)]
+        if wrong:
+            raise ConfigurationError(
+                f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
+            )
+        super().__post_init__()
+
+    @property
+    def judges(self) -> tuple[int, ...]:
+        """Held-out episodes."""
+        return _listed(self.holdout)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverDatasetSettings(DatasetSettings):
+    """Settings of a calibration from a dataset of a robot with a driver."""
+
+    space: str = ""
+    """Named parameter set of the robot, such as k9 or k11; by default the first.
+    docs/reference/parameters.md lists them."""
+
+    parameters: File | None = None
+    """What to search beside the robot's set (YAML), such as an encoder's zero."""
+
+    policy: File | None = None
+    """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
+    simulator; by default the copy in the dataset."""
+
+    def check(self) -> None:
+        """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
+        super().check()
+        if self.policy is not None:
+            check_policy_runs(self.named())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Divided(Checked):
+    """What to search of a user's robot, and which parts of its recordings to use."""
+
+    parameters: File | None = None
+    """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
+    of every joint and gain of every actuator of the model."""
+
+    holdout_part: Annotated[float | None, Range(0, 0.95)] = None
+    """Share of each recording, its last part, that is held out to test the result, without --holdout; 0.25 by
+    default, 0 for none."""
+
+    fit_seconds: Annotated[float, Range(0.1, 1e5, "s")] = 60.0
+    """Fit this many seconds, in parts that lie evenly over the recordings; more is slower."""
+
+    window: Annotated[float, Range(1e-3, 60, "s")] = 0.4
+    """Length of the longest prediction windows of the search [s]; the search begins with a quarter of it.
+    Longer windows show slow effects (weight, static friction); their memory grows with the square of their
+    samples."""
+
+    physics_step: Annotated[float | None, Range(1e-6, 0.1, "s")] = None
+    """Requested physics step [s]; by default the MJCF's timestep. It is adjusted to a whole number of steps
+    per sampling period."""
+
+    def division(self, *, judged: bool) -> Division:
+        """Return how recordings become parts to fit and parts that judge.
+
+        Args:
+            judged: Whether recordings were named that only judge.
+
+        Raises:
+            ConfigurationError: A share of each recording is to be held out as well.
+        """
+        if judged and self.holdout_part:
+            raise ConfigurationError("give --holdout or --holdout-part, not both")
+        share = HELDOUT_PART if self.holdout_part is None else self.holdout_part
+        return Division(share=0.0 if judged else share, fit_seconds=self.fit_seconds, window_s=self.window)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recordings(Divided):
+    """Any robot: its MuJoCo model and its recordings (docs/tutorials/your-robot.md)."""
+
+    model: Path | None = None
+    """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
+
+    data: tuple[Path, ...] = ()
+    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
+
+    columns: File | None = None
+    """Column map (YAML; docs/how-to/import.md). Without one, the meaning of the
+    channels is guessed from their names."""
+
+    feet: tuple[str, ...] = ()
+    """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
+    recordings must contain the base's orientation and gyro."""
+
+    leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
+    """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
+
+    force: bool = False
+    """Use recordings although a check of them failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UserRobotSettings(Divided, CalibrateSettings):
+    """Settings of a calibration of a user's robot."""
+
+    def check(self) -> None:
+        """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
+        super().check()
+        if not self.knows_policy:
+            refuse_closed_loop(self.named())
+
+    @property
+    def knows_policy(self) -> bool:
+        """Whether the policy that moved the robot was named."""
+        return False
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnDatasetSettings(UserRobotSettings, DatasetSettings):
+    """Settings of a calibration from a dataset with its own robot.yaml."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilesSettings(UserRobotSettings, Recordings):
+    """Settings of a calibration of any robot, from its MuJoCo model and recordings."""
+
+    model: Any = field(kw_only=False)
+    """The robot's MJCF. Its position actuators (or motors) take the recorded commands. From Python also a
+    ``mujoco.MjSpec``, or the last compiled ``mujoco.MjModel``."""
+
+    data: Any = field(default=(), kw_only=False)
+    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders. From Python one or several, also
+    mappings of names to arrays and data frames: positions [rad or m] (T, J), commands (T, A), time [s]
+    (T,)."""
+
+    holdout: Any = ()
+    """Held-out recordings, which only test the result; by default the last part of each recording
+    (--holdout-part)."""
+
+    policy: File | None = None
+    """The policy (.onnx) that moved the robot: it gives the commands of recordings without any, and checks
+    the clock of recorded ones. Methods that run it in every simulator need it, such as deal-unaligned."""
+
+    @property
+    def knows_policy(self) -> bool:
+        """Whether the policy that moved the robot was named."""
+        return self.policy is not None
+
+    @property
+    def judges(self) -> tuple[Any, ...]:
+        """Held-out recordings."""
+        return _listed(self.holdout)
+
+    def __post_init__(self) -> None:
+        self._keep(data=_listed(self.data), holdout=_listed(self.holdout), feet=_words(self.feet))
+        self._keep(leave_out=_triples(self.leave_out))
+        numbers = [str(one) for one in self.holdout if str(one).isdigit()]
+        if numbers:
+            raise ConfigurationError(
+                f"--holdout {' '.join(numbers)}: with --model give recordings; episode numbers go with a "
+                "dataset"
+            )
+        super().__post_init__()
+
+
+RECORDINGS: Mapping[str, InputKind] = {
+    "dataset": InputKind(
+        DriverDatasetSettings, "a dataset of a robot with a driver", example="runs/first/dataset"
+    ),
+    "own-robot": InputKind(
+        OwnDatasetSettings, "a dataset with its own robot.yaml", example="runs/mine/dataset --holdout 1"
+    ),
+    "model": InputKind(
+        FilesSettings,
+        "any robot: its MuJoCo model and its recordings",
+        usage="--model robot.xml",
+        example="--model robot.xml --data rec.csv --out runs/mine",
+    ),
+}
+"""The kinds of recordings."""
+
+
+def kind_of(dataset: Any, model: Any, options: Collection[str], table: Mapping[str, InputKind]) -> str:
+    """Return the kind of the recordings that were named.
 
     Args:
-        dataset: The named dataset.
-        model: Whether a model is given.
-        data: Whether recordings for a model are given.
+        dataset: The named dataset, or the name of a kind.
+        model: The given model.
+        options: The names of all given options.
+        table: The kinds.
 
     Raises:
         ConfigurationError: There is none, or there are two; or a model is named as a dataset.
     """
-    if not model and dataset is not None and Path(dataset).suffix == ".xml":
-        recordings = "" if data else " --data rec.csv"
+    if model is None and dataset is not None and Path(dataset).suffix == ".xml":
+        recordings = "" if "data" in options else " --data rec.csv"
         raise ConfigurationError(
             f"{dataset} is a model, not a dataset; name it by --model {dataset}{recordings}"
         )
-    if not model and dataset is None and data:
+    if model is None and dataset is None and "data" in options:
         raise ConfigurationError("--data needs the robot's model: add --model robot.xml")
-    if (dataset is not None) == model:
-        how = "not both" if model else "one of the two"
+    if (dataset is None) == (model is None):
+        how = "one of the two" if model is None else "not both"
         raise ConfigurationError(
             "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
             f"(deal-hw calibrate --model robot.xml --data rec.csv), {how}"
         )
+    if model is not None:
+        return "model"
+    if str(dataset) in table and not Path(dataset).exists():
+        return str(dataset)
+    if doubt_of(dataset):
+        # The reader will say that it is not there; until then the options of either kind fit.
+        return fitting({name: table[name] for name in ("dataset", "own-robot")}, options) or "dataset"
+    return "own-robot" if carries_robot(dataset_of(dataset)) else "dataset"
 
 
-def residual_std(
-    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
-) -> FloatArray | None:
-    """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
-
-    Args:
-        given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
-            line as words; None or no words: none is expected.
-        robot: The robot.
-
-    Raises:
-        ConfigurationError: A number is missing, or is not above 0.
-        UnknownNameError: A joint is not known.
-    """
-    if given is None or given == ():
-        return None
-    if isinstance(given, tuple) and len(given) == 1:
-        given = _number(given[0])
-    elif isinstance(given, tuple):
-        # A last word without a number is a joint without a value.
-        found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
-        given = dict(zip(given[::2], found, strict=True))
-    names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
-    one = not isinstance(given, Mapping)
-    values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
-    for name in values:
-        if name not in names:
-            raise UnknownNameError("joint", name, names)
-    if (
-        set(values) != set(names)
-        or any(math.isnan(v) for v in values.values())
-        or (one and robot.base is not None)
-    ):
-        whole = "" if robot.base is not None else "one number, or "
-        raise ConfigurationError(
-            f"--residual-std: give {whole}a name and a number above 0 for each of {', '.join(names)}"
-        )
-    for value in values.values():
-        Range(1e-9, 1e3, "rad or m").check("--residual-std", float(value))
-    C = len(robot.coordinates)
-    std = np.ones(2 * C)
-    std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
-    if robot.base is not None:
-        std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
-    return std
+def doubt_of(dataset: Any) -> str:
+    """Return why the kind of a named dataset is not known; empty if it is, or none is named."""
+    if dataset is None or str(dataset) in RECORDINGS or Path(dataset).exists():
+        return ""
+    return f"{dataset} does not exist"
 
 
-def _number(word: str) -> float:
+def python_kinds() -> Kinds:
+    """Return the kinds as Python names them: model and data, or a dataset."""
+    return Kinds(
+        noun="recordings",
+        table=lambda: RECORDINGS,
+        find=lambda given: kind_of(
+            given.options.get("dataset"),
+            given.options.get("model") if given.first is None else given.first,
+            given.options,
+            RECORDINGS,
+        ),
+        doubt=lambda given: doubt_of(given.options.get("dataset")),
+    )
+
+
+_SHAPES = (
+    'write known={"cart.mass": 0.41}, range={"cart.mass": (0.1, 1.0)} and '
+    'leave_out=[("rec.csv", 1.5, 2.0)] like this; one of them is different'
+)
+
+
+def _pairs(given: Any) -> Pairs:
     try:
-        return float(word)
-    except ValueError as err:
-        raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err
+        items = given.items() if isinstance(given, Mapping) else given
+        return tuple((str(name), float(value)) for name, value in items)
+    except (AttributeError, TypeError, ValueError) as err:
+        raise ConfigurationError(f"{_SHAPES} ({err})") from err
+
+
+def _triples(given: Any) -> Triples:
+    try:
+        rows = [(name, *both) for name, both in given.items()] if isinstance(given, Mapping) else given
+        return tuple((str(name), float(low), float(high)) for name, low, high in rows)
+    except (AttributeError, TypeError, ValueError) as err:
+        raise ConfigurationError(f"{_SHAPES} ({err})") from err
+
+
+def _words(given: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+def _listed(given: Any) -> tuple[Any, ...]:
+    """Return one recording or episode, or several, as a tuple."""
+    alone = isinstance(given, str | Path | int | Mapping) or hasattr(given, "columns")
+    return (given,) if alone else tuple(given)

@@ -14,9 +14,8 @@ from deal_hw.errors import ConfigurationError, UnknownNameError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robots import parameter_spaces
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.settings import CalibrateSettings, Recordings
-from deal_hw.workflows.options import File
-from deal_hw.workflows.robot import carries_robot, recorded_robot
+from deal_hw.workflows.calibration.settings import FilesSettings, OwnDatasetSettings, UserRobotSettings
+from deal_hw.workflows.robot import described
 from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def without_speed_limits(
     return space.with_known(known)
 
 
-def searched_space(settings: CalibrateSettings, model: Any, say: Say) -> ParameterSpace:
+def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> ParameterSpace:
     """Return the parameters to search of a user's model; report what is not searched as it is 0 there.
 
     Raises:
@@ -80,7 +79,7 @@ def searched_space(settings: CalibrateSettings, model: Any, say: Say) -> Paramet
     from deal_hw.sim.parameters.template import left_at_zero, template
     from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
-    if settings.recordings.parameters is None:
+    if settings.parameters is None:
         zero = [f"{kind} of {short(', '.join(names))}" for kind, names in left_at_zero(model).items()]
         if zero:
             say(
@@ -89,36 +88,31 @@ def searched_space(settings: CalibrateSettings, model: Any, say: Say) -> Paramet
             )
         space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
     else:
-        space = read_space(settings.recordings.parameters, model)
+        space = read_space(Path(settings.parameters), model)
     space = settings.searched(space)
     check_space(model, space)
     return space
 
 
-def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
-    """Write a commented parameter file for a model and return its path.
+def write_parameters(settings: OwnDatasetSettings | FilesSettings, path: Path) -> Path:
+    """Write a commented parameter file for the model of a user's robot and return its path.
 
     Args:
-        config: Names the file, and the model.
-        dataset: Contains the robot if no model is named.
+        settings: They name the model, or a dataset with its own robot.yaml.
+        path: The file.
 
     Raises:
-        ConfigurationError: There is no model, or the file exists.
+        ConfigurationError: The file exists, or the model cannot be used.
     """
-    path, model = config.write_parameters, config.model
-    if model is None and carries_robot(dataset):
-        from deal_hw.data.recording.dataset import Dataset
-
-        model = recorded_robot(Dataset.open(Path(str(dataset))).description, Path(str(dataset))).mjcf
-    if model is None or path is None:
-        raise ConfigurationError(
-            "--write-parameters needs --model robot.xml, or a dataset with its own robot.yaml"
-        )
     if path.exists():
         raise ConfigurationError(f"{path} exists; name another file, or remove it")
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.parameters.template import template
 
+    if isinstance(settings, FilesSettings):
+        model = Path(settings.model)
+    else:
+        model = described(str(settings.dataset)).mjcf
     text = template(compile_mjcf(model), model.name)
     path.write_text(text, encoding="utf-8")
     return path

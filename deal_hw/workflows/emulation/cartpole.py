@@ -19,8 +19,8 @@ from deal_hw.workflows.emulation.settings import (
 from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
-    from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
     from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
+    from deal_hw.testing.pseudo_terminal import PseudoTerminal
 
 
 def emulate_cartpole(
@@ -52,7 +52,7 @@ def emulate_cartpole(
         own["firmware"] = usable_firmware(config.firmware)
         runs = f", firmware: {own['firmware']}"
     link = None if config.link is None else Path(config.link)
-    emulator: CartpoleEmulator = make(truth, link=link, hazards=_hazards(config), **own)
+    emulator: PseudoTerminal = make(truth, link=link, hazards=_hazards(config), **own)
     what = f"profile {truth.profile}, seed {truth.seed}{runs}"
 
     def report() -> dict[str, Any]:

@@ -11,12 +11,12 @@ from deal_hw.robots import reached_over, robot_entry
 from deal_hw.robots.emulation import Emulation, EmulatorRequest
 from deal_hw.testing.faults import FaultRates
 from deal_hw.workflows.emulation.common import read_truth, serve
-from deal_hw.workflows.emulation.settings import EmulateSettings
+from deal_hw.workflows.emulation.settings import EmulatePlugInSettings
 from deal_hw.workflows.say import Say
 
 
 def emulate_plug_in(
-    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say
+    config: EmulatePlugInSettings, stop: threading.Event, cut: threading.Event, *, announce: Say
 ) -> None:
     """Run the emulator until a stop, the given time or the end of its port.
 
@@ -31,12 +31,13 @@ def emulate_plug_in(
     """
     wire = config.transport or robot_entry(config.robot).emulated_on[0]
     entry, chosen = reached_over(config.robot, wire)
-    emulation: Emulation = entry.load(chosen.emulator)(_request(config, wire))
+    emulation: Emulation = entry.load(chosen.emulator)(request_of(config, wire))
     what = f"profile {config.profile}, seed {config.seed}"
     serve(emulation, config, what, stop, cut, announce=announce, report=emulation.report)
 
 
-def _request(config: EmulateSettings, wire: str) -> EmulatorRequest:
+def request_of(config: EmulatePlugInSettings, wire: str) -> EmulatorRequest:
+    """Return what is asked of the emulator."""
     truth: Mapping[str, Any] | None = None
     if config.truth_from is not None:
         truth = read_truth(Path(config.truth_from), dict)
@@ -51,4 +52,8 @@ def _request(config: EmulateSettings, wire: str) -> EmulatorRequest:
         freeze_after_s=config.freeze_after_s,
         cut_after_s=config.cut_after_s,
         cut_s=config.cut_s,
+        port=config.port or "",
+        link=None if config.link is None else Path(config.link),
+        vanish_after_s=config.vanish_after_s,
+        return_after_s=config.return_after_s,
     )

@@ -10,7 +10,7 @@ from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
-from deal_hw.robots import emulated_robots
+from deal_hw.robots import emulated_robots, robot_entry
 from deal_hw.transport import NetworkOptions, WireOptions
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Share, given, refuse
@@ -145,16 +145,8 @@ class EmulateSettings(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EmulateCartpoleSettings(EmulateSettings):
-    """Emulate a cart-pole in real time on its own port, with hidden physics."""
-
-    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
-    """The wire; each is on a pseudo-terminal."""
-
-    firmware: Literal["auto", "host", "python", "avr"] = "auto"
-    """On serial or CAN, and an ODrive's pole encoder: the firmware's C core compiled for this computer
-    (host), a copy in Python, or the image for the ATmega328P under simavr (avr, serial only). auto: host, or
-    python without a C compiler."""
+class PseudoTerminalSettings(EmulateSettings):
+    """An emulated robot behind a pseudo-terminal."""
 
     link: File | None = None
     """Make a symbolic link to the port here."""
@@ -165,6 +157,26 @@ class EmulateCartpoleSettings(EmulateSettings):
     return_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """The port comes back under --link this long after it vanished [s]; by default the emulator ends when the
     port vanishes."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
+            raise ConfigurationError(
+                "--return-after-s needs --vanish-after-s and --link: the new port has another name"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateCartpoleSettings(PseudoTerminalSettings):
+    """Emulate a cart-pole in real time on its own port, with hidden physics."""
+
+    transport: Literal["serial", "can", "odrive", "dynamixel"] = "serial"
+    """The wire; each is on a pseudo-terminal."""
+
+    firmware: Literal["auto", "host", "python", "avr"] = "auto"
+    """On serial or CAN, and an ODrive's pole encoder: the firmware's C core compiled for this computer
+    (host), a copy in Python, or the image for the ATmega328P under simavr (avr, serial only). auto: host, or
+    python without a C compiler."""
 
     can: CanFaults = field(default_factory=CanFaults)
     """The CAN bus."""
@@ -187,9 +199,28 @@ class EmulateCartpoleSettings(EmulateSettings):
             raise ConfigurationError(
                 "the ATmega328P has no CAN controller; use --firmware host or python, or --transport serial"
             )
-        if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
-            raise ConfigurationError(
-                "--return-after-s needs --vanish-after-s and --link: the new port has another name"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulatePlugInSettings(PseudoTerminalSettings):
+    """Emulate a robot of a plug-in in real time on its own port, with hidden physics."""
+
+    port: str | None = None
+    """Where an emulator on a network listens; by default the port that the plug-in names."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        entry = robot_entry(self.robot)
+        name = self.transport or entry.emulated_on[0]
+        if entry.wire(name).emulator_port:
+            refuse(
+                given(self, EmulatePlugInSettings, ["link", "vanish_after_s", "return_after_s"]),
+                f"the emulator of {self.robot!r} on {name} listens at --port, it has no pseudo-terminal",
+            )
+        else:
+            refuse(
+                given(self, EmulatePlugInSettings, ["port"]),
+                f"the emulator of {self.robot!r} on {name} makes a pseudo-terminal; --link names it",
             )
 
 
@@ -215,7 +246,10 @@ _SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettin
 
 
 def _table() -> dict[str, InputKind]:
-    return {name: InputKind(_SETTINGS.get(name, EmulateSettings)) for name in emulated_robots()}
+    return {
+        name: InputKind(_SETTINGS.get(name, EmulatePlugInSettings), example=f"{name} --seed 0")
+        for name in emulated_robots()
+    }
 
 
 def _find(arguments: Arguments) -> str:

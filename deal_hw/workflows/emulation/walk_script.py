@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 Script = tuple[tuple[float, tuple[float, float, float]], ...]
 PROFILE: Final = (
@@ -22,6 +22,13 @@ HELDOUT: Final = (
 )
 """The held-out walk, for testing the calibration. It is gentle: otherwise every second robot falls."""
 HELDOUT_S: Final = 8.0
+
+
+class Walk(NamedTuple):
+    """Requested velocities over time, and how long they are followed [s]."""
+
+    parts: Script
+    seconds: float
 
 
 def write_script(path: Path, script: Script) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -42,6 +42,7 @@ def examine_servos(
     clock: Clock,
     sysfs: Path = _SYSFS,
     transport_at: Callable[[str, int, Clock], Transport] = SerialTransport,
+    rates: Sequence[int] = BAUD_RATES,
 ) -> Iterator[Finding]:
     """Yield findings at every baud rate; nothing is written to a servo.
 
@@ -50,6 +51,7 @@ def examine_servos(
         clock: For the waiting.
         sysfs: Folder of the kernel's information on serial ports.
         transport_at: Makes a transport of a path, a baud rate and a clock.
+        rates: Baud rates to try.
 
     Raises:
         DealHwError: The port cannot be opened.
@@ -57,7 +59,7 @@ def examine_servos(
     path, settings = parse_port(port)
     yield from _latency_timer(path, sysfs)
     found = 0
-    for rate in (settings.baud_rate, *(rate for rate in BAUD_RATES if rate != settings.baud_rate)):
+    for rate in (settings.baud_rate, *(rate for rate in rates if rate != settings.baud_rate)):
         try:
             transport = transport_at(path, rate, clock)
             transport.open()
@@ -80,7 +82,7 @@ def examine_servos(
         yield Finding(
             AREA,
             Severity.FAIL,
-            f"no servo answers on {path} at any of {len(BAUD_RATES)} baud rates",
+            f"no servo answers on {path} at any of {len(rates)} baud rates",
             "switch their supply on (USB does not power them), check the 3-pin cables, and that this is the "
             "adapter's port",
         )

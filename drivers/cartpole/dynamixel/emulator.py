@@ -8,10 +8,10 @@ from typing import Final
 
 from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.drivers.servo_bus.registers import BAUD_RATES
+from deal_hw.testing.pseudo_terminal import PseudoTerminal
 
 _SPEEDS: Final = {
     code: rate for rate in BAUD_RATES if (code := getattr(termios, f"B{rate}", None)) is not None
@@ -19,7 +19,7 @@ _SPEEDS: Final = {
 _OUTPUT_SPEED = 5
 
 
-class ServoEmulator(CartpoleEmulator):
+class ServoEmulator(PseudoTerminal):
     """Runs servos behind a pty; they receive noise if the host's port has another baud rate.
 
     Args:

@@ -11,13 +11,13 @@ from deal_hw.drivers.cartpole.chips.device import CartpoleDevice, EmulatedDevice
 from deal_hw.drivers.cartpole.chips.firmwares import CAN_FIRMWARES, usable_firmware
 from deal_hw.drivers.cartpole.chips.host_firmware import CanHostFirmware, settings_of
 from deal_hw.drivers.cartpole.chips.servo import Servo
-from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, Hazards
 from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
 from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, unique_id
 from deal_hw.drivers.cartpole.wire.can_link import NODE, CanLink
 from deal_hw.errors import UnknownNameError
+from deal_hw.testing.pseudo_terminal import PseudoTerminal
 
 SECOND_DEVICE: Final = 0x5EC0_0000
 """Changes the serial number of a second device under the same number."""
@@ -71,7 +71,7 @@ def adapter_emulator(
     link: Path | None,
     hazards: Hazards,
     port: Callable[[str], str] = lambda path: path,
-) -> CartpoleEmulator:
+) -> PseudoTerminal:
     """Return an emulated serial CAN adapter with devices on its bus.
 
     Args:
@@ -80,14 +80,14 @@ def adapter_emulator(
         hazards: Faults on purpose.
         port: Converts the path to a host's ``--port``.
     """
-    return CartpoleEmulator(
+    return PseudoTerminal(
         SlcanAdapter(devices, hazards.can), link, hazards, port=lambda path: port(f"slcan:{path}")
     )
 
 
 def can_emulator(
     truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "auto"
-) -> CartpoleEmulator:
+) -> PseudoTerminal:
     """Return an emulated cart-pole on a CAN bus behind a serial adapter.
 
     Raises:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from deal_hw.ranges import Checked, Range
-from deal_hw.testing.faults import FrameFaults
+from deal_hw.testing.pseudo_terminal import PortFaults
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,27 +71,13 @@ class ServoFaults(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hazards:
-    """Faults that the emulator makes. Times are counted from the first arming.
+class Hazards(PortFaults):
+    """Faults that the emulator makes, of its port and of its wire.
 
     Attributes:
-        freeze_after_s: The firmware hangs: it sends and receives nothing any more [s]; None for never.
-        cut_after_s: The wire is cut: nothing is sent or received, but the firmware runs on [s]; None for
-            never.
-        cut_s: Duration of the cut [s].
-        vanish_after_s: The port disappears as if unplugged, but the firmware runs on [s]; None for never.
-        return_after_s: Time after that until it returns, as a new port under the same link [s]; None: it does
-            not return, and the emulator ends.
-        faults: What happens to frames from the device.
         can: A CAN bus and its faults.
         servo: Dynamixel servos and their faults.
     """
 
-    freeze_after_s: float | None = None
-    cut_after_s: float | None = None
-    cut_s: float = 1.0
-    vanish_after_s: float | None = None
-    return_after_s: float | None = None
-    faults: FrameFaults | None = None
     can: CanFaults = CanFaults()
     servo: ServoFaults = ServoFaults()

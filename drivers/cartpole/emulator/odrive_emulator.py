@@ -12,7 +12,6 @@ from deal_hw.drivers.cartpole.chips.host_firmware import CanHostFirmware, settin
 from deal_hw.drivers.cartpole.chips.servo import Servo
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.can_emulator import SECOND_DEVICE, adapter_emulator
-from deal_hw.drivers.cartpole.emulator.emulator import CartpoleEmulator
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, Hazards
 from deal_hw.drivers.cartpole.emulator.odrive_drive import OdriveFirmware
 from deal_hw.drivers.cartpole.emulator.odrive_endpoints import ENABLE_WATCHDOG, WATCHDOG_TIMEOUT
@@ -23,6 +22,7 @@ from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.cartpole.wire.can_link import Angle, CanLink
 from deal_hw.drivers.cartpole.wire.odrive_link import ENCODER_KIND, OdriveSettings
 from deal_hw.errors import UnknownNameError
+from deal_hw.testing.pseudo_terminal import PseudoTerminal
 
 _SERIES = 0x3854_0000_0000
 """Upper bits of the emulated drives' serial numbers."""
@@ -100,7 +100,7 @@ def odrive_device(
 
 def odrive_emulator(
     truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "auto"
-) -> CartpoleEmulator:
+) -> PseudoTerminal:
     """Return an emulated ODrive and pole encoder behind a serial CAN adapter; node is the drive's.
 
     Raises:

@@ -8,7 +8,7 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.robots.can_robot import CanFrames
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.wire.can_link import accept
-from deal_hw.drivers.cartpole.wire.odrive_link import OdriveLink, OdriveSettings
+from deal_hw.drivers.cartpole.wire.odrive_link import WATCHDOG_S, OdriveLink, OdriveSettings
 from deal_hw.drivers.transports.can_bus import take_settings
 from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.listen_only import listen_only
@@ -39,7 +39,7 @@ class OdriveRobot(CartpoleRobot):
     def __init__(self, transport: Transport, clock: Clock, settings: OdriveSettings) -> None:
         super().__init__(transport, clock, link=lambda: OdriveLink(settings, clock))
         # Without its watchdog the drive holds its last command for ever; the operator gets a warning.
-        self.watchdog_s = settings.watchdog_s if settings.enable_watchdog else 0.0  # type: ignore[misc]
+        self.watchdog_s = WATCHDOG_S if settings.enable_watchdog else 0.0  # type: ignore[misc]
 
 
 def odrive_settings(port: str) -> tuple[str, OdriveSettings]:

@@ -41,6 +41,12 @@ ENCODER_NODE: Final = 2
 _U32 = 0xFFFF_FFFF
 
 
+HEARTBEAT_AGE_S: Final = 0.2
+"""Largest age of the drive's heartbeat [s]."""
+WATCHDOG_S: Final = 0.2
+"""The drive switches off after this time without a command [s]."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdriveSettings:
     """Numbers of the parts on the bus, and the mechanics between them.
@@ -53,8 +59,6 @@ class OdriveSettings:
         torque_constant: Torque constant of the motor [N*m/A]: 8.27 / KV; the default is for 270 KV.
         velocity_limit_m_s: The drive's own speed limit [m/s]. It is above the trip speed of the safety
             filter, because a drive that exceeds it switches off.
-        heartbeat_age_s: Largest age of the drive's heartbeat [s].
-        watchdog_s: The drive switches off after this time without a command [s].
         enable_watchdog: Number of the drive's setting axis0.config.enable_watchdog; it differs between
             firmware versions. 0: the watchdog is not set.
         watchdog_timeout: Number of axis0.config.watchdog_timeout.
@@ -65,8 +69,6 @@ class OdriveSettings:
     metres_per_turn: float = 0.04
     torque_constant: float = 8.27 / 270
     velocity_limit_m_s: float = 8.0
-    heartbeat_age_s: float = 0.2
-    watchdog_s: float = 0.2
     enable_watchdog: int = 0
     watchdog_timeout: int = 0
 
@@ -86,8 +88,6 @@ class OdriveSettings:
             "metres_per_turn",
             "torque_constant",
             "velocity_limit_m_s",
-            "heartbeat_age_s",
-            "watchdog_s",
         ):
             if not 0 < getattr(self, name) < 1000:
                 raise ConfigurationError(f"{name} is {getattr(self, name)!r}; allowed: above 0, below 1000")
@@ -190,7 +190,7 @@ class OdriveLink:
         if self._armed and not self._homed:
             return "the pole encoder is no longer homed: it restarted; check its supply, then home again"
         age_us = 0 if self._heartbeat_us is None else self._device_us - self._heartbeat_us
-        if age_us > self._s.heartbeat_age_s * 1e6:
+        if age_us > HEARTBEAT_AGE_S * 1e6:
             return f"the ODrive's heartbeat is {age_us / 1e3:.0f} ms old; set its heartbeat_msg_rate_ms to 20"
         return ""
 
@@ -281,7 +281,7 @@ class OdriveLink:
         s = self._s
         if not s.enable_watchdog:
             return b""
-        values = {s.watchdog_timeout: struct.pack("<f", s.watchdog_s), s.enable_watchdog: b"\1\0\0\0"}
+        values = {s.watchdog_timeout: struct.pack("<f", WATCHDOG_S), s.enable_watchdog: b"\1\0\0\0"}
         return b"".join(
             self._pack(Command.RX_SDO, WRITE, number, value)
             + self._pack(Command.RX_SDO, READ, number, bytes(4))
@@ -293,7 +293,7 @@ class OdriveLink:
         s = self._s
         if not s.enable_watchdog:
             return True
-        timeout = self._written.get(s.watchdog_timeout) == struct.pack("<f", s.watchdog_s)
+        timeout = self._written.get(s.watchdog_timeout) == struct.pack("<f", WATCHDOG_S)
         return timeout and self._written.get(s.enable_watchdog, b"\0")[0] == 1
 
     def _arm(self, message: protocol.Arm, idle: bytes) -> bytes:
@@ -385,7 +385,7 @@ class OdriveLink:
         self._device_us += passed_us
         self._offset.take(self._clock.now_ns(), 1000 * self._device_us)
         # After a silence, as between two processes, the heartbeat's time is set anew.
-        if self._heartbeat_us is not None and passed_us > self._s.heartbeat_age_s * 1e6:
+        if self._heartbeat_us is not None and passed_us > HEARTBEAT_AGE_S * 1e6:
             self._heartbeat_us = self._device_us
         if cart is None:
             return  # Its number is missing from the states, and the gap is counted.

@@ -15,16 +15,64 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.go2.bridge.admission import Admission, Control
 from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits
-from deal_hw.drivers.go2.bridge.mode_question import ModeQuestion
-from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.bridge.robot_side import BUSY
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
-from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
-from deal_hw.drivers.go2.motion_switcher import SWITCHER, MotionSwitcher, ServiceClient
+from deal_hw.drivers.go2.messages.rpc import (
+    CLAIM_TEXTS,
+    Request,
+    decode_response,
+    encode_note,
+    encode_request,
+    read_note,
+)
+from deal_hw.drivers.go2.motion_switcher import BUSY as BUSY_CODE
+from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, MotionSwitcher, ServiceClient
+from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Stamp
 from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
+
+_RESPONSE: Final = topics.response(SWITCHER)
+
+
+class ModeQuestion:
+    """The newest question to ``motion_switcher``, and its answer.
+
+    One thread asks; another one may take the robot's messages.
+    """
+
+    def __init__(self) -> None:
+        self._identity = 0
+        self._answer: tuple[int, str] | None = None
+
+    def ask(self, now_ns: int) -> bytes:
+        """Return the payload of a new question; the answer to the one before does not count any more.
+
+        Args:
+            now_ns: The bridge's clock, from which the question has its number [ns].
+        """
+        self._identity = max(self._identity + 1, now_ns)
+        return encode_request(Request(self._identity, CHECK_MODE, "{}"))
+
+    def take(self, message: Message) -> None:
+        """Take a message of the robot's side; answers to other programs, and errors, are skipped."""
+        if message.channel != _RESPONSE:
+            return
+        try:
+            response = decode_response(message.payload)
+            name = BUSY if response.code == BUSY_CODE else response.json().get("name")
+        except FrameError:
+            return
+        if response.code in (0, BUSY_CODE) and isinstance(name, str):
+            self._answer = response.identity, name
+
+    def answer(self) -> str | None:
+        """Return the active mode's name by the answer to the newest question, once; None without one."""
+        answer, self._answer = self._answer, None
+        return answer[1] if answer is not None and answer[0] == self._identity else None
+
 
 REQUESTS: Final = tuple(topics.request(name) for name in topics.SERVICES)
 RESPONSES: Final = tuple(topics.response(name) for name in topics.SERVICES)

@@ -20,11 +20,11 @@ from deal_hw.drivers.go2.emulator.sensing import Sensing
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, PERIOD_MS, STANDING, Posture
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
-from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
 from deal_hw.drivers.go2.messages.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.drivers.go2.messages.sport_state import POINTS, SportState, encode_sport_state
+from deal_hw.drivers.transports import topics
 from deal_hw.errors import FrameError
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray

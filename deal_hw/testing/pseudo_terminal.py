@@ -1,4 +1,4 @@
-"""A cart-pole on a pseudo-terminal in real time: the device core behind ``deal-hw emulate cartpole``."""
+"""A device in virtual time behind a pseudo-terminal in real time, with faults of its port."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ import os
 import select
 import tty
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.drivers.cartpole.chips.device import EmulatedDevice
-from deal_hw.drivers.cartpole.chips.firmwares import device_of
-from deal_hw.drivers.cartpole.emulator.faults import Hazards
-from deal_hw.drivers.cartpole.emulator.slcan_adapter import SlcanAdapter
-from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError
+from deal_hw.testing.faults import FrameFaults
 
 STALL_NS = 50_000_000
 """If the process is behind by more than this, device time stands still instead of catching up."""
@@ -24,7 +21,72 @@ STALL_NS = 50_000_000
 _MOST_CHANGES = 2000
 
 
-class CartpoleEmulator:
+class SteppedDevice(Protocol):
+    """A device in virtual device time: bytes in, bytes out. It also fits a ``VirtualTransport``."""
+
+    @property
+    def device_ns(self) -> int:
+        """Device time at which the next tick runs [ns]."""
+        ...
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motor follows commands; times of faults count from its first moment."""
+        ...
+
+    @property
+    def mode(self) -> str:
+        """State of the motor, one word."""
+        ...
+
+    @property
+    def watchdog(self) -> bool:
+        """Whether the device stopped its motor because no commands came."""
+        ...
+
+    @property
+    def trouble(self) -> str:
+        """Current fault; "" for none."""
+        ...
+
+    @property
+    def received_bytes(self) -> int:
+        """Number of bytes from the host."""
+        ...
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host."""
+        ...
+
+    def advance_to(self, device_ns: int) -> bytes:
+        """Run every tick up to and including a time [ns]; return the bytes sent meanwhile."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PortFaults:
+    """Faults of a pseudo-terminal and of the device's firmware. Times count from the first arming.
+
+    Attributes:
+        freeze_after_s: The firmware hangs: it sends and receives nothing any more [s]; None for never.
+        cut_after_s: The wire is cut: nothing is sent or received, but the firmware runs on [s]; None for
+            never.
+        cut_s: Duration of the cut [s].
+        vanish_after_s: The port disappears as if unplugged, but the firmware runs on [s]; None for never.
+        return_after_s: Time after that until it returns, as a new port under the same link [s]; None: it does
+            not return, and the emulator ends.
+        faults: What happens to frames from the device.
+    """
+
+    freeze_after_s: float | None = None
+    cut_after_s: float | None = None
+    cut_s: float = 1.0
+    vanish_after_s: float | None = None
+    return_after_s: float | None = None
+    faults: FrameFaults | None = None
+
+
+class PseudoTerminal:
     """Runs a device core behind a pty; device time follows the clock.
 
     A host may close the port and open it again. Frames that nobody reads are dropped, as on a UART.
@@ -45,9 +107,9 @@ class CartpoleEmulator:
 
     def __init__(
         self,
-        device: EmulatedDevice | SlcanAdapter,
+        device: SteppedDevice,
         link: Path | None = None,
-        hazards: Hazards | None = None,
+        hazards: PortFaults | None = None,
         clock: Clock | None = None,
         port: Callable[[str], str] = str,
     ) -> None:
@@ -56,7 +118,7 @@ class CartpoleEmulator:
         self._device = device
         self._port = port
         self._link = link
-        self._hazards = hazards or Hazards()
+        self._hazards = hazards or PortFaults()
         self._clock = clock or MonotonicClock()
         self._master = self._slave = -1
         self._origin_ns = 0
@@ -205,17 +267,6 @@ class CartpoleEmulator:
             self.dropped += 1
             return
         self._unsent = data[written:]
-
-
-def serial_emulator(
-    truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "auto"
-) -> CartpoleEmulator:
-    """Return an emulated cart-pole with a serial port.
-
-    Raises:
-        ConfigurationError: Its firmware needs a compiler, which is missing.
-    """
-    return CartpoleEmulator(device_of(truth, firmware), link, hazards)
 
 
 def _passed(limit_s: float | None, time_s: float) -> bool:
