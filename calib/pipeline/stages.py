@@ -373,7 +373,7 @@ def conclude_fit(
     ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
     not explain the recordings, although the residual is as large as the weights say.
     """
-    from deal_hw.calib.validation.checks import hold_shorter, judge, unexplained
+    from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
     from deal_hw.calib.validation.random_delay import fit_delays
     from deal_hw.calib.validation.time_steps import averaged, scan_latency
 
@@ -386,8 +386,8 @@ def conclude_fit(
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
-    steady = late is None and not (wrong or unexplained(refined))
-    if problem.fixed_latency_s is None and steady:
+    doubt = late is not None or wrong or doubtful(refined)
+    if problem.fixed_latency_s is None and not doubt:
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -402,9 +402,9 @@ def conclude_fit(
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
-    if late is not None or wrong or unexplained(refined):
+    if doubt or unexplained(refined):
         # Delays were found because the fit with a constant one is not right.
-        known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
+        known = hold_windows(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause)
