@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How long `train` and `calibrate` live after a signal, and what they leave behind.
+"""How long `train`, `calibrate` and `demo` live after a signal, and what they leave behind.
 
 python tools/measure_interrupts.py runs/demo/dataset --runs 20 --out interrupts.json
 
@@ -44,12 +44,13 @@ def command(verb: str, dataset: Path, out: Path) -> list[str]:
         "train": ["train", "cartpole", "--udr", "--steps", "1000000", "--out", str(out)],
         "train-go2": ["train", "go2", "--udr", "--steps", "10000000", "--out", str(out)],
         "calibrate": ["calibrate", str(dataset), "--out", str(out)],
-        "calibrate-deal": ["calibrate", str(dataset), "--method", "deal", "--out", str(out)],
+        "demo": ["demo", "cartpole", "--out", str(out)],
+        "calibrate-deal": ["calibrate", str(dataset), "--search", "deal", "--no-refine", "--out", str(out)],
     }
     return [sys.executable, "-m", "deal_hw", *arguments[verb]]
 
 
-VERBS = ("train", "train-go2", "calibrate", "calibrate-deal")
+VERBS = ("train", "train-go2", "calibrate", "calibrate-deal", "demo")
 
 
 def left_over(mark: str) -> list[int]:
@@ -129,7 +130,9 @@ def sound(row: Mapping[str, Any]) -> bool:
     # Python ends itself by SIGINT after any interrupt that came while it ran text, as dataclasses do; and a
     # signal ends it before the verb has taken signals. A shell sees 130 or 143.
     codes = (INTERRUPTED, -signal.Signals[row["signal"]])
-    ended = row["ended_before"] or (row["took_s"] <= MOST_S and row["exit_code"] in codes)
+    in_time = row["took_s"] <= MOST_S and row["exit_code"] in codes
+    # A verb that was refused has met no signal.
+    ended = row["exit_code"] == 0 if row["ended_before"] else in_time
     return ended and not row["processes_left"] and not row["broken_files"]
 
 

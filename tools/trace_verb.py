@@ -8,9 +8,9 @@ Runs the verb in this process and ends it when the named function is called, bef
 loaded
     files of this package that were imported. Whoever follows the verb may meet each of them.
 files, functions
-    functions of this package that were called, and the files in which they lie. Bodies of modules and classes
-    and generated methods do not count; comprehensions and functions inside functions count as part of the
-    function around them.
+    functions of this package that were called, and the files in which they lie. Bodies of modules and
+    classes, comprehensions in them, and generated methods do not count; comprehensions and functions inside
+    functions count as part of the function around them.
 child processes
     programs that were started, forks included.
 """
@@ -34,6 +34,9 @@ STARTS = frozenset({"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn
 FOLDERS = ("deal_hw", "calib", "drivers", "policies")
 FUNCTION = inspect.CO_OPTIMIZED | inspect.CO_NEWLOCALS
 """Flags of the code of functions; that of modules and classes lacks the first."""
+
+COMPREHENSIONS = frozenset({"<listcomp>", "<setcomp>", "<dictcomp>", "<genexpr>"})
+"""In the body of a module or a class, they run while it is imported."""
 
 
 class ReachedError(BaseException):
@@ -67,7 +70,8 @@ class Trace:
                 self.reached = name
                 sys.setprofile(None)
                 raise ReachedError
-            self.functions[code.co_filename.removeprefix(self._root)].add(name)
+            if name:
+                self.functions[code.co_filename.removeprefix(self._root)].add(name)
 
     def audit(self, event: str, arguments: tuple[Any, ...]) -> None:
         """Note a program that is started; for `sys.addaudithook`."""
@@ -86,9 +90,10 @@ class Trace:
 
 
 def qualified(code: CodeType) -> str:
-    """Return the name of a function with its class, without functions and comprehensions inside it."""
+    """Return the name of a function with its class, of what is inside it that of the function; else ""."""
     name: str = getattr(code, "co_qualname", code.co_name)
-    return name.partition(".<locals>")[0]
+    name = name.partition(".<locals>")[0]
+    return "" if name.rpartition(".")[2] in COMPREHENSIONS else name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -97,12 +102,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--until", nargs="+", default=FIRST_FIT, metavar="NAME", help="functions; default: the first fit"
+        "--until",
+        action="append",
+        metavar="NAME",
+        help="a function, also several times; default: the first fit",
     )
     parser.add_argument("--list", action="store_true", help="print each file with its functions")
     parser.add_argument("words", nargs=argparse.REMAINDER, metavar="VERB ...", help="as after `deal-hw`")
     given = parser.parse_args(arguments)
-    trace = traced(given.until, given.words)
+    trace = traced(given.until or FIRST_FIT, given.words)
     for line in lines(trace, listed=given.list):
         print(line)
     return 0 if trace.reached else 2
@@ -132,8 +140,10 @@ def lines(trace: Trace, *, listed: bool) -> Iterator[str]:
         for file, names in sorted(trace.functions.items()):
             yield f"{file}: {', '.join(sorted(names))}"
     count = sum(map(len, trace.functions.values()))
-    yield f"until {trace.reached or 'the end'}: {len(trace.loaded())} files loaded, {count} functions in "
-    yield f"    {len(trace.functions)} files called, {len(trace.programs)} child processes"
+    yield (
+        f"until {trace.reached or 'the end'}: {len(trace.loaded())} files loaded, {count} functions in "
+        f"{len(trace.functions)} files called, {len(trace.programs)} child processes"
+    )
     yield from (f"    {program[:100]}" for program in trace.programs)
 
 

@@ -85,6 +85,8 @@ class Refined:
         shooting: The windows used last.
         iterations: Iterations over all stages.
         shorter: The fit in shorter windows from which it began, if there is one.
+        refused: The fit in longer windows that was not kept because its chi2 had grown, if there is one. Not
+            with contacts: there, start states in another basin are the usual reason.
     """
 
     theta: FloatArray
@@ -95,6 +97,7 @@ class Refined:
     shooting: Shooting
     iterations: int
     shorter: Refined | None = None
+    refused: Refined | None = None
 
 
 def refine(
@@ -160,6 +163,8 @@ def refine(
         done += used
         found = _refined(shooting, point, normal, done)
         if result is not None and not shooting.given and found.chi2 > WORSE * max(result.chi2, 1.0):
+            if np.isfinite(found.chi2) and not shooting.contacts:
+                result = dataclasses.replace(result, refused=found)
             break
         result = dataclasses.replace(found, shorter=result)
         theta, latency_s = found.theta, found.latency_s

@@ -12,16 +12,16 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
-from deal_hw.calib.fit.intervals import Uncertainty
-from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.validation.checks import Validation
-from deal_hw.calib.validation.wider_models import WiderFit
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
+    from deal_hw.calib.fit.intervals import Uncertainty
     from deal_hw.calib.fit.output_error import OutputErrorFit
+    from deal_hw.calib.fit.refinement import Refined
+    from deal_hw.calib.validation.wider_models import WiderFit
 
 SHARED_ERRORS = "errors that commands and measurements share"
 AFTER_FIT = "after the fit"

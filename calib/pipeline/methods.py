@@ -164,7 +164,7 @@ def make_method(name: str, *, refine: bool = False, thorough: bool = False) -> C
     ``thorough``: checks run to their end where they take more physics steps than the fits.
     """
     from deal_hw.calib.pipeline.stages import CalibrationPipeline
-    from deal_hw.calib.validation.checks import Validation
+    from deal_hw.calib.validation.settings import Validation
 
     check_method(name)
     pipeline, inside = divided(name)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -46,30 +46,19 @@ from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, at_parameters
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.no_data import nominal
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.checks import (
-    HALVES,
-    SplitHalf,
-    Validation,
-    agreement,
-    unexplained,
-    widened_by_split_half,
-    with_causes,
-    with_step,
-)
-from deal_hw.calib.validation.cross_validation import (
-    Choice,
-    fold_masks,
-    motion_numbers,
-    on_folds,
-    time_masks,
-)
-from deal_hw.calib.validation.diagnosis import diagnose
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Z90, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.validation.cause_words import Diagnosis
+    from deal_hw.calib.validation.checks import SplitHalf
+    from deal_hw.calib.validation.cross_validation import Choice
+
+# What follows the fits is imported where it is used, as in stages.py.
 
 SEARCH_S = 12.0
 """Length of data for the search, spread evenly over the recordings [s]. The search only has to find the
@@ -161,6 +150,10 @@ class OutputErrorFits(Fits):
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
+        from deal_hw.calib.validation import checks
+        from deal_hw.calib.validation.cross_validation import Choice
+        from deal_hw.calib.validation.diagnosis import diagnose
+
         settings, (first, *windows) = self.settings, self.first or self.started(run).first
         # The recordings as they are fitted, which may be joined or a part.
         problem = first.plain.problem
@@ -196,10 +189,10 @@ class OutputErrorFits(Fits):
                 # A local fit that diverged has seen only a part of the recordings.
                 lost = local.chi2 >= LOCAL_HOPELESS
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
-                if judged[1] is not None and unexplained(judged[1]):
+                if judged[1] is not None and checks.unexplained(judged[1]):
                     causes = diagnose(judged[0], judged[1], run.play, run.allows)
             split = self._split_half(run, problem, fit, recipe, known)
-        known = widened_by_split_half(known, split, latency_s, problem.latency_range_s)
+        known = checks.widened_by_split_half(known, split, latency_s, problem.latency_range_s)
         if settings.hold_first:
             known = _including(known, first.theta)
         for kinds, std in settings.common_std:
@@ -207,9 +200,9 @@ class OutputErrorFits(Fits):
         facts: dict[str, Any] = {}
         if local is not None:
             with run.check(AFTER_FIT):
-                known, facts["physics_step"] = with_step(run.problem, local, known)
+                known, facts["physics_step"] = checks.with_step(run.problem, local, known)
         if causes is not None and judged[1] is not None:
-            known, facts["diagnosis"] = with_causes(judged[0], judged[1], known, causes)
+            known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, causes)
         found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {
@@ -275,6 +268,8 @@ class OutputErrorFits(Fits):
         ends in it whatever its start. Without ``search``, that on all recordings was no better start, and no
         fold is searched.
         """
+        from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, on_folds, time_masks
+
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
@@ -336,6 +331,9 @@ class OutputErrorFits(Fits):
         self, run: CalibrationRun, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
     ) -> SplitHalf:
         """Fit two halves of the motions from the estimate on all data, and compare."""
+        from deal_hw.calib.validation.checks import HALVES, SplitHalf, agreement
+        from deal_hw.calib.validation.cross_validation import fold_masks
+
         before, most = problem.steps, self.settings.half_iterations
         # Central derivatives by each value and the latency, and a line of damped steps.
         members = 2 * (len(problem.space) + 1) + 10

@@ -16,14 +16,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
-from deal_hw.calib.fit.channel_weights import WeightedFit, weight_channels
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
     EVIDENCE,
@@ -48,12 +47,7 @@ from deal_hw.calib.pipeline.calibration_run import (
     CalibrationRun,
     FitOutcome,
 )
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.checks import Validation, hold_shorter, judge, unexplained
-from deal_hw.calib.validation.diagnosis import PLAY, find_play, fit_play
-from deal_hw.calib.validation.random_delay import DelayFit, fit_delays
-from deal_hw.calib.validation.shared_errors import find_shared_error
-from deal_hw.calib.validation.time_steps import HALVINGS, averaged, check_step, halved, scan_latency
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     EXPLAINED_CHI2,
@@ -67,6 +61,13 @@ from deal_hw.calibration import (
 )
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.fit.channel_weights import WeightedFit
+    from deal_hw.calib.validation.cause_words import Diagnosis
+    from deal_hw.calib.validation.random_delay import DelayFit
+
+# What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
 CONTACT_DRAWN = 0
 """Refinements from drawn points with feet on the floor, where each takes as long as a search."""
@@ -173,6 +174,9 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         local = local_fit(problem, partial(run.offer, "local fit")) if self.settings.local_first else None
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
+        from deal_hw.calib.fit.channel_weights import weight_channels
+        from deal_hw.calib.validation.diagnosis import PLAY, fit_play
+
         # Another minimum can leave a residual as small as noise, but with a pattern.
         white = local is not None and conclusive(problem, local, WHITE_SAMPLES)
         if local is not None and not white and conclusive(problem, local):
@@ -331,6 +335,8 @@ def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun
     The error of a step is correlated, as that of a wrong model, and fine encoders show it. Where half the
     step explains a part of the residual, fits with it come before a search.
     """
+    from deal_hw.calib.validation.time_steps import HALVINGS, check_step, halved
+
     problem, fit = run.problem, local
     if problem.noise_free or not local.chi2 < LOCAL_HOPELESS:
         return None
@@ -367,6 +373,10 @@ def conclude_fit(
     ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
     not explain the recordings, although the residual is as large as the weights say.
     """
+    from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
+    from deal_hw.calib.validation.random_delay import fit_delays
+    from deal_hw.calib.validation.time_steps import averaged, scan_latency
+
     late, scan, whole = None, None, None
     searched = searched or without_search(run.problem, run.budget, refined)
     if unexplained(refined, WHITE_SAMPLES):
@@ -376,8 +386,8 @@ def conclude_fit(
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
-    steady = late is None and not (wrong or unexplained(refined))
-    if problem.fixed_latency_s is None and steady:
+    doubt = late is not None or wrong or doubtful(refined)
+    if problem.fixed_latency_s is None and not doubt:
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -392,9 +402,9 @@ def conclude_fit(
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
-    if late is not None or wrong or unexplained(refined):
+    if doubt or unexplained(refined):
         # Delays were found because the fit with a constant one is not right.
-        known = hold_shorter(known, refined.latency_s, refined if late is None else late.before)
+        known = hold_windows(known, refined.latency_s, refined if late is None else late.before)
     if late is not None:
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause)
@@ -425,6 +435,8 @@ def conclude_fit(
 
 def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
     """Return random delays of commands as a cause of the residual, which the fit has allowed for."""
+    from deal_hw.calib.validation.cause_words import Diagnosis
+
     found = late.found
     alarm = Finding.alarm(
         f"Each command acts after its own delay: {1e3 * latency_s:.3g} ms on average, with a standard "
@@ -456,6 +468,8 @@ def with_play(run: CalibrationRun) -> FitOutcome | None:
 
     No search follows: nothing but noise is left to explain.
     """
+    from deal_hw.calib.validation.diagnosis import PLAY, find_play
+
     if run.local is None or run.play is None:
         return None
     with run.check(PLAY):
@@ -480,6 +494,9 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     to be right, and a brief search has to find a simulator that predicts as well as the corrected recordings.
     If it does, the recordings are right: the suspicion is withdrawn, and the whole strategy follows.
     """
+    from deal_hw.calib.validation.checks import unexplained
+    from deal_hw.calib.validation.shared_errors import find_shared_error
+
     problem, local = run.problem, run.local
     asked = run.settings.diagnosis and run.settings.local_first
     if not asked or (local is not None and not unexplained(local, WHITE_SAMPLES)):
@@ -527,6 +544,8 @@ def conclusive(problem: Problem, fit: Refined, longest: float = CORRELATION_SAMP
     A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the
     longest autocorrelation time of a residual that counts as noise [samples].
     """
+    from deal_hw.calib.validation.checks import unexplained
+
     chosen = problem.known_std is not None and problem.robot.base is None
     return not chosen and not unexplained(fit, longest)
 

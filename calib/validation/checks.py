@@ -26,11 +26,12 @@ from deal_hw.calib.fit.intervals import (
     uncertainty_at,
     with_rows,
 )
-from deal_hw.calib.fit.refinement import Refined, refine_windows
+from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import Allows, all_allowed, diagnose
 from deal_hw.calib.validation.residual_place import unexplained_alarm
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Z90, listed
@@ -60,29 +61,6 @@ HALVES = "two halves of the data"
 
 LATENCY = "latency"
 """Name of the latency among the values that a cause moves."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Validation:
-    """Which checks follow a refinement."""
-
-    local_first: bool = True
-    """Refine the nominal values first; where that explains the recordings there is no search."""
-
-    cross_validation: bool = True
-    """Choose among candidate fits by their predictions of data that they left out (`output-error`)."""
-
-    split_half: bool = True
-    """Refine two halves of the data alone and compare."""
-
-    physics_step: bool = True
-    """Predict with half the physics step; intervals include the step's shift."""
-
-    diagnosis: bool = True
-    """Name causes of an unexplained residual."""
-
-    thorough: bool = False
-    """Run checks to their end where they take more physics steps than the fits."""
 
 
 def latency_alarms(problem: Problem, latency_s: float) -> tuple[Finding, ...]:
@@ -116,30 +94,44 @@ def unexplained(refined: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
     return correlation_time(refined.normal.residual) > longest
 
 
-def hold_shorter(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertainty:
-    """Return ``known`` of a model that is wrong, with intervals that hold what shorter windows say.
+def doubtful(refined: Refined) -> bool:
+    """Return whether noise does not explain a fit, in its own windows or in longer ones.
+
+    Noise does not grow with a window's length, and a model's error does.
+    """
+    return unexplained(refined) or refined.refused is not None
+
+
+def hold_windows(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertainty:
+    """Return ``known`` of a model that is wrong, with intervals that hold what other windows say.
 
     A model's error adds up along a window. So estimates of a wrong model change with the window's length, by
     more than their own uncertainty, which alone is no reason (Hausman 1978). Every part of the recordings
     shares that error: it shows neither in their halves nor in blocks of time. Shorter windows are easier to
-    explain; those with a larger residual ended in another minimum, and do not count.
+    explain; those with a larger residual ended in another minimum, and do not count. Longer windows that were
+    refused count, if their residual is not so large that they ended elsewhere, too.
 
     Args:
         known: The uncertainty of an estimate.
         latency_s: Its latency [s].
-        fit: The estimate's fit, or that from which it began, with shorter ones.
+        fit: The estimate's fit, or that from which it began, with shorter ones and a refused one.
     """
     space, problem = known.space, fit.shooting.problem
-    excess = np.zeros(len(space) + 1)
+    others: list[Refined] = []
     longer, shorter = fit, fit.shorter
     while shorter is not None and _chi2_as(shorter, longer) < longer.chi2:
-        own = uncertainty_at(problem, shorter)
-        late_std = own.latency_reach_s(shorter.latency_s) / Z90
-        std = np.append(np.sqrt(np.diag(own.covariance)), late_std)
-        moved = space.to_scale(shorter.theta) - space.to_scale(known.theta)
-        square = np.append(moved, shorter.latency_s - latency_s) ** 2
-        excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
+        others.append(shorter)
         longer, shorter = shorter, shorter.shorter
+    if fit.refused is not None and fit.refused.chi2 < LOCAL_HOPELESS * max(fit.chi2, 1.0):
+        others.append(fit.refused)
+    excess = np.zeros(len(space) + 1)
+    for other in others:
+        own = uncertainty_at(problem, other)
+        late_std = own.latency_reach_s(other.latency_s) / Z90
+        std = np.append(np.sqrt(np.diag(own.covariance)), late_std)
+        moved = space.to_scale(other.theta) - space.to_scale(known.theta)
+        square = np.append(moved, other.latency_s - latency_s) ** 2
+        excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
     excess[:-1][known.blind] = 0.0
     wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
     if reach_s := known.latency_reach_s(latency_s):

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
-from deal_hw.robot import Robot
 from deal_hw.robots.entry import RobotEntry, TransportEntry, WireEntry
 from deal_hw.robots.registry import (
     driven_entry,
@@ -23,13 +21,15 @@ from deal_hw.robots.registry import (
     transports,
     wires,
 )
-from deal_hw.transport import TopicTransport, Transport, WireOptions
+from deal_hw.transport import WireOptions
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
     from deal_hw.motions.scores.balance import BalanceResult
     from deal_hw.motions.scores.velocity_error import Track
     from deal_hw.policies.tasks import TrainingTask
+    from deal_hw.robot import Robot
+    from deal_hw.transport import TopicTransport, Transport
 
 
 def make_robot(
@@ -68,7 +68,7 @@ def make_robot(
         given["can_send"] = can_send
     else:
         link = make_transport(wire.transport, port, clock, options)
-        arguments = (link if can_send else listen_only(link), clock)
+        arguments = (link if can_send else _listening(link), clock)
     try:
         made: Robot = driver(*arguments, **given)
     except TypeError as error:
@@ -109,8 +109,14 @@ def adopt_robot(
             "connection by make_robot()"
         )
     link: Transport = transport.load(transport.adopt)(fd, clock=clock, port=port)
-    made: Robot = driver(link if can_send else listen_only(link), clock)
+    made: Robot = driver(link if can_send else _listening(link), clock)
     return made
+
+
+def _listening(link: Transport) -> Transport:
+    from deal_hw.drivers.transports.listen_only import listen_only
+
+    return listen_only(link)
 
 
 def make_transport(

@@ -6,11 +6,14 @@ import functools
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
-from deal_hw.motions.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.robots import is_known, robot_entry
+
+if TYPE_CHECKING:
+    from deal_hw.motions.behaviours import Behaviour
 
 
 def shipped_policy(robot: str) -> Path | None:
@@ -59,6 +62,7 @@ def shipped_balancer(description: RobotDescription) -> Callable[[], Behaviour] |
 
 
 def _tried(path: Path, description: RobotDescription) -> Callable[[], Behaviour]:
+    from deal_hw.motions.behaviours import PolicyBehaviour
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policies.trial import check_policy
 

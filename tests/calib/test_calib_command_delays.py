@@ -27,8 +27,8 @@ from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.random_delay import fit_delays
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import signatures
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.plant.profiles import PROFILES

@@ -16,8 +16,9 @@ from deal_hw.calib.fit.refinement import Refined, at_parameters
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
-from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.validation.checks import unexplained
 from deal_hw.calib.validation.cross_validation import fold_masks
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
 
 

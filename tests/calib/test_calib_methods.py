@@ -33,7 +33,7 @@ from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import NEAR_SPREAD, Eki
 from deal_hw.calib.search.unaligned import Unaligned, UnalignedSettings
-from deal_hw.calib.validation.checks import Validation
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import EXPLAINED_CHI2, Budget, CalibrationResult, Progress
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace

@@ -31,8 +31,8 @@ from deal_hw.calib.pipeline.output_error_fits import (
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray

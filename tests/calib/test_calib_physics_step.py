@@ -16,7 +16,8 @@ from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import with_finer_step
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.validation.checks import unexplained
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import (
     CLEARLY,
     MOST_STEPS,

@@ -20,6 +20,7 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import HELD_STD, noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
+from deal_hw.calib.fit import refinement
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
     FALSE_ALARMS,
@@ -40,11 +41,13 @@ from deal_hw.calib.pipeline.stages import (
     CalibrationPipeline,
     Refinement,
     RestartSettings,
+    conclude_fit,
     conclusive,
     lower_minimum,
 )
-from deal_hw.calib.validation.checks import Validation
+from deal_hw.calib.validation.checks import doubtful, unexplained
 from deal_hw.calib.validation.metrics import HeldOut
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import LatencyScan
 from deal_hw.calibration import BEFORE_SEARCH, Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
@@ -249,6 +252,30 @@ def test_no_prediction_of_noisy_samples_errs_by_less_than_their_noise(noisy: Cas
 
 
 @pytest.mark.slow
+def test_a_longer_window_that_is_refused_is_kept_as_such(
+    monkeypatch: pytest.MonkeyPatch, small_problem: Callable[..., Problem]
+) -> None:
+    """The model errs there, also where noise explains the kept windows. Then no tick is whole."""
+    problem = small_problem(fixed_latency_s=None)
+    kept = refine(problem, problem.space.nominal, problem.first_latency_s, (0.2,))
+    monkeypatch.setattr(refinement, "WORSE", 0.0)
+    found = refine(problem, problem.space.nominal, problem.first_latency_s, (0.2, 0.4))
+    assert np.array_equal(found.theta, kept.theta) and kept.refused is None
+    assert found.refused is not None and found.refused.shooting.length == 2 * found.shooting.length
+    assert doubtful(found) and doubtful(kept) == unexplained(kept)
+    rng = np.random.default_rng(0)
+    run = CalibrationRun(
+        problem=problem,
+        budget=Budget(),
+        rng=rng,
+        attempts=Restarts(FixedSearch(problem.space.nominal, 0.0, 0.05), rng, None),
+        settings=Validation(split_half=False, physics_step=False, diagnosis=False),
+        first_steps=problem.steps,
+    )
+    whole, free = (conclude_fit(run, None, fit) for fit in (kept, found))
+    assert "latency_scan" in whole.facts and "latency_scan" not in free.facts
+
+
 def test_a_residual_that_no_drawn_point_lowers_is_the_models(small_problem: Callable[..., Problem]) -> None:
     """With a wrong latency forced on it nothing explains the data: one brief search, and an alarm."""
     problem = small_problem(fixed_latency_s=0.02)

@@ -17,7 +17,7 @@ from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Refinement, RestartSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki, EkiSettings
-from deal_hw.calib.validation.checks import Validation
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model

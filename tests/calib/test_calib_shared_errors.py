@@ -21,7 +21,8 @@ from deal_hw.calib.pipeline.stages import Fits, Refinement, with_shared_error
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation import shared_errors as shared_errors_module
-from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.validation.checks import unexplained
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.shared_errors import (
     ChannelChange,
     FoundError,
@@ -232,7 +233,9 @@ def test_a_search_that_predicts_as_well_withdraws_it(
 ) -> None:
     """Right recordings that were suspected: printed, tried by a brief search, and taken back in print."""
     run, suspicion, printed = suspected
-    monkeypatch.setattr(stages, "find_shared_error", lambda *_: SharedErrorCheck(found=suspicion))
+    monkeypatch.setattr(
+        shared_errors_module, "find_shared_error", lambda *_: SharedErrorCheck(found=suspicion)
+    )
     found = with_shared_error(Refinement(), run)
     words = [p.message for p in printed]
     assert words.index(str(suspicion.alarm)) < words.index(suspicion.withdrawn)
@@ -272,7 +275,7 @@ def test_corrections_that_take_longer_than_the_fits_are_left_out_and_said(
         allowed.append(most)
         return SharedErrorCheck(tried=2 if most < math.inf else 5, of=5)
 
-    monkeypatch.setattr(stages, "find_shared_error", check)
+    monkeypatch.setattr(shared_errors_module, "find_shared_error", check)
     with_shared_error(AsGiven(), run)
     assert "3 of 5 corrections were not tried" in run.left_out[SHARED_ERRORS]
     thorough = dataclasses.replace(run, settings=Validation(thorough=True), left_out={})

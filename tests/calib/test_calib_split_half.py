@@ -19,14 +19,14 @@ from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.checks import (
     HALVES,
     SplitHalf,
-    Validation,
     agreement,
     check_split_half,
     half_of,
-    hold_shorter,
+    hold_windows,
     judge,
     widened_by_split_half,
 )
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Z90, Budget, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 
@@ -144,8 +144,8 @@ def test_halves_disagree_about_the_latency_like_about_any_value(
     assert _widened(late, three, 0.039).latency_interval_s == pytest.approx((0.030, 0.04))
 
 
-def test_intervals_hold_what_shorter_windows_say(noisy_problem: Problem, noisy_refined: Refined) -> None:
-    """Stiffness five standard deviations lower in shorter windows: its interval reaches there, but for one.
+def test_intervals_hold_what_other_windows_say(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """Stiffness five standard deviations lower in other windows: its interval reaches there, but for one.
 
     By hand: what exceeds their own standard deviation, sqrt(25 - 1) of it, is added.
     """
@@ -157,15 +157,20 @@ def test_intervals_hold_what_shorter_windows_say(noisy_problem: Problem, noisy_r
     at = space.to_scale(noisy_refined.theta) - 5.0 * own * np.eye(len(space))[k]
     short = dataclasses.replace(short, theta=space.from_scale(at))
     wrong = dataclasses.replace(noisy_refined, chi2=2.0, shorter=short)
-    wide = hold_shorter(known, wrong.latency_s, wrong)
+    wide = hold_windows(known, wrong.latency_s, wrong)
     expected = std.copy()
     expected[k] += np.sqrt(5.0**2 - 1.0) * own / Z90
     assert np.sqrt(np.diag(wide.covariance)) == pytest.approx(expected, rel=1e-3)
     assert wide.latency_interval_s == known.latency_interval_s
     # Shorter windows that are explained worse ended in another minimum.
     other = dataclasses.replace(wrong, shorter=dataclasses.replace(short, chi2=3.0))
-    same = hold_shorter(known, wrong.latency_s, other)
+    same = hold_windows(known, wrong.latency_s, other)
     assert np.sqrt(np.diag(same.covariance)) == pytest.approx(std)
+    # Longer windows that were refused; those with a residual that is larger by far ended elsewhere.
+    for chi2, reach in ((short.chi2, expected), (30.0, std)):
+        refused = dataclasses.replace(short, chi2=chi2)
+        held = hold_windows(known, wrong.latency_s, dataclasses.replace(noisy_refined, refused=refused))
+        assert np.sqrt(np.diag(held.covariance)) == pytest.approx(reach, rel=1e-3)
 
 
 def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:

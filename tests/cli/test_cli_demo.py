@@ -17,29 +17,38 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import mujoco
+import numpy as np
 import pytest
 
 from deal_hw.calib.pipeline import output_error_fits
 from deal_hw.calibration import percent
 from deal_hw.cli import demo_cartpole, demo_go2, demo_runs
 from deal_hw.cli import deploy as deploy_verb
+from deal_hw.cli import train as train_verb
 from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.demo import KINDS as DEMO
 from deal_hw.cli.demo import Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
-from deal_hw.cli.main import main
+from deal_hw.cli.main import EXIT_INTERRUPTED, main
 from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.process.channel import RUNNING, Beat
 from deal_hw.control.process.supervisor import Supervisor
 from deal_hw.data.run_folder import RunFolder
-from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
+from deal_hw.drivers.cartpole.description import k9_space
+from deal_hw.errors import ConfigurationError, SafetyError, TransportError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
 from deal_hw.motions.posture import PostureConfig
+from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.training import TrainingProgress
 from deal_hw.workflows.calibration.run import CalibrateReport
+from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
+from deal_hw.workflows.running.supervised import InterruptedRunError
+from deal_hw.workflows.train import Training, TrainSettings
+from deal_hw.workflows.train import run as run_training
 
 pytestmark = pytest.mark.real_time
 
@@ -241,22 +250,78 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
 
 
-def test_ctrl_c_in_the_first_recording_ends_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exit code 130, and the robot is not armed again for a second recording."""
-    made = 0
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("job", ["collect", "train", "deploy"])
+def test_a_signal_ends_the_demo_in_each_job(
+    job: str, number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code 130; the robot is passive, its emulator has ended, and no later job begins.
+
+    Each signal comes at an event of the job, so the machine's load changes nothing. How long a verb lives
+    after a signal is measured by tools/measure_interrupts.py.
+    """
+    begun: list[str] = []
+    reports: list[RunReport] = []
+    emulators: list[EmulatorProcess] = []
+
+    class Kept(EmulatorProcess):
+        def __init__(self, robot: str, *options: str) -> None:
+            super().__init__(robot, *options)
+            emulators.append(self)
 
     def press(beat: Beat) -> None:
         if beat.phase == RUNNING and beat.count == 5:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
     class Pressed(Supervisor):
         def __init__(self, **settings: Any) -> None:
-            nonlocal made
-            made += 1
             super().__init__(**{**settings, "on_beat": press})
 
+    training = run_training
+
+    def pressed_in_training(config: TrainSettings, _: TrainingProgress | None = None) -> Training:
+        return training(config, lambda status: signal.raise_signal(number))
+
+    def begin(name: str, result: Any = None) -> None:
+        """Run a job that ends by the signal; another one only has its result."""
+        own = getattr(demo_cartpole, name)
+
+        def work(*arguments: Any, **options: Any) -> Any:
+            begun.append(name)
+            if name != job:
+                return result
+            try:
+                return own(*arguments, **options)
+            except InterruptedRunError as interrupted:
+                reports.append(interrupted.report)
+                raise
+
+        monkeypatch.setattr(demo_cartpole, name, work)
+
+    space = k9_space()
+    believed = ParameterDistribution(
+        space=space, mean=space.nominal, covariance=0.01 * np.eye(len(space)), latency_s=(0.01, 0.012)
+    )
+    file = tmp_path / "distribution.json"
+    file.write_text(json.dumps(believed.to_json() | {"verdict": "green"}), encoding="utf-8")
     monkeypatch.setattr(episode, "Supervisor", Pressed)
-    assert (main(["demo", "--out", str(tmp_path / "demo")]), made) == (130, 1)
+    monkeypatch.setattr(demo_cartpole, "EmulatorProcess", Kept)
+    monkeypatch.setattr(train_verb, "run", pressed_in_training)
+    if job != "collect":
+        monkeypatch.setattr(demo_cartpole, "recorded", lambda record, what: record(0))
+    for name in ("collect", "deploy", "show_episode"):
+        begin(name, run_of(ended(0)))
+    begin("calibrate", SimpleNamespace(files={"distribution.json": file}, result=None))
+    begin("train")
+    arguments = ["demo", "cartpole", "--steps", "2000", "--out", str(tmp_path / "demo")]
+    assert main(arguments) == EXIT_INTERRUPTED
+    jobs = ["collect", "collect", "calibrate", "calibrate", "train", "deploy"]
+    assert begun == (["collect"] if job == "collect" else jobs[: jobs.index(job) + 1])
+    for emulator in emulators:
+        with pytest.raises(TransportError, match="not running"):
+            _ = emulator.pid
+    ends = [(one.outcome, one.passive_confirmed) for report in reports for one in report.episodes]
+    assert ends == ([] if job == "train" else [(Outcome.STOPPED, True)])
 
 
 @pytest.mark.parametrize("on_stand", [False, True])

@@ -22,9 +22,9 @@ from deal_hw.data.recording import mcap_scan
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
+from deal_hw.data.recording.recorder import LIBRARY
 from deal_hw.data.recording.repair import repair, verify
-from deal_hw.data.recording.schemas import EVENT, STATE, message_type
+from deal_hw.data.recording.schemas import EVENT, METADATA_NAME, STATE, message_type
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.description import digest_of
 from deal_hw.drivers.cartpole.description import DESCRIPTION

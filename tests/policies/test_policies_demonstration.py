@@ -136,7 +136,9 @@ def test_rollouts_do_not_depend_on_the_number_of_threads(replay: bool) -> None:
             np.testing.assert_array_equal(array, same)
 
 
-@pytest.mark.parametrize("robot", FLOATING)
+@pytest.mark.parametrize(
+    "robot", [pytest.param(name, marks=[pytest.mark.slow] * (name == "allegro")) for name in FLOATING]
+)
 def test_the_paper_takes_pi_0_in_the_loop(robot: str) -> None:
     """`deal-paper` with the policy instead of its recorded actions runs to the end, inside the ranges."""
     model, space, _, made = recorded(robot, 3, 1.0)

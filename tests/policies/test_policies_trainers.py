@@ -196,6 +196,7 @@ def test_stable_baselines3_goes_on_with_the_model_that_is_kept(kept: Path, tmp_p
     assert policy.spec.training["algorithm"] == "sac"
 
 
+@pytest.mark.slow
 def test_a_resumed_training_takes_up_the_optimisers_memory(kept: Path, tmp_path: Path) -> None:
     """Where checkpoint and model are of one moment; a model of another moment is left alone."""
     import torch

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from measure_interrupts import sound
 
 pytestmark = pytest.mark.real_time
 
@@ -23,3 +24,16 @@ def test_a_reader_that_has_read_enough_ends_it_without_a_traceback(tmp_path: Pat
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (-signal.SIGPIPE, "")
+
+
+def test_a_verb_that_was_refused_is_no_sound_run() -> None:
+    """It had ended before the signal, as a verb that was done."""
+    done = {
+        "signal": "SIGINT",
+        "took_s": 0.0,
+        "exit_code": 0,
+        "ended_before": True,
+        "processes_left": 0,
+        "broken_files": [],
+    }
+    assert sound(done) and not sound({**done, "exit_code": 2})

@@ -13,10 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.data.checks import meaning, samples, telemetry
-from deal_hw.data.checks.joint_match import match
+from deal_hw.data.checks import samples, telemetry
 from deal_hw.data.checks.samples import OTHERS, OURS
-from deal_hw.data.checks.speed import speed_verdict
 from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings, check_spikes, find_spikes, sound
 from deal_hw.data.table import Table, table_of
 from deal_hw.errors import DatasetError
@@ -83,6 +81,10 @@ def examine(
         spikes: Definition of a spike.
         efforts: Commands are efforts of motors: where they never change, the joints move by themselves.
     """
+    from deal_hw.data.checks import meaning
+    from deal_hw.data.checks.joint_match import match
+    from deal_hw.data.checks.speed import speed_verdict
+
     first = (
         samples.check_length(table, OTHERS),
         samples.check_finite(table, OTHERS),

@@ -16,8 +16,8 @@ from mcap.writer import CompressionType, Writer
 
 from deal_hw.data.files import EpisodeFile, opened_episode
 from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
-from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
-from deal_hw.data.recording.schemas import TRANSFORM, RosMessageType
+from deal_hw.data.recording.recorder import LIBRARY
+from deal_hw.data.recording.schemas import METADATA_NAME, TRANSFORM, RosMessageType
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray, IntArray
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,30 +14,25 @@ from mcap.records import Chunk, Metadata
 from deal_hw.data.files import INDEX_NAME
 from deal_hw.data.importing.channels import Channels, digest_of_file
 from deal_hw.data.importing.columns import ColumnMap, JointColumns, JointKinds, TimeColumn
-from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.data.importing.guess import channels_of_joints, guess_columns, guess_time
 from deal_hw.data.importing.guess_topics import guess_topics
-from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
-from deal_hw.data.importing.mcap_source import read_mcap
-from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.table import build_table
-from deal_hw.data.recording.dataset import Dataset
-from deal_hw.data.recording.mcap_scan import FoundRecord, scan
-from deal_hw.data.recording.reader import read_trajectory
-from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.data.recording.schemas import METADATA_NAME
 from deal_hw.data.table import Table, table_of
 from deal_hw.documentation import page
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
 
 Say = Callable[[str], None]
-_READERS: dict[str, Callable[[Path], Channels]] = {
-    ".csv": read_csv,
-    ".tsv": read_csv,
-    ".txt": read_csv,
-    ".npz": read_npz,
-    ".mcap": read_mcap,
+_CSV = "deal_hw.data.importing.csv_source:read_csv"
+_READERS = {
+    ".csv": _CSV,
+    ".tsv": _CSV,
+    ".txt": _CSV,
+    ".npz": "deal_hw.data.importing.npz_source:read_npz",
+    ".mcap": "deal_hw.data.importing.mcap_source:read_mcap",
 }
+"""MODULE:FUNCTION that reads a file, imported on use, by the end of its name."""
 _HEAD_BYTES = 1 << 20
 SAME_EFFORT = 0.02
 """A motor of 1 N or N·m, within this, takes both kinds of command alike [N or N·m]."""
@@ -50,18 +46,7 @@ def read_channels(path: Path) -> list[Channels]:
     """
     path = Path(path)
     if path.is_dir():
-        if is_lerobot(path):
-            return read_lerobot(path)
-        if is_dataset(path):
-            dataset = Dataset.open(path, lambda text: None)
-            return [read_own(dataset.path(index)) for index in range(len(dataset.episodes))]
-        bags = sorted(path.glob("*.mcap")) if (path / "metadata.yaml").is_file() else []
-        if len(bags) == 1:
-            return [read_mcap(bags[0])]
-        raise DatasetError(
-            f"{path} is a folder, but not a dataset, a LeRobot dataset (meta/info.json) or a ROS 2 bag of "
-            "one MCAP file (metadata.yaml); name a file"
-        )
+        return _read_folder(path)
     if not path.exists():
         raise DatasetError(f"{path} does not exist; check its name")
     if path.suffix.lower() == ".db3":
@@ -76,7 +61,29 @@ def read_channels(path: Path) -> list[Channels]:
             f"{path}: files ending in {path.suffix or 'nothing'!r} are not known; "
             f"known: {', '.join(_READERS)}, and LeRobot folders"
         )
-    return [reader(path)]
+    module, _, function = reader.partition(":")
+    return [getattr(importlib.import_module(module), function)(path)]
+
+
+def _read_folder(path: Path) -> list[Channels]:
+    from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
+
+    if is_lerobot(path):
+        return read_lerobot(path)
+    if is_dataset(path):
+        from deal_hw.data.recording.dataset import Dataset
+
+        dataset = Dataset.open(path, lambda text: None)
+        return [read_own(dataset.path(index)) for index in range(len(dataset.episodes))]
+    bags = sorted(path.glob("*.mcap")) if (path / "metadata.yaml").is_file() else []
+    if len(bags) == 1:
+        from deal_hw.data.importing.mcap_source import read_mcap
+
+        return [read_mcap(bags[0])]
+    raise DatasetError(
+        f"{path} is a folder, but not a dataset, a LeRobot dataset (meta/info.json) or a ROS 2 bag of "
+        "one MCAP file (metadata.yaml); name a file"
+    )
 
 
 def load_tables(
@@ -178,6 +185,8 @@ def own_episodes(path: Path, say: Say | None = None) -> list[Path]:
         DatasetError: The dataset cannot be read.
     """
     if is_dataset(path):
+        from deal_hw.data.recording.dataset import Dataset
+
         dataset = Dataset.open(path, say or (lambda text: None))
         return [dataset.path(index) for index in range(len(dataset.episodes))]
     return [path] if is_episode(path) else []
@@ -193,6 +202,8 @@ def is_episode(path: Path) -> bool:
     path = Path(path)
     if path.suffix.lower() != ".mcap" or not path.is_file():
         return False
+    from deal_hw.data.recording.mcap_scan import FoundRecord, scan
+
     with open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
     for item in scan(head):
@@ -268,6 +279,8 @@ def read_own(path: Path) -> Channels:
         TornRecordingError: It has no footer or is damaged.
         DatasetError: It cannot be read.
     """
+    from deal_hw.data.recording.reader import read_trajectory
+
     table = table_of(read_trajectory(path), path.name)
     arrays = {
         "time_s": table.time_s,

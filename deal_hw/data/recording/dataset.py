@@ -18,7 +18,6 @@ from typing_extensions import Self
 from deal_hw.data.files import INDEX_NAME, write_bytes, write_json
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.reader import Episode, check_description, read_episode
-from deal_hw.data.recording.repair import repair
 from deal_hw.description import RobotDescription, digest_of
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
 from deal_hw.reading import MIB, read_json
@@ -255,6 +254,8 @@ class Dataset:
     ) -> tuple[EpisodeInfo, Episode | None]:
         path = self.folder / file
         with contextlib.suppress(EmptyRecordingError):
+            from deal_hw.data.recording.repair import repair
+
             report = repair(path)
             if report.repaired:
                 self._notify(report.describe())

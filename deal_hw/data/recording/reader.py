@@ -15,8 +15,7 @@ from mcap.records import Message as McapMessage
 
 from deal_hw.data.files import opened_episode
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
-from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.recording.schemas import BODY, OLD_TOPICS, RosMessageType, message_type
+from deal_hw.data.recording.schemas import BODY, METADATA_NAME, OLD_TOPICS, RosMessageType, message_type
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,

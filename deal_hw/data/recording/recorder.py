@@ -34,6 +34,7 @@ from deal_hw.data.recording.schemas import (
     EVENT,
     JOINT_STATE,
     LOG,
+    METADATA_NAME,
     ROBOT,
     STATE,
     TRANSFORM,
@@ -49,7 +50,6 @@ FLUSH_INTERVAL_S = 0.05
 may be late by the other half."""
 FORMAT_VERSION = 2
 """Since 2 log times are on the wall clock and standard messages are written; both versions read alike."""
-METADATA_NAME = "deal-hw"
 END_NAME = "deal-hw.end"
 LOG_LEVELS = {"velocity": 1, "clipped": 3, "warning": 3}
 """Level of foxglove.Log by an event's kind: 1 debug, 3 warning; others 2, info."""

@@ -18,8 +18,8 @@ from mcap.writer import CompressionType, Writer
 
 from deal_hw.data.files import EpisodeFile, opened_episode
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
-from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
-from deal_hw.data.recording.schemas import CHANNELS, FIRST_CHANNELS
+from deal_hw.data.recording.recorder import LIBRARY
+from deal_hw.data.recording.schemas import CHANNELS, FIRST_CHANNELS, METADATA_NAME
 from deal_hw.errors import DatasetError
 
 REPAIR_NAME = "deal-hw.repair"

@@ -19,6 +19,8 @@ import numpy.typing as npt
 
 from deal_hw.errors import ProtocolError, UnknownNameError
 
+METADATA_NAME = "deal-hw"
+"""Name of the metadata of an episode."""
 _HEADER = b"\x00\x01\x00\x00"
 """CDR header, little-endian; alignment counts from its end."""
 _SCALARS = {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback, percent
+from deal_hw.calibration import BEFORE_SEARCH, CalibrationResult, Progress, ProgressCallback, percent
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.findings import Finding
@@ -43,13 +43,15 @@ def check_resume(path: Path, resume: bool) -> None:
 
 
 class BestSoFar:
-    """The best fit of a running calibration: better fits are kept for an interrupt; clear gains are reported.
+    """Receives the progress of a calibration: keeps the best fit for an interrupt, and reports clear gains.
 
     Args:
         space: The parameters.
         judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
         and "null"; None without held-out data.
-        say: Called with a sentence on each fit whose error is 5 % lower than the one reported before.
+        say: Called with a sentence on each fit whose error is 5 % lower than the one reported before, and
+            with each message before the search.
+        progress: Called with the progress, too; None: nobody else is.
     """
 
     def __init__(
@@ -57,18 +59,26 @@ class BestSoFar:
         space: ParameterSpace,
         judge: Callable[[FloatArray, float], Mapping[str, float]] | None,
         say: Say = silent,
+        progress: ProgressCallback | None = None,
     ) -> None:
-        self._space, self._judge, self._say = space, judge, say
+        self._space, self._judge, self._say, self._progress = space, judge, say, progress
         self._began = time.monotonic()
         self._error = self._said = math.inf
         self.result: CalibrationResult | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Compare a fit with the best one so far; see :attr:`Progress.estimate`."""
-        if progress.estimate is None:
-            return
+        """Note a step of the calibration."""
+        if progress.estimate is not None:
+            self._compare(progress, progress.estimate)
+        if progress.stage == BEFORE_SEARCH:
+            self._say(f"{BEFORE_SEARCH}: {progress.message}")
+        if self._progress is not None:
+            self._progress(progress)
+
+    def _compare(self, progress: Progress, estimate: FloatArray) -> None:
+        """Compare a fit with the best one so far."""
         latency_s = progress.latency_s or 0.0
-        errors = self._judge(progress.estimate, latency_s) if self._judge is not None else {}
+        errors = self._judge(estimate, latency_s) if self._judge is not None else {}
         error = errors.get("calibrated", progress.values.get("chi2", math.inf))
         if self.result is not None and not error < self._error:
             return
@@ -77,7 +87,7 @@ class BestSoFar:
         self.result = CalibrationResult(
             method=f"interrupted after {progress.stage}",
             space=self._space,
-            estimate=progress.estimate,
+            estimate=estimate,
             interval=low_high,
             latency_s=latency_s,
             latency_interval_s=(latency_s, latency_s),

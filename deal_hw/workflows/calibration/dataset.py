@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from deal_hw.data.checks.spikes import SpikeSettings
 from deal_hw.data.recording.episode_info import motion_of
+from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
@@ -186,7 +187,7 @@ def choose_episodes(
         ConfigurationError: No episode is left to fit, or one is in both lists.
     """
     every = range(len(dataset.episodes))
-    metadata = [dataset.read(i).metadata for i in every]
+    metadata = [read_metadata(dataset.path(i)) for i in every]
     judges = (i for i in every if motion_of(metadata[i]) == HELDOUT_MOTION and i not in episodes)
     # An episode that is named twice must not count twice.
     episodes, holdout = tuple(dict.fromkeys(episodes)), tuple(dict.fromkeys(holdout))

@@ -21,8 +21,6 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
-from deal_hw.workflows.calibration.dataset import read_driver_dataset, read_own_dataset
-from deal_hw.workflows.calibration.files import read_files
 from deal_hw.workflows.calibration.policy import say_that_alignment_is_better
 from deal_hw.workflows.calibration.settings import (
     CalibrateSettings,
@@ -112,7 +110,11 @@ def calibration_input(settings: CalibrateSettings, *, say: Say = silent) -> Cali
 
 def _read(settings: CalibrateSettings, say: Say) -> Source:
     if isinstance(settings, FilesSettings):
+        from deal_hw.workflows.calibration.files import read_files
+
         return read_files(settings, say)
+    from deal_hw.workflows.calibration.dataset import read_driver_dataset, read_own_dataset
+
     if isinstance(settings, OwnDatasetSettings):
         return read_own_dataset(settings, say)
     if isinstance(settings, DriverDatasetSettings):
@@ -170,11 +172,12 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
 def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode:
     """Return a recording on the physics grid; a floating robot's one includes the base."""
     from deal_hw.sim.recordings.episode import align, fill_gaps, thin
-    from deal_hw.sim.recordings.standing import with_sensed_base
 
     robot = source.robot
     episode = align(trajectory, robot.description, name)
     if robot.base is not None and trajectory.body is not None:
+        from deal_hw.sim.recordings.standing import with_sensed_base
+
         episode = with_sensed_base(episode, robot, trajectory, source.feet)
         if source.division is None:
             episode = while_walking(episode, trajectory)

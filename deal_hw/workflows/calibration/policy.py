@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, UNALIGNED_METHODS, search_of
-from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.motions.velocity import FixedVelocity, make_source
 from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
@@ -100,6 +98,7 @@ def recorded_policy(
         ConfigurationError: The file is another policy, or the dataset has no copy of it.
         PolicyError: The file cannot be run.
     """
+    from deal_hw.motions.velocity import FixedVelocity, make_source
     from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 
@@ -138,6 +137,8 @@ def recorded_policy(
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:
     """Refuse an episode in which not only the policy moved the robot."""
+    from deal_hw.data.recording.episode_info import motion_of
+
     motion, stands = motion_of(run), bool(run.get("stand", False))
     if motion == "balance" and not stands:
         return

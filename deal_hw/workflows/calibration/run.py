@@ -15,11 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calibration import (
-    BEFORE_SEARCH,
     LATENCY_RANGE_S,
     Budget,
     CalibrationResult,
-    Progress,
     ProgressCallback,
 )
 from deal_hw.errors import InsufficientDataError, MissingExtraError
@@ -143,7 +141,6 @@ def calibrate_episodes(
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.pipeline.methods import make_method
-        from deal_hw.calib.validation.checks import latency_alarms
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
@@ -172,7 +169,7 @@ def calibrate_episodes(
         return of.errors({"nominal": (nominal, 0.0), "calibrated": (theta, latency)})
 
     judge = None if held_out is None else lambda *fit, of=held_out: errors(of, *fit).nrmse
-    best = BestSoFar(space, judge, say)
+    best = BestSoFar(space, judge, say, progress)
     searcher = make_method(method, refine=budget.refine, thorough=thorough)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
@@ -180,19 +177,13 @@ def calibrate_episodes(
         threadpool_limits(1, user_api="blas"),
         keeping_best(best, keep, robot) if keep is not None else contextlib.nullcontext(),
     ):
-
-        def note(p: Progress) -> None:
-            best(p)
-            if p.stage == BEFORE_SEARCH:
-                say(f"{BEFORE_SEARCH}: {p.message}")
-            if progress is not None:
-                progress(p)
-
         store = None
         if checkpoint is not None:
             identity = run_identity(problem, searcher, budget, rng)
             store = SearchCheckpoint(checkpoint, identity, fresh=not resume)
-        result = searcher.run(problem, budget, rng, note, store)
+        result = searcher.run(problem, budget, rng, best, store)
+    from deal_hw.calib.validation.checks import latency_alarms
+
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
     result = dataclasses.replace(result, alarms=alarms)
     if held_out is None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.motions.scores.velocity_error import wanted_velocity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 from deal_hw.workflows.say import Say
@@ -29,11 +28,17 @@ WEIGHING_S = 0.35
 
 def all_walk(robot: RobotModel, recordings: Iterable[Trajectory]) -> bool:
     """Return whether all recordings are of a policy that walks."""
-    return robot.base is not None and all(wanted_velocity(r) is not None for r in recordings)
+    if robot.base is None:
+        return False
+    from deal_hw.motions.scores.velocity_error import wanted_velocity
+
+    return all(wanted_velocity(r) is not None for r in recordings)
 
 
 def while_walking(episode: SampledEpisode, trajectory: Trajectory) -> SampledEpisode:
     """Return the episode; of a walk, without standing up and lying down."""
+    from deal_hw.motions.scores.velocity_error import wanted_velocity
+
     wanted = wanted_velocity(trajectory)
     if wanted is None:
         return episode
@@ -49,6 +54,7 @@ def weighed(space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, sa
     No motion on feet can separate masses from gains, since all forces scale together. The motors' efforts
     can, in the last moments before the robot walks.
     """
+    from deal_hw.motions.scores.velocity_error import wanted_velocity
     from deal_hw.sim.legged.weighing import standing_mass
 
     trunk, wanted, body = robot.description.floating_base, wanted_velocity(trajectory), trajectory.body
