@@ -200,8 +200,9 @@ def _options(argv: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
 
 def _remade(one: Remake, out: Path, python: str, against: Path | None) -> tuple[str, str]:
     out.parent.mkdir(parents=True, exist_ok=True)
-    words = [python, "-m", "deal_hw", *one.command, "--out", str(out)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    words = [str(Path(python).absolute()), "-m", "deal_hw", *one.command, "--out", out.name]
+    # Python looks for modules in the current folder first: that must not be a checkout of another commit.
+    done = subprocess.run(words, cwd=out.parent, capture_output=True, text=True, check=False)
     if not out.is_file():
         return "failed", (done.stderr.strip() or done.stdout.strip())[-300:]
     [row] = load_rows(out)

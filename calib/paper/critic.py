@@ -99,7 +99,8 @@ class Critic(Stateful):
         self._parameters: list[Tensor] = []
         with torch.no_grad():
             for layer in self.layers:
-                # torch's default initialisation, but from our generator instead of the global one.
+                # torch's default initialisation, U(-1 / sqrt(inputs), 1 / sqrt(inputs)), but from our
+                # generator instead of the global one.
                 bound = layer.in_features**-0.5
                 for parameter in (layer.weight, layer.bias):
                     parameter.uniform_(-bound, bound, generator=self.generator)
@@ -139,6 +140,8 @@ class Critic(Stateful):
         data = torch.from_numpy(real)
         ends = np.cumsum([len(block) for block in fake])
         draws = settings.updates * settings.batch
+        # Line 5: M samples of each side for each of n updates, (s, a, s') of the recording and of all
+        # simulators together. Draws of all updates at once; each block gives the rows that fall into it.
         rows = torch.randint(len(data), (draws,), generator=self.generator)
         other = torch.randint(int(ends[-1]), (draws,), generator=self.generator).numpy()
         imitation = np.empty((draws, real.shape[1]), dtype=np.float32)
@@ -149,6 +152,7 @@ class Critic(Stateful):
         shape = (settings.updates, settings.batch, real.shape[1])
         batches, copies = data[rows].reshape(shape), torch.from_numpy(imitation).reshape(shape)
         gap, sound = 0.0, self.save()
+        # Lines 6-7: w <- w + step grad_w [mean D_w(real) - mean D_w(fake)], n times.
         with self._pool() as pool:
             for k in range(settings.updates):
                 gap = self._update(batches[k], copies[k], pool)
@@ -208,6 +212,7 @@ class Critic(Stateful):
             for i in range(0, groups, per):
                 block = torch.from_numpy(samples[i : i + per])
                 parts = self.hidden(block.reshape(-1, width))
+                # mean_j [h1, h2, D](x_ij) for each group i of samples j.
                 means = [part.reshape(len(block), count, -1).mean(dim=1) for part in parts]
                 out.append(torch.cat(means, dim=1))
         return torch.cat(out).double().numpy()
@@ -221,12 +226,15 @@ class ClippedCritic(Critic):
         return torch.optim.RMSprop(self._parameters, lr=self.settings.learning_rate, foreach=True)
 
     def _update(self, real: Tensor, fake: Tensor, pool: Executor) -> float:
+        # The gradient of a difference of means is that of both means: two independent parts for two threads.
         ours, theirs = pool.map(self._mean_and_gradient, (real, fake))
         # Eq. 5: max over the weights of E_real D - E_fake D. Optimisers minimise: the gradient turns round.
         for parameter, up, down in zip(self._parameters, ours[1], theirs[1], strict=True):
             parameter.grad = down - up
         self.optimiser.step()
         with torch.no_grad():
+            # w <- clip(w, -c, c) holds the slope of D below a constant, as the Wasserstein distance asks
+            # (Arjovsky et al. 2017, Algorithm 1).
             torch._foreach_clamp_min_(self._parameters, -self.settings.clip)
             torch._foreach_clamp_max_(self._parameters, self.settings.clip)
         return ours[0] - theirs[0]
@@ -253,6 +261,7 @@ class PenaltyCritic(Critic):
         between = (mix * real + (1 - mix) * fake).requires_grad_(True)
         output = self.hidden(torch.cat([real, fake, between]))[2][:, 0]
         ends = len(real), len(real) + len(fake)
+        # A sum over samples: each D(x) depends on its own x alone, so row k is grad_x D(x_k).
         (slope,) = torch.autograd.grad(output[ends[1] :].sum(), between, create_graph=True)
         penalty = ((slope.norm(dim=1) - 1) ** 2).mean()
         gap = output[: ends[0]].mean() - output[ends[0] : ends[1]].mean()

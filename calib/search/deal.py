@@ -14,6 +14,15 @@ reason:
 
 The critic is a WGAN-GP of 64-64 units with Adam, not a clipped WGAN of 256-256 (section 3.1): with clipped
 weights, hidden features hardly depend on the parameters.
+
+Symbols, for member i of N and sample j of n (a window, or a control period):
+    e_j, e_ij: innovations of the recording and of the member, (width,); c_j: its context (s, a).
+    D: the critic; h1, h2: activations of its hidden layers; phi(e, c) = [h1, h2, D](e, c), (F,).
+    Phi = mean_j phi(e_j, c_j), Phi_i = mean_j phi(e_ij, c_j): statistics of recording and member.
+    W: whitens a difference of statistics or of innovations, so that 1 is a standard deviation of its noise.
+    d_i = [W (Phi - Phi_i), W (e - e_i)]: what the Kalman step takes to zero by moving theta_i (`eki`):
+        theta_i += C_theta,d (C_d,d + a 1)^-1 d_i, with the inflation a of `eki`.
+    gap = mean_j D(e_j, c_j) - mean_ij D(e_ij, c_j): the Wasserstein estimate of eq. 5.
 """
 
 from __future__ import annotations
@@ -242,9 +251,11 @@ class _View(Stateful, abc.ABC):
         Values are the critic's statistics and the innovations, the latter relative to the prediction of
         ``centre``. The estimate is nan without a critic.
         """
+        # Episodes follow each other along the samples: e_j is (n, width), e_ij (N, n, width).
         parts = [self._innovations(members, centre, data) for data in self._windows]
         real = np.concatenate([part[0] for part in parts])
         fake = np.concatenate([part[1] for part in parts], axis=1)
+        # A member whose simulation diverged has no innovations. Its row stays nan; the update leaves it out.
         good = np.isfinite(fake).all(axis=(1, 2))
         if not good.any() or not np.isfinite(real).all():
             return np.full((len(fake), 1), np.nan), float("nan")
@@ -269,7 +280,7 @@ class _View(Stateful, abc.ABC):
 
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
         # Windows of distant members run away by many scales. Without a limit the critic would fit those
-        # alone.
+        # alone. 5 s tanh(e / 5 s) is e up to about two scales s, and never more than five.
         limited = (5.0 * np.tanh(values / (5.0 * scale))).astype(np.float32)
         context = np.broadcast_to(self._context, (*values.shape[:-1], self._context.shape[1]))
         return np.concatenate([limited, context], axis=-1)
@@ -311,6 +322,8 @@ class _CleanView(_View):
         scale = np.maximum(np.sqrt(np.mean(fake[good] ** 2, axis=(0, 1))), 1e-12)
         data, imitation = self._join(real, scale), self._join(fake, scale)
         gap = self._train(data, imitation[good])
+        # Without noise nothing says how large a difference of statistics is. W is one over their spread in
+        # the population; statistics that no member changes (dead units) go.
         target, found = self._critic.statistics(data[None])[0], self._critic.statistics(imitation)
         alive, std = spread_of(found[good])
         return target[alive] / std, found[:, alive] / std, gap
@@ -356,14 +369,19 @@ class _NoisyView(_View):
         self, real: FloatArray, fake: FloatArray, good: npt.NDArray[np.bool_]
     ) -> tuple[FloatArray, FloatArray, float]:
         settings = self._settings
+        # Whitened innovations have noise of variance 1. So a simulated noise of e_ij is a standard normal
+        # draw, and the scale of a channel is sqrt(1 + mean_ij e_ij^2), that of innovations with noise.
         draws = self._rng.standard_normal((settings.noise_draws, *real.shape))
         scale = np.sqrt(1.0 + np.mean(fake[good] ** 2, axis=(0, 1)))
         noise = draws[self._rng.integers(len(draws), size=len(fake))]
         data, imitation = self._join(real, scale), self._join(fake + noise, scale)
         gap = self._train(data, imitation[good])
         target = self._critic.statistics(data[None])[0]
+        # Phi_i without the noise of a single draw: the mean over some. tanh and ReLU bend the mean, so noise
+        # is added before phi, not left out.
         repeats = [self._critic.statistics(self._join(fake + d, scale)) for d in draws[:SMOOTH_DRAWS]]
         found = np.mean(repeats, axis=0)
+        # cov Phi from noise alone (a model that is right), and W = L^-1 with L L^T = cov Phi (Cholesky).
         covariance = np.cov(self._critic.statistics(self._join(draws, scale)), rowvar=False)
         variance = np.diag(covariance)
         alive = variance > 1e-12 * max(float(variance.max()), 1e-30)
