@@ -314,7 +314,7 @@ def test_every_task_has_settings_for_every_trainer(robot: str, name: str) -> Non
     ("name", "settings", "message"),
     [
         ("ppo", {"steps": 0}, "steps must be positive, got 0"),
-        ("ppo", {"trace": 0.0}, r"trace must lie in \(0, 1\], got 0.0"),
+        ("ppo", {"gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
         ("ppo", {"hidden": ()}, "hidden must name at least one layer"),
         ("sac", {"steps": 0}, "steps must be positive, got 0"),
         ("sac", {"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
