@@ -335,13 +335,22 @@ class UserRobotSettings(Divided, CalibrateSettings):
 
     @property
     def knows_policy(self) -> bool:
-        """Whether the policy that moved the robot was named."""
-        return False
+        """Whether the policy that moved the robot was named, or may be noted in the recordings."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnDatasetSettings(UserRobotSettings, DatasetSettings):
     """Settings of a calibration from a dataset with its own robot.yaml."""
+
+    policy: File | None = None
+    """The policy (.onnx) that moved the robot: it checks the clock of recorded commands. Methods that run it
+    in every simulator need it, such as deal-unaligned; by default the one of `data import --policy`."""
+
+    @property
+    def knows_policy(self) -> bool:
+        """See :attr:`UserRobotSettings.knows_policy`; the reader of the dataset says if it is unknown."""
+        return True
 
 
 @dataclass(frozen=True, kw_only=True)
