@@ -246,6 +246,7 @@ def own(table: Table, policy: Path, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("own")
     states_file(table, folder)
     late = table.target_at(table.time_s - 0.6)
+    assert table.velocity is not None
     columns = np.column_stack([table.time_s, table.position, table.velocity, late])
     np.savetxt(
         folder / "late.csv",
@@ -254,8 +255,13 @@ def own(table: Table, policy: Path, tmp_path_factory: pytest.TempPathFactory) ->
         header="time,cart.pos,pole.pos,cart.vel,pole.vel,cart.cmd",
         comments="",
     )
-    rates = {"control_rate": DESCRIPTION.control_rate_hz, "state_rate": DESCRIPTION.state_rate_hz}
-    new_robot(DESCRIPTION.mjcf, out=folder / "robot.yaml", name="balancer", **rates)
+    new_robot(
+        DESCRIPTION.mjcf,
+        out=folder / "robot.yaml",
+        name="balancer",
+        control_rate=DESCRIPTION.control_rate_hz,
+        state_rate=DESCRIPTION.state_rate_hz,
+    )
     return folder
 
 
