@@ -62,7 +62,8 @@ def _check_joints(robot: UserRobot, table: Table) -> None:
         if has != wants:
             raise ConfigurationError(
                 f"{table.name} has {what} of {', '.join(has) or 'no joint'}, but robot {robot.file.name!r} "
-                f"needs those of {', '.join(wants)}; name the columns in a column map (--columns)"
+                f"needs those of {', '.join(wants)}; name the columns in a column map (--columns, in Python "
+                "columns=)"
             )
 
 
