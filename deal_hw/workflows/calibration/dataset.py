@@ -13,7 +13,18 @@ from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
+from deal_hw.workflows.calibration.policy import (
+    imported_policy,
+    recorded_policy,
+    refuse_closed_loop,
+    say_other_range,
+    say_unknown_range,
+)
+from deal_hw.workflows.calibration.policy_commands import (
+    at_policy_rate,
+    policy_of_files,
+    with_policy_clock,
+)
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
@@ -92,24 +103,36 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.engine.model import load_model
     from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
+    from deal_hw.sim.mjcf.joint_facts import joint_facts
 
     division = settings.division(judged=bool(settings.judges))
     dataset, description = _opened(settings)
     fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
     if held and settings.holdout_part is None:
         division = dataclasses.replace(division, share=0.0)
-    trajectories, telemetry = sound_recordings(
-        {i: dataset.read(i).trajectory for i in (*fit, *held)}, dataset.folder, settings.spikes, say
-    )
+    trajectories = {i: dataset.read(i).trajectory for i in (*fit, *held)}
+    given = None if settings.policy is None else Path(settings.policy)
+    file = imported_policy(dataset, {i: t.metadata for i, t in trajectories.items()}, given)
+    if settings.in_closed_loop and file is None:
+        refuse_closed_loop(settings.named())
     model = compile_mjcf(description.mjcf)
+    if given is not None:
+        trajectories = with_policy_clock(trajectories, given, joint_facts(description.mjcf, model), say)
+    trajectories, telemetry = sound_recordings(trajectories, dataset.folder, settings.spikes, say)
     space = searched_space(settings, model, say)
     timestep = float(model.opt.timestep) if settings.physics_step is None else settings.physics_step
     rates = sampling(1.0 / description.state_rate_hz, timestep, settings.window)
+    in_loop = file if settings.in_closed_loop else None
+    if in_loop is not None:
+        rates = at_policy_rate(rates, in_loop)
     description = dataclasses.replace(
         description,
         device_rate_hz=1.0 / rates.step_s,
         control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
     )
+    policy = None if in_loop is None else policy_of_files(in_loop, description)
+    if policy is not None:
+        say_unknown_range(policy, space, settings.latency_range, say)
     return Source(
         robot=load_model(with_speed_limits(description, model, space), rates.step_s),
         space=space,
@@ -125,6 +148,7 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="import recordings of other motion, and name their episodes with --holdout",
+        policy=policy,
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import examine_recording
+from deal_hw.workflows.calibration.policy import say_unknown_range
 from deal_hw.workflows.calibration.policy_commands import (
     at_policy_rate,
     policy_of_files,
@@ -79,6 +80,9 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
         for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }
     robot = load_model(description, rates.step_s)
+    run = None if in_loop is None else policy_of_files(in_loop, description)
+    if run is not None:
+        say_unknown_range(run, space, settings.latency_range, say)
     fitted, held = parts
     return Source(
         robot=robot,
@@ -103,7 +107,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
-        policy=None if in_loop is None else policy_of_files(in_loop, description),
+        policy=run,
     )
 
 

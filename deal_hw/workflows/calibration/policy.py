@@ -12,6 +12,9 @@ from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.workflows.say import Say
 
+NOTED_POLICY = "policy"
+"""Entry of an imported recording's source: the policy whose commands it has, 16 digits of its SHA-256."""
+
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.parameters import ParameterSpace
@@ -39,8 +42,8 @@ def refuse_closed_loop(method: str) -> None:
     if search in CLOSED_LOOP_METHODS:
         raise ConfigurationError(
             f"{search} runs the policy that moved the robot, which is unknown for --model without --policy "
-            "FILE.onnx, and for a dataset with its own robot.yaml; name it, or use eki, deal or "
-            "deal-paper-replay"
+            "FILE.onnx, and for a dataset with its own robot.yaml that was imported without it; name it, or "
+            "use eki, deal or deal-paper-replay"
         )
 
 
@@ -79,6 +82,73 @@ def say_other_range(policy: PopulationDemonstration, robot: str, space: Paramete
         f"the policy that moved the robot was trained {what}. The DEAL paper trains it in the range that is "
         "searched. Simulators at the ends of the range may fall at once under this one, and then say little"
     )
+
+
+def say_unknown_range(
+    policy: PopulationDemonstration, space: ParameterSpace, latency_range_s: tuple[float, float], say: Say
+) -> None:
+    """Say where nothing shows that a user's policy was trained in the range that is searched.
+
+    Args:
+        policy: The policy that moved the robot.
+        space: What is searched.
+        latency_range_s: Range of the latency's search [s].
+        say: Called with the sentence.
+    """
+    from deal_hw.parameters import ParameterDistribution
+
+    if policy.trained_under == ParameterDistribution.uniform(space, latency_range_s).digest():
+        return
+    trained = policy.trained_under
+    what = f"names the distribution {trained}" if trained else "names no distribution of its training"
+    say(
+        f"the policy {what}, not that of the {len(space)} searched parameters. The DEAL paper trains it in "
+        "the range that is searched. Simulators at the ends of the range may fall at once under this one, "
+        "and then say little; --range-ratio narrows it"
+    )
+
+
+def imported_policy(
+    dataset: Dataset, runs: Mapping[int, Mapping[str, Any]], given: Path | None
+) -> Path | None:
+    """Return the file of the policy that moved the robot in imported episodes; None: it is not known.
+
+    Args:
+        dataset: The dataset, with its own robot.yaml.
+        runs: Metadata of the episodes, by number.
+        given: The file that was named; None: the copy in the dataset, if they were imported with a policy.
+
+    Raises:
+        ConfigurationError: The file is another policy, or the dataset lost its copy.
+        InsufficientDataError: The episodes were imported with different policies.
+        PolicyError: The file cannot be run.
+    """
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    digests = sorted({str(run.get("import", {}).get(NOTED_POLICY, "")) for run in runs.values()})
+    if len(digests) > 1:
+        raise InsufficientDataError(
+            f"episodes {', '.join(map(str, runs))} were imported with {len(digests)} policies, or some "
+            "without one; name episodes of one policy (--episodes, --holdout)"
+        )
+    (noted,) = digests
+    if given is not None:
+        found = OnnxPolicy(given).digest
+        if noted and not found.startswith(noted):
+            raise ConfigurationError(
+                f"{given} is not the policy with which the recordings were imported: its SHA-256 begins "
+                f"with {found[:16]}, that one's with {noted}; leave --policy out, or name the right file"
+            )
+        return given
+    if not noted:
+        return None
+    kept = dataset.policy_path(noted)
+    if not kept.is_file():
+        raise ConfigurationError(
+            f"{dataset.folder} has no copy of the policy that moved the robot (its SHA-256 begins with "
+            f"{noted}); name its file: --policy FILE"
+        )
+    return kept
 
 
 def recorded_policy(
