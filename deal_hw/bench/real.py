@@ -92,7 +92,7 @@ def split_name(source: CalibrateSettings) -> str:
     """Return the name of the held-out part."""
     judges: tuple[Any, ...] = ()
     if isinstance(source, DatasetSettings | FilesSettings):
-        judges = source.judges
+        judges = source.holdout
     if judges:
         return "+".join(Path(str(one)).stem for one in judges)
     part = source.holdout_part if isinstance(source, UserRobotSettings) else None

@@ -89,16 +89,12 @@ class CalibrateDataset(CalibrateOptions, DriverDatasetSettings):
 
     dataset: tyro.conf.Positional[Path]
 
-    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
-
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOwnDataset(CalibrateOptions, OwnDatasetSettings):
     """Find the simulator parameters that explain a dataset with its own robot.yaml."""
 
     dataset: tyro.conf.Positional[Path]
-
-    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
 
     write_parameters: Path | None = None
     """Write a --parameters file for the robot's model, to edit, and end."""

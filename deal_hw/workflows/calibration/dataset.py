@@ -52,7 +52,7 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
 
     dataset, description = _opened(settings)
     robot_name = dataset.description["name"]
-    fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
+    fit, held = choose_episodes(dataset, settings.episodes, settings.holdout, say)
     robot = load_model(description)
     space = named_space(robot_name, settings.space)
     if settings.parameters is not None:
@@ -93,9 +93,9 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
     from deal_hw.sim.engine.model import load_model
     from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
 
-    division = settings.division(judged=bool(settings.judges))
+    division = settings.division(judged=bool(settings.holdout))
     dataset, description = _opened(settings)
-    fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
+    fit, held = choose_episodes(dataset, settings.episodes, settings.holdout, say)
     if held and settings.holdout_part is None:
         division = dataclasses.replace(division, share=0.0)
     trajectories, telemetry = sound_recordings(

@@ -1,7 +1,8 @@
-"""The policy of a dataset's recordings, for methods that run it in every simulator."""
+"""The policy that moved the robot, for methods that run it in every simulator."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.parameters import ParameterSpace
     from deal_hw.policies.demonstration import PopulationDemonstration
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
 
 
 def check_policy_runs(method: str) -> None:
@@ -133,6 +135,28 @@ def recorded_policy(
         )
     ahead, left, turn = source.reach()[0]
     return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))
+
+
+def policy_of_files(policy: OnnxPolicy, description: RobotDescription) -> PopulationDemonstration:
+    """Return the policy that moved the robot, for methods that run it in every simulator.
+
+    Args:
+        policy: The policy. It gave or checked the commands of these recordings, so joints, units and
+            rate fit.
+        description: The robot by the user's model, sampled at the policy's rate.
+    """
+    from deal_hw.policies.demonstration import PopulationDemonstration
+
+    spec = policy.spec
+    # A model's file has another name than the robot, and often another rest pose. Actions are around the
+    # policy's own pose, as in the commands that were computed.
+    own = dataclasses.replace(
+        description,
+        name=spec.robot,
+        default_position=spec.default_position,
+        control_rate_hz=spec.control_rate_hz,
+    )
+    return PopulationDemonstration(policy, own, ran_before=True)
 
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:

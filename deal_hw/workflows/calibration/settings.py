@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
 from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
@@ -192,8 +192,8 @@ class CalibrateSettings(Checked):
             space = space.with_free(self.free)
         if self.range_ratio is not None:
             space = space.with_ratio(self.range_ratio)
-        space = space.with_known(dict(_pairs(self.known)))
-        for parameter, low, high in _triples(self.range):
+        space = space.with_known(dict(self.known))
+        for parameter, low, high in cast(Triples, self.range):
             space = space.with_range(parameter, low, high)
         if not len(space):
             raise ConfigurationError(
@@ -213,7 +213,7 @@ class DatasetSettings(CalibrateSettings):
     """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out
     ones."""
 
-    holdout: Annotated[int | tuple[int, ...], Range(0, 1_000_000)] = ()
+    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
     """Held-out episodes, which only test the result, by number (the first is 0). By default those collected
     with --motion chirp."""
 
@@ -222,19 +222,14 @@ class DatasetSettings(CalibrateSettings):
     period."""
 
     def __post_init__(self) -> None:
-        self._keep(dataset=dataset_of(self.dataset), holdout=_listed(self.holdout))
-        self._keep(episodes=_listed(self.episodes))
-        wrong = [str(one) for one in _listed(self.holdout) if not isinstance(one, int)]
+        judges: tuple[Any, ...] = _listed(self.holdout)
+        self._keep(dataset=dataset_of(self.dataset), episodes=_listed(self.episodes), holdout=judges)
+        wrong = [str(one) for one in judges if not isinstance(one, int)]
         if wrong:
             raise ConfigurationError(
                 f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
             )
         super().__post_init__()
-
-    @property
-    def judges(self) -> tuple[int, ...]:
-        """Held-out episodes."""
-        return _listed(self.holdout)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -369,11 +364,6 @@ class FilesSettings(UserRobotSettings, Recordings):
     def knows_policy(self) -> bool:
         """Whether the policy that moved the robot was named."""
         return self.policy is not None
-
-    @property
-    def judges(self) -> tuple[Any, ...]:
-        """Held-out recordings."""
-        return _listed(self.holdout)
 
     def __post_init__(self) -> None:
         self._keep(data=_listed(self.data), holdout=_listed(self.holdout), feet=_words(self.feet))
