@@ -20,12 +20,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from deal_hw.bench.figures import draw_transfer
 from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.rows import Cells, Row, RowTable, describe_call
 from deal_hw.bench.scores import error_percent, log_error_x100
 from deal_hw.bench.settings import Transfer
 from deal_hw.bench.tasks import TASKS, Case, check_tasks, make_case
-from deal_hw.bench.transfer_figure import draw_transfer
 from deal_hw.bench.transfer_target import WORKS, judged, speed_profile, truth_of
 from deal_hw.calib.pipeline.methods import check_method, is_default, usual_budget
 from deal_hw.data.run_folder import git_commit
