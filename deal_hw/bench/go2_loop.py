@@ -20,7 +20,7 @@ from deal_hw.bench.rows import Cells, Row, RowTable, per_parameter, printed
 from deal_hw.bench.scores import check_truth
 from deal_hw.bench.settings import Go2Loop
 from deal_hw.calibration import CalibrationResult
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space

@@ -15,7 +15,7 @@ from verb_options import Option, dataclasses_of, kind_of, options
 
 from deal_hw.cli.main import VERBS, parse
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.errors import DealHwError
 from deal_hw.robots import driver_description, make_robot
 from deal_hw.types import Trajectory

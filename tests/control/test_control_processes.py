@@ -27,8 +27,7 @@ from deal_hw.cli.deploy import KINDS as DEPLOY
 from deal_hw.cli.deploy import deploy
 from deal_hw.cli.replay import KINDS as REPLAY
 from deal_hw.cli.replay import replay
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.process.channel import RUNNING, Beat
+from deal_hw.control.process.channel import RUNNING, Beat, Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.drivers.cartpole.description import DESCRIPTION

@@ -12,7 +12,7 @@ import pytest
 from fakes.unitree_mujoco import PUBLISHED, SUBSCRIBED, UnitreeMujoco
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import SafetyError, TransportTimeoutError, VersionMismatchError

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice

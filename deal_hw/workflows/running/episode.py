@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.loop.timing import LoopTimingReport
 from deal_hw.control.process.channel import (
     CONNECTING,
@@ -19,6 +18,7 @@ from deal_hw.control.process.channel import (
     MAKING_PASSIVE,
     STARTING,
     Beat,
+    Outcome,
 )
 from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.supervisor import ChildEnd, Supervisor

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw import errors
-from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.loop.timing import LoopTimingReport
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.documentation import page
 from deal_hw.motions.scores.balance import FALLEN_RAD, BalanceResult

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.safety import Safety
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.excitation import Excitation

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 from deal_hw import errors
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.process.channel import Beat
+from deal_hw.control.process.channel import Beat, Outcome
 from deal_hw.description import RobotDescription
 from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
 from deal_hw.robots import make_robot
