@@ -529,7 +529,7 @@ def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy
         import deal_hw.policies.onnx_runtime
         from deal_hw.workflows.running.plan import RunPlan, make_behaviour
         from deal_hw.clock import MonotonicClock
-        from deal_hw.robots import make_robot
+        from deal_hw.robots.connect import make_robot
         robot = make_robot("cartpole", "serial", "/dev/null", MonotonicClock())
         make_behaviour(RunPlan(robot="cartpole", motion="chirp"), robot.description)
         heavy = ("torch", "mujoco", "scipy", "rerun", "pandas")

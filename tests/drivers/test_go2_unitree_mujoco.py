@@ -38,7 +38,7 @@ from deal_hw.errors import (
 )
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.types import RobotState, Status
 

@@ -22,7 +22,7 @@ from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, UnknownNameError
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.robot import Robot
-from deal_hw.robots import adopt_robot, make_robot
+from deal_hw.robots.connect import adopt_robot, make_robot
 from deal_hw.transport import Message, Transport
 
 pytestmark = pytest.mark.real_time

@@ -28,7 +28,8 @@ from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
-from deal_hw.robots import balanced, on_this_computer, robot_entry, walked
+from deal_hw.robots import balanced, robot_entry, walked
+from deal_hw.robots.connect import on_this_computer
 from deal_hw.signals import OPERATOR, name
 from deal_hw.version import __version__
 from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice

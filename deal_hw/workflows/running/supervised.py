@@ -15,7 +15,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.channel import Beat, Outcome
 from deal_hw.description import RobotDescription
 from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.workflows.options import File
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun
