@@ -8,16 +8,8 @@ import pytest
 from deal_hw.clock import MonotonicClock
 from deal_hw.errors import ConfigurationError, PortNotFoundError, UnknownNameError
 from deal_hw.robot import Robot
-from deal_hw.robots import (
-    adopt_robot,
-    carries_topics,
-    default_transport,
-    driver_description,
-    make_robot,
-    robot_description,
-    robots,
-    transports,
-)
+from deal_hw.robots import default_transport, driver_description, robot_description, robots, transports
+from deal_hw.robots.connect import adopt_robot, carries_topics, make_robot
 
 pytestmark = pytest.mark.real_time
 

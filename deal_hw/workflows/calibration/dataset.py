@@ -13,7 +13,6 @@ from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
@@ -61,6 +60,8 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
     episodes = {i: dataset.read(i) for i in (*fit, *held)}
     policy = None
     if settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
+
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
         say_other_range(policy, robot_name, space, say)

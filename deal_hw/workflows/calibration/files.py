@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import examine_recording
-from deal_hw.workflows.calibration.policy import policy_of_files
 from deal_hw.workflows.calibration.recordings import (
     Recorded,
     at_rest_without_commands,
@@ -65,11 +65,13 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
         policy = OnnxPolicy(settings.policy)
     fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), policy, facts, say)
     rates = common_rates([*fitted, *held], model, settings.physics_step, settings.window)
-    in_loop = policy if settings.in_closed_loop else None
-    if in_loop is not None:
+    in_loop = None
+    if policy is not None and settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import policy_of_files
         from deal_hw.workflows.calibration.policy_commands import at_policy_rate
 
-        rates = at_policy_rate(rates, in_loop)
+        rates = at_policy_rate(rates, policy)
+        in_loop = functools.partial(policy_of_files, policy)
     description = describe(path, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
     parts = without(
@@ -107,7 +109,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
-        policy=None if in_loop is None else policy_of_files(in_loop, description),
+        policy=None if in_loop is None else in_loop(description),
     )
 
 

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, UNALIGNED_METHODS, search_of
 from deal_hw.description import RobotDescription
-from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.workflows.say import Say
 
@@ -18,43 +16,6 @@ if TYPE_CHECKING:
     from deal_hw.parameters import ParameterSpace
     from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
-
-
-def check_policy_runs(method: str) -> None:
-    """Check that a method runs the policy that moved the robot.
-
-    Raises:
-        ConfigurationError: It does not, so a named policy would have no effect.
-    """
-    search = search_of(method)
-    if search not in CLOSED_LOOP_METHODS:
-        raise ConfigurationError(f"--policy would have no effect: {search} runs no policy")
-
-
-def refuse_closed_loop(method: str) -> None:
-    """Refuse a method that runs the policy that moved the robot, where nobody knows that policy.
-
-    Raises:
-        ConfigurationError: The method does.
-    """
-    search = search_of(method)
-    if search in CLOSED_LOOP_METHODS:
-        raise ConfigurationError(
-            f"{search} runs the policy that moved the robot, which is unknown for --model without --policy "
-            "FILE.onnx, and for a dataset with its own robot.yaml; name it, or use eki, deal or "
-            "deal-paper-replay"
-        )
-
-
-def say_that_alignment_is_better(method: str, say: Say) -> None:
-    """Say it where a search compares distributions of recordings whose commands and states are aligned."""
-    if method in UNALIGNED_METHODS:
-        say(
-            f"{method} compares distributions of motion. In these recordings commands and states have one "
-            "clock, so predictions can be compared, too, and every robot that was measured was predicted "
-            f"better by that ({page('results/paper.md')}): leave --method out, unless the motion diverges "
-            "from any prediction"
-        )
 
 
 def say_other_range(policy: PopulationDemonstration, robot: str, space: ParameterSpace, say: Say) -> None:

@@ -27,7 +27,6 @@ from deal_hw.data.files import dataset_of
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
-from deal_hw.workflows.calibration.policy import check_policy_runs, refuse_closed_loop
 from deal_hw.workflows.calibration.source import Division
 from deal_hw.workflows.kinds import InputKind, Kinds, fitting
 from deal_hw.workflows.options import File, Ratio, Seed, Threads
@@ -250,8 +249,10 @@ class DriverDatasetSettings(DatasetSettings):
     def check(self) -> None:
         """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
         super().check()
-        if self.policy is not None:
-            check_policy_runs(self.named())
+        if self.policy is not None and not self.in_closed_loop:
+            raise ConfigurationError(
+                f"--policy would have no effect: {search_of(self.named())} runs no policy"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,8 +326,12 @@ class UserRobotSettings(Divided, CalibrateSettings):
     def check(self) -> None:
         """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
         super().check()
-        if not self.knows_policy:
-            refuse_closed_loop(self.named())
+        if self.in_closed_loop and not self.knows_policy:
+            raise ConfigurationError(
+                f"{search_of(self.named())} runs the policy that moved the robot, which is unknown for "
+                "--model without --policy FILE.onnx, and for a dataset with its own robot.yaml; name it, or "
+                "use eki, deal or deal-paper-replay"
+            )
 
     @property
     def knows_policy(self) -> bool:
