@@ -186,6 +186,9 @@ class Problem:
             it from the recordings.
         smoothing_s: Width over which start states are smoothed [s].
         policy: The policy that produced all commands; None for an unknown one, or no policy.
+        start_std: Rollouts of the policy begin in states drawn from the whole recordings, moved by this
+            standard deviation of (position, velocity), (2 C,); NaN: the recording's own uncertainty. None:
+            they begin in the recorded first state.
         command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
             to single commands of these recordings: a problem of others begins without.
         channels: Indices of the measured channels into (position, velocity), (M,).
@@ -203,6 +206,7 @@ class Problem:
     known_std: FloatArray | None = None
     smoothing_s: float = SMOOTHING_S
     policy: PopulationPolicy | None = None
+    start_std: FloatArray | None = None
     command_delays: CommandDelays | None = field(init=False, default=None)
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
@@ -347,6 +351,11 @@ class Problem:
     def coordinates(self) -> int:
         """Tangent coordinates C of a state."""
         return int(self.episodes[0].position.shape[1])
+
+    @property
+    def commands(self) -> int:
+        """Commands A of a control period."""
+        return int(self.episodes[0].target.shape[1])
 
     @property
     def channel_names(self) -> tuple[str, ...]:

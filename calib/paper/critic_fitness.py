@@ -18,7 +18,7 @@ class CriticFitness(Fitness):
 
     def _prepare(self, rng: np.random.Generator) -> None:
         settings = self._settings
-        self._view = RolloutView(self._problem, settings)
+        self._view = RolloutView(self._problem, settings, rng)
         self._critic = ClippedCritic(
             self._view.real.shape[1],
             settings.critic or CriticSettings(),

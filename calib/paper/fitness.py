@@ -10,7 +10,7 @@ import abc
 import functools
 import importlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,15 +20,18 @@ from deal_hw.calib.data.innovations import Members, Whitening, cut, is_noisy, li
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Stateful
 from deal_hw.calib.data.search import Coordinates
+from deal_hw.calib.data.start_states import drawn_start
 from deal_hw.calib.paper.rollouts import (
     TransitionScale,
     control_ticks,
     demonstration,
+    drawn_ticks,
     policy_of,
     rollout_population,
     transitions,
 )
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.sim.recordings.imu_base import PLACE_STD
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
@@ -60,6 +63,8 @@ class FitnessSettings:
         window_ticks: Window length of `trajectory` in control periods.
         ticks: Most transitions of a rollout (`critic`, `energy`, `mmd`); None for the robot's own number in
             `TRANSITIONS`.
+        rollout_ticks: Control periods of a rollout from a drawn start state. Longer ones show slow effects,
+            shorter ones diverge less from the recording.
         replay: Roll out with the recorded commands, not with the policy in closed loop (Algorithm 1, line 3).
         difference: Score (s, a, s' - s) instead of the paper's (s, a, s'). The information is the same. But s
             and s' differ by only a hundredth of their range, which a first layer hardly sees.
@@ -75,6 +80,7 @@ class FitnessSettings:
 
     window_ticks: int = 10
     ticks: int | None = None
+    rollout_ticks: int = 25
     replay: bool = False
     difference: bool = False
     standardise: bool = True
@@ -82,7 +88,7 @@ class FitnessSettings:
     replay_generations: int | None = 1
 
     def __post_init__(self) -> None:
-        for name in ("window_ticks", "ticks"):
+        for name in ("window_ticks", "ticks", "rollout_ticks"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {value}")
@@ -180,24 +186,47 @@ class TrajectoryFitness(Fitness):
 class RolloutView:
     """Transitions (s, a, s') of the recording and of rollouts.
 
+    With drawn start states (:attr:`Problem.start_std`) rollouts are shorter and begin in states drawn from
+    the whole recordings; the recording's transitions are then those behind these states. All generations
+    share the draws, so that they are comparable.
+
+    Args:
+        problem: The recordings.
+        settings: What of them is compared.
+        rng: Draws start states; not used without.
+
     Raises:
         InsufficientDataError: A recording is too short, or its policy is not known.
     """
 
-    def __init__(self, problem: Problem, settings: FitnessSettings) -> None:
+    def __init__(self, problem: Problem, settings: FitnessSettings, rng: np.random.Generator) -> None:
         self._problem, self._settings = problem, settings
         most = settings.most_transitions(problem.robot.description.name)
-        ticks = functools.partial(control_ticks, problem, most=most)
+        past: dict[str, Any] = {}
         if not settings.replay:
             policy = policy_of(problem)
-            ticks = functools.partial(ticks, history=policy.history, ran_before=policy.ran_before)
-        self._ticks = [ticks(index) for index in range(len(problem.episodes))]
+            past = {"history": policy.history, "ran_before": policy.ran_before}
+        every = range(len(problem.episodes))
+        self._seed = 0
+        if problem.start_std is None:
+            self._parts = [(index, control_ticks(problem, index, most, **past)) for index in every]
+        else:
+            self._seed = int(rng.integers(2**62))
+            self._parts = [
+                (index, ticks)
+                for index in every
+                for ticks in drawn_ticks(problem, index, most, settings.rollout_ticks, rng, **past)
+            ]
+        shown = self._shown()
+        self._columns = np.flatnonzero(np.concatenate([shown, np.ones(problem.commands, dtype=bool), shown]))
+        self.outputs = int(np.count_nonzero(shown))
+        """Width of s', the last entries of a transition."""
         raw = np.concatenate(
             [
                 demonstration(problem, index, ticks, difference=settings.difference)
-                for index, ticks in enumerate(self._ticks)
+                for index, ticks in self._parts
             ]
-        )
+        )[:, self._columns]
         width = raw.shape[1]
         self._scale = TransitionScale(np.zeros(width), np.ones(width), np.inf)
         if settings.standardise:
@@ -205,23 +234,32 @@ class RolloutView:
         self.real: Samples = self._scale.apply(raw)
         """The recording's transitions, (n, inputs)."""
 
-    @property
-    def outputs(self) -> int:
-        """Width of s', the last entries of a transition."""
-        return 2 * self._problem.coordinates
+    def _shown(self) -> npt.NDArray[np.bool_]:
+        """Return which entries of (position, velocity) the recordings show at all, (2 C,).
+
+        The others are the place of a base on the floor that no sensor reports: it is 0 in the recording.
+        """
+        shown = np.ones(2 * self._problem.coordinates, dtype=bool)
+        for episode in self._problem.episodes:
+            if episode.estimate_std is not None:
+                std = np.broadcast_to(episode.estimate_std, (len(episode.sample), len(shown)))
+                unseen = np.asarray(np.all(std <= PLACE_STD, axis=0))
+                unseen[episode.channels] = False
+                shown &= ~unseen
+        return shown
 
     @functools.cached_property
     def _noise(self) -> FloatArray:
         """The noise of smoothed states in a transition, standardised, (inputs,)."""
         C = self._problem.coordinates
-        rows = [s.std[t.sample] for s, t in zip(self._problem.starts, self._ticks, strict=True)]
+        rows = [self._problem.starts[index].std[ticks.sample] for index, ticks in self._parts]
         # Smoothed states count with twice their noise, for kinks that are no polynomials.
         std = 0.5 * np.sqrt(np.mean(np.concatenate(rows) ** 2, axis=0))
         std[~np.isfinite(std)] = 0.0
-        noise = np.zeros(self.real.shape[1])
+        noise = np.zeros(4 * C + self._problem.commands)
         noise[: 2 * C] = std
         noise[-2 * C :] = std * (np.sqrt(2.0) if self._settings.difference else 1.0)
-        return np.asarray(noise / self._scale.std)
+        return np.asarray(noise[self._columns] / self._scale.std)
 
     def as_sensed(self, rollouts: Samples, rng: np.random.Generator) -> Samples:
         """Return simulators' transitions with the noise of smoothed measurements, (N, n, inputs)."""
@@ -233,19 +271,37 @@ class RolloutView:
     def rollouts(self, members: Members) -> tuple[Samples, npt.NDArray[np.bool_]]:
         """Return each member's transitions, (N, n, inputs), and which members did not diverge, (N,)."""
         blocks = []
-        for index, ticks in enumerate(self._ticks):
-            moved = rollout_population(self._problem, members, index, ticks, replay=self._settings.replay)
-            blocks.append(transitions(*moved, difference=self._settings.difference))
+        for number, (index, ticks) in enumerate(self._parts):
+            moved = rollout_population(
+                self._problem,
+                members,
+                index,
+                ticks,
+                replay=self._settings.replay,
+                moved=self._draws(len(members.theta), number),
+            )
+            found = transitions(*moved, difference=self._settings.difference)
+            blocks.append(found if found.shape[-1] == len(self._columns) else found[..., self._columns])
         raw = blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
         usable = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
         return self._scale.apply(raw), usable
+
+    def _draws(self, count: int, number: int) -> FloatArray | None:
+        """Return how far the start state of each member lies from a part's own one, (N, 2 C)."""
+        given = self._problem.start_std
+        if given is None:
+            return None
+        index, ticks = self._parts[number]
+        middle, std = drawn_start(self._problem, index, int(ticks.sample[0]), given)
+        draws = np.random.default_rng([self._seed, number]).standard_normal((count, len(std)))
+        return np.asarray(middle + draws * std)
 
 
 class EnergyFitness(Fitness):
     """Minus the energy distance between the recording's transitions and the member's own."""
 
     def _prepare(self, rng: np.random.Generator) -> None:
-        self._view = RolloutView(self._problem, self._settings)
+        self._view = RolloutView(self._problem, self._settings, rng)
         self._real = self._view.real.astype(np.float64)
 
     def score(self, members: Members) -> FloatArray:

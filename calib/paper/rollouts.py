@@ -44,6 +44,19 @@ class Ticks:
     def __len__(self) -> int:
         return len(self.start) - 1
 
+    def part(self, first: int, length: int, history: int) -> Ticks:
+        """Return ``length`` ticks from number ``first`` on, with at most ``history`` past ticks."""
+        end = first + length
+        known = np.concatenate([self.past, self.sample[:first]])
+        return Ticks(
+            self.start[first : end + 1],
+            self.sample[first : end + 1],
+            (0, *(tick - first for tick in self.changes if first < tick < end)),
+            self.lead,
+            self.number + first,
+            known[max(len(known) - history, 0) :],
+        )
+
     @property
     def action(self) -> IntArray:
         """Grid index at which each tick's action is read, (T,)."""
@@ -107,6 +120,29 @@ def control_ticks(
     )
 
 
+def drawn_ticks(
+    problem: Problem,
+    index: int,
+    most: int,
+    length: int,
+    rng: np.random.Generator,
+    history: int = 0,
+    *,
+    ran_before: bool = False,
+) -> list[Ticks]:
+    """Draw parts of ``length`` control periods from an episode, ``most`` periods in all, each with its past.
+
+    One begins in each of as many equal stretches of the episode, anywhere in it. Errors and the other
+    arguments are those of :func:`control_ticks`.
+    """
+    whole = control_ticks(problem, index, None, history, ran_before=ran_before)
+    length = min(length, len(whole))
+    count = max(round(min(most, len(whole)) / length), 1)
+    edges = np.linspace(0, len(whole) - length + 1, count + 1)
+    begins = (edges[:-1] + rng.random(count) * np.diff(edges)).astype(int)
+    return [whole.part(int(begin), length, history) for begin in begins]
+
+
 def _send(batch: ServoBatch, episode: SampledEpisode, at: int) -> None:
     batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
 
@@ -118,11 +154,13 @@ def rollout_population(
     ticks: Ticks,
     *,
     replay: bool = False,
+    moved: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Roll all members out from the recording's initial state (Algorithm 1, line 3).
 
     With ``replay``, members get the recorded targets, pi_0's actions on the robot, instead of pi_0's new
-    ones. The physics step may be longer than the device's period.
+    ones. ``moved`` is added to the start (position, velocity) of each member, (N, 2 C). The physics step may
+    be longer than the device's period.
 
     Returns:
         Positions and velocities at the ticks, (N, T + 1, J) each, and the action of each tick, (N, T, A).
@@ -137,7 +175,8 @@ def rollout_population(
     def roll(batch: ServoBatch, end: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         mine = slice(end - batch.count, end)
         part = Members(members.theta[mine], members.latency_s[mine])
-        return _roll(problem, batch, part, index, ticks, replay=replay)
+        own = None if moved is None else moved[mine]
+        return _roll(problem, batch, part, index, ticks, own, replay=replay)
 
     if len(batches) == 1:
         return roll(batches[0], len(members.theta))
@@ -148,14 +187,25 @@ def rollout_population(
 
 
 def _roll(
-    problem: Problem, batch: ServoBatch, members: Members, index: int, ticks: Ticks, *, replay: bool
+    problem: Problem,
+    batch: ServoBatch,
+    members: Members,
+    index: int,
+    ticks: Ticks,
+    moved: FloatArray | None,
+    *,
+    replay: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     episode = problem.episodes[index]
     batch.set_parameters(members.theta)
     starts, first = problem.starts[index], int(ticks.sample[0])
+    position, velocity = starts.position[first], starts.velocity[first]
+    if moved is not None:
+        C = len(position)
+        position, velocity = position + moved[:, :C], velocity + moved[:, C:]
     batch.set_state(
-        starts.position[first],
-        starts.velocity[first],
+        position,
+        velocity,
         reference=None if episode.reference is None else episode.reference[first],
     )
     if replay:

@@ -160,7 +160,7 @@ class _Unaligned(LogitStepper):
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         # Before anything else: without a policy nothing can be simulated.
-        self._view = RolloutView(log.problem, FitnessSettings(difference=True))
+        self._view = RolloutView(log.problem, FitnessSettings(difference=True), rng)
         super().__init__(log, rng, search)
         settings = self.settings
         width, outputs = self._view.real.shape[1], self._view.outputs

@@ -53,6 +53,8 @@ class CalibrateOptions(CalibrateSettings):
 
     range: Annotated[Triples, Range(-1e12, 1e12)] = ()
 
+    start_std: Annotated[Pairs, Range(0, 1e3)] = ()
+
     residual_std: tuple[str, ...] = ()
 
     out: Path | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,6 +66,31 @@ class Table:
         sound = np.isfinite(self.position).all(axis=1)
         columns = self.position[sound].T
         return np.stack([np.interp(time_s, self.time_s[sound], column) for column in columns], axis=1)
+
+    def in_order(self, joint_names: Sequence[str], actuated: Sequence[str] | None = None) -> Table:
+        """Return the recording with its joints, all of them, in another order.
+
+        Args:
+            joint_names: The order.
+            actuated: Order of the commands; None: that of the joints.
+        """
+        order = [self.joint_names.index(name) for name in joint_names]
+        arrays = {
+            name: values[:, order]
+            for name in ("position", "velocity", "effort")
+            if (values := getattr(self, name)) is not None
+        }
+        if actuated is None:
+            actuated = [name for name in joint_names if name in self.actuated]
+        columns = [self.actuated.index(name) for name in actuated]
+        return dataclasses.replace(
+            self,
+            joint_names=tuple(joint_names),
+            units=tuple(self.units[i] for i in order),
+            actuated=tuple(actuated),
+            target=self.target[:, columns],
+            **arrays,
+        )
 
     def rows(self, kept: npt.NDArray[np.bool_]) -> Table:
         """Return the recording with these samples only, (T,); commands stay."""

@@ -47,6 +47,9 @@ class ImportSettings(Checked):
     """The robot's name; by default the file name of the model, or of the first recording."""
     device_periods: Annotated[int, Range(1, 100_000)] = 1
     """Periods of the robot's own control loop between two samples: its rate divided by the recording's."""
+    policy: Path | None = None
+    """The policy (.onnx) that moved the robot: it gives the commands of recordings without any, and checks
+    the clock of recorded ones. The dataset keeps a copy, for methods that run it in every simulator."""
     force: bool = False
     """Import recordings although a check failed; the failed checks are noted in the dataset."""
     dry_run: bool = False
@@ -106,6 +109,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     kinds = None if facts is None else kinds_of(facts)
     tables = [table for path in foreign for table in load_tables(path, columns, joints, say, printed, kinds)]
     if facts is not None:
+        if config.policy is not None:
+            from deal_hw.policies.onnx_runtime import OnnxPolicy
+            from deal_hw.workflows.calibration.policy_commands import with_commands_of
+
+            tables = with_commands_of(OnnxPolicy(config.policy), tables, facts, say)
         tables = at_rest_without_commands(tables, facts, say)
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
     if episodes:
@@ -158,8 +166,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         from deal_hw.data.recording.dataset import Dataset
         from deal_hw.sim.robots.dataset_robot import store_robot
 
-        with Dataset.create_or_open(config.out, values, say):
+        with Dataset.create_or_open(config.out, values, say) as dataset:
             store_robot(robot, config.out)
+            if config.policy is not None:
+                dataset.keep_policy(config.policy, digest_of_file(config.policy))
     noted = [{"plausibility": problems, "source": source} for source in sources]
     return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
 
@@ -230,6 +240,10 @@ def _refuse_ignored(config: ImportSettings) -> None:
         refuse(given(config, default, names), "--robot says it")
     if config.description is not None:
         refuse(given(config, default, ("name", "device_periods")), "--description says it")
+    if config.policy is not None and config.robot is None and config.model is None:
+        raise ConfigurationError(
+            "--policy needs the robot that it moved: add --robot robot.yaml or --model robot.xml"
+        )
 
 
 def _takes_positions(facts: JointFacts | None, table: Table) -> bool:

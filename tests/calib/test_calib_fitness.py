@@ -152,9 +152,9 @@ def test_a_rollout_has_the_transitions_of_the_papers_table_4(
     """250 of the Go2, 600 of the hand, 200 of the others; a shorter recording gives all that it has."""
     d = make_case(task, "ideal", 3, 3.0, by_policy=True, seconds=seconds)
     problem = Problem(d.robot, d.space, [d.fit], threads=1, policy=d.policy)
-    view = RolloutView(problem, FitnessSettings())
+    view = RolloutView(problem, FitnessSettings(), np.random.default_rng(0))
     assert len(view.real) == pytest.approx(expected, abs=1)
-    assert len(RolloutView(problem, FitnessSettings(ticks=30)).real) == 30
+    assert len(RolloutView(problem, FitnessSettings(ticks=30), np.random.default_rng(0)).real) == 30
 
 
 def test_bad_names_and_settings_are_refused(problem: Problem) -> None:

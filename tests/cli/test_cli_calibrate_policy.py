@@ -14,7 +14,7 @@ from deal_hw.cli.calibrate import CalibrateDataset, CalibrateFiles, calibrate
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
-from deal_hw.errors import ConfigurationError, DatasetError, InsufficientDataError
+from deal_hw.errors import ConfigurationError, DatasetError, InsufficientDataError, UnknownNameError
 from deal_hw.policies.demonstration import PopulationDemonstration
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy import say_other_range
@@ -137,6 +137,28 @@ def test_a_policy_that_would_do_nothing_is_refused(dataset: Path) -> None:
     files = CalibrateFiles(model=Path("robot.xml"), data=(Path("a.csv"),), search="deal-paper")
     with pytest.raises(ConfigurationError, match="which is unknown for --model"):
         calibrate(files)
+
+
+def test_start_states_of_a_method_without_a_policy_are_refused(dataset: Path) -> None:
+    """They would do nothing; and a spread that no state is moved by."""
+    with pytest.raises(ConfigurationError, match="--starts would have no effect: eki runs no policy"):
+        settings(dataset, search="eki", starts="drawn").check()
+    with pytest.raises(ConfigurationError, match="--start-std would have no effect: deal runs no policy"):
+        settings(dataset, search=None, start_std=(("pole.velocity", 0.1),)).check()
+    with pytest.raises(ConfigurationError, match="--starts recorded moves no state"):
+        settings(dataset, starts="recorded", start_std=(("pole.velocity", 0.1),)).check()
+
+
+def test_start_states_are_drawn_where_that_is_asked(dataset: Path, tmp_path: Path) -> None:
+    """The result says so; an exact recording has them recorded otherwise, and names are checked."""
+    drawn = calibrate(settings(dataset, out=tmp_path, start_std=(("pole.velocity", 0.1),))).result
+    assert drawn.provenance["start_states"] == "drawn"
+    assert drawn.provenance["start_std"] == {"pole.velocity": 0.1}
+    plain = calibrate(settings(dataset, out=tmp_path)).result
+    assert plain.provenance["start_states"] == "recorded"
+    assert not np.array_equal(drawn.estimate, plain.estimate)
+    with pytest.raises(UnknownNameError, match=r"pole\.speed"):
+        calibrate(settings(dataset, out=tmp_path, start_std=(("pole.speed", 0.1),)))
 
 
 def test_a_policy_is_kept_once_and_as_it_was_checked(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_driver_loads_neither_torch_nor_mujoco_nor_scipy() -> None:
     code = (
         "import sys\n"
         "from deal_hw.clock import MonotonicClock\n"
-        "from deal_hw.robots import make_robot\n"
+        "from deal_hw.robots.connect import make_robot\n"
         "make_robot('cartpole', 'serial', 'x', MonotonicClock())\n"
         "print([m for m in ('torch', 'mujoco', 'scipy', 'pytest', 'rerun') if m in sys.modules])\n"
     )

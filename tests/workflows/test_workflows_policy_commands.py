@@ -12,6 +12,7 @@ import deal_hw
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.paper.rollouts import control_ticks, rollout_population
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
@@ -20,8 +21,10 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands
-from deal_hw.workflows.calibration.settings import FilesSettings
+from deal_hw.workflows.calibration.settings import FilesSettings, OwnDatasetSettings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
+from deal_hw.workflows.import_export import ImportSettings, import_recordings
+from deal_hw.workflows.robot import new_robot
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import required_policy
 
@@ -240,3 +243,107 @@ def test_simulators_go_on_from_the_policys_past(policy: OnnxPolicy, tmp_path: Pa
         wanted = episode.target[ticks.action[0]]
         assert len(ticks.past) == work.policy.history
         assert abs(action[0, 0, 0] - wanted[0]) < 0.01 * np.ptp(episode.target)
+
+
+@pytest.fixture(scope="module")
+def own(table: Table, policy: OnnxPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the states, a file with the commands 0.6 s late, and a robot.yaml of the cart-pole."""
+    folder = tmp_path_factory.mktemp("own")
+    states_file(table, folder)
+    late = table.target_at(table.time_s - 0.6)
+    assert table.velocity is not None
+    columns = np.column_stack([table.time_s, table.position, table.velocity, late])
+    np.savetxt(
+        folder / "late.csv",
+        columns[columns[:, 0] > 0.6],
+        delimiter=",",
+        header="time,cart.pos,pole.pos,cart.vel,pole.vel,cart.cmd",
+        comments="",
+    )
+    new_robot(
+        DESCRIPTION.mjcf,
+        out=folder / "robot.yaml",
+        name="balancer",
+        control_rate=DESCRIPTION.control_rate_hz,
+        state_rate=DESCRIPTION.state_rate_hz,
+    )
+    return folder
+
+
+def imported(
+    own: Path, out: Path, file: str, policy: Path | None = None, said: list[str] | None = None
+) -> Path:
+    """Import a file with the robot.yaml, and with the policy if one is given."""
+    config = ImportSettings(paths=(own / file,), out=out, robot=own / "robot.yaml", policy=policy)
+    import_recordings(config, (said if said is not None else []).append)
+    return out
+
+
+def test_a_dataset_of_states_alone_keeps_its_policy(own: Path, policy: OnnxPolicy, tmp_path: Path) -> None:
+    """`data import --policy` computes the commands; `calibrate DATASET` runs the kept policy by itself."""
+    said: list[str] = []
+    dataset = imported(own, tmp_path / "dataset", "states.csv", policy.path, said)
+    assert any("no commands, so they are those of" in line for line in said)
+    (kept,) = (dataset / "policies").iterdir()
+    assert kept.read_bytes() == policy.path.read_bytes()
+    printed: list[str] = []
+    found = deal_hw.calibrate(
+        dataset=dataset,
+        method="moments-unaligned",
+        free=("cart.frictionloss", "cart.servo_stiffness"),
+        population=8,
+        generations=2,
+        threads=1,
+        say=printed.append,
+    )
+    assert found.result.provenance["compares"] == "distributions"
+    assert found.inputs.policy is not None and found.inputs.policy.ran_before
+    assert found.inputs.robot.description.control_rate_hz == pytest.approx(DESCRIPTION.control_rate_hz)
+    assert any("not that of the 2 searched parameters" in line for line in printed)
+    named = OwnDatasetSettings(dataset=dataset, method="moments-unaligned", policy=policy.path, threads=1)
+    work = calibration_input(named, say=printed.append)
+    assert "both have one clock" in " ".join(printed)
+    np.testing.assert_array_equal(work.episodes[0].target, found.inputs.episodes[0].target)
+
+
+def test_a_datasets_wrong_clock_is_found_before_any_search(
+    own: Path, policy: OnnxPolicy, tmp_path: Path
+) -> None:
+    """Commands 0.6 s late are moved: at the import, or in the calibration."""
+    said: list[str] = []
+    dataset = imported(own, tmp_path / "moved", "late.csv", policy.path, said)
+    assert any("clocks are apart" in line for line in said)
+    moved = Dataset.open(dataset).read(0).trajectory
+    late = imported(own, tmp_path / "late", "late.csv")
+    settings = OwnDatasetSettings(dataset=late, search="eki", policy=policy.path, threads=1, window=0.2)
+    printed: list[str] = []
+    work = calibration_input(settings, say=printed.append)
+    assert any("clocks are apart" in line for line in printed)
+    begins = work.shown.sent_s[0] - Dataset.open(late).read(0).trajectory.sent_s[0]
+    assert abs(begins + 0.6) <= 1.5 / DESCRIPTION.control_rate_hz
+    at = np.searchsorted(moved.sent_s, 2.0), np.searchsorted(work.shown.sent_s, 2.0)
+    np.testing.assert_allclose(moved.position_target[at[0]], work.shown.position_target[at[1]])
+    assert work.policy is None
+
+
+def test_a_policy_that_is_not_the_datasets_is_refused(own: Path, policy: OnnxPolicy, tmp_path: Path) -> None:
+    """No policy for a method that runs one, another one, one of another size, a lost copy, no robot."""
+    plain = imported(own, tmp_path / "plain", "late.csv")
+    unaligned = OwnDatasetSettings(dataset=plain, method="deal-unaligned", threads=1)
+    with pytest.raises(ConfigurationError, match="that was imported without it; name it"):
+        calibration_input(unaligned)
+    other = required_policy("go2")
+    with pytest.raises(PolicyMismatchError, match="has the joints cart, pole, the policy FL_hip"):
+        calibration_input(dataclasses.replace(unaligned, policy=other))
+    with pytest.raises(ConfigurationError, match=r"commands of no joint.*--policy FILE\.onnx"):
+        imported(own, tmp_path / "none", "states.csv")
+    dataset = imported(own, tmp_path / "dataset", "states.csv", policy.path)
+    kept = dataclasses.replace(unaligned, dataset=dataset)
+    with pytest.raises(ConfigurationError, match="is not the policy with which the recordings were imported"):
+        calibration_input(dataclasses.replace(kept, policy=other))
+    next((dataset / "policies").iterdir()).unlink()
+    with pytest.raises(ConfigurationError, match=r"has no copy of the policy.*--policy FILE"):
+        calibration_input(kept)
+    without = ImportSettings(paths=(own / "states.csv",), out=tmp_path / "x", policy=policy.path)
+    with pytest.raises(ConfigurationError, match="--policy needs the robot that it moved"):
+        import_recordings(without)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -127,7 +128,7 @@ def to_trajectories(
     if not table.command_s.size:
         raise DatasetError(
             f"{table.name}: no commands; name the commanded positions as `target` in the column map, or "
-            "give the policy that moved the robot (calibrate --policy FILE.onnx)"
+            "give the policy that moved the robot (--policy FILE.onnx)"
         )
     clock, rows = _clock(table)
     period = period_of(table) if period_s is None else period_s
@@ -150,6 +151,19 @@ def to_trajectories(
         }
         recordings.append(_recording(table, rows[part], clock[part], period, gains, facts))
     return recordings
+
+
+def with_earlier_commands(trajectory: Trajectory, by_s: float) -> Trajectory:
+    """Return an imported recording whose commands were sent so much earlier [s]; its states stay."""
+    sent_s, device_s = trajectory.sent_s - by_s, trajectory.device_s
+    in_force = np.searchsorted(sent_s, device_s + 1e-9, side="right") - 1
+    known, at = in_force >= 0, np.maximum(in_force, 0)
+    return dataclasses.replace(
+        trajectory,
+        sent_s=sent_s,
+        command_sequence=np.where(known, trajectory.sent_sequence[at], -1),
+        command_age_s=np.where(known, np.maximum(device_s - sent_s[at], 0.0), np.nan),
+    )
 
 
 def _clock(table: Table) -> tuple[FloatArray, IntArray]:

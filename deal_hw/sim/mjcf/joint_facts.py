@@ -33,6 +33,7 @@ class JointFacts:
             efforts at the joint), (J, 2); infinite for none.
         full_effort: Effort of each joint's motor at its highest command, or at 1 without a ctrlrange, (J,)
             [N or N·m]; NaN without a motor, or with one whose force also depends on the motion.
+        gain: A command in a recording over the model's ctrl, (J,): a motor's effort at 1; 1 for all others.
     """
 
     names: tuple[str, ...]
@@ -43,6 +44,7 @@ class JointFacts:
     motor: Flags
     command: FloatArray
     full_effort: FloatArray
+    gain: FloatArray
 
 
 def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
@@ -86,10 +88,11 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
 
 def _actuation(
     model: mujoco.MjModel, column: Mapping[int, int]
-) -> tuple[Flags, Flags, FloatArray, FloatArray]:
-    """Return which joints have servos, which motors, command ranges and full efforts, by column."""
+) -> tuple[Flags, Flags, FloatArray, FloatArray, FloatArray]:
+    """Return which joints have servos, which motors, command ranges, full efforts and gains, by column."""
     servo, motor = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
     command, full_effort = np.tile([-np.inf, np.inf], (len(column), 1)), np.full(len(column), np.nan)
+    gain = np.ones(len(column))
     for actuator in range(model.nu):
         joint = joint_of(model, actuator)
         if joint not in column:
@@ -99,10 +102,10 @@ def _actuation(
         servo[at], motor[at] = servo[at] or closes, motor[at] or not closes
         limited, full = bool(model.actuator_ctrllimited[actuator]), 1.0
         if not closes:
-            full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
+            gain[at] = full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
             most = np.max(np.abs(model.actuator_ctrlrange[actuator])) if limited else 1.0
             if not model.actuator_biasprm[actuator].any():
                 full_effort[at] = abs(full) * most
         if limited:
             command[at] = np.sort(model.actuator_ctrlrange[actuator] * full)
-    return servo, motor, command, full_effort
+    return servo, motor, command, full_effort, gain

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,13 +100,32 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
     fit, held = choose_episodes(dataset, settings.episodes, settings.holdout, say)
     if held and settings.holdout_part is None:
         division = dataclasses.replace(division, share=0.0)
-    trajectories, telemetry = sound_recordings(
-        {i: dataset.read(i).trajectory for i in (*fit, *held)}, dataset.folder, settings.spikes, say
-    )
+    trajectories = {i: dataset.read(i).trajectory for i in (*fit, *held)}
+    policy = None
+    if settings.policy is not None or settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import imported_policy
+
+        given = None if settings.policy is None else Path(settings.policy)
+        policy = imported_policy(dataset, {i: t.metadata for i, t in trajectories.items()}, given)
+        if policy is None:
+            settings.refuse_unknown_policy()
     model = compile_mjcf(description.mjcf)
+    if policy is not None and settings.policy is not None:
+        from deal_hw.sim.mjcf.joint_facts import joint_facts
+        from deal_hw.workflows.calibration.policy_commands import with_policy_clock
+
+        trajectories = with_policy_clock(trajectories, policy, joint_facts(description.mjcf, model), say)
+    trajectories, telemetry = sound_recordings(trajectories, dataset.folder, settings.spikes, say)
     space = searched_space(settings, model, say)
     timestep = float(model.opt.timestep) if settings.physics_step is None else settings.physics_step
     rates = sampling(1.0 / description.state_rate_hz, timestep, settings.window)
+    in_loop = None
+    if policy is not None and settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import policy_of_files
+        from deal_hw.workflows.calibration.policy_commands import at_policy_rate
+
+        rates = at_policy_rate(rates, policy)
+        in_loop = functools.partial(policy_of_files, policy)
     description = dataclasses.replace(
         description,
         device_rate_hz=1.0 / rates.step_s,
@@ -126,6 +146,7 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="import recordings of other motion, and name their episodes with --holdout",
+        policy=None if in_loop is None else in_loop(description, space, settings.latency_range, say),
     )
 
 

@@ -109,7 +109,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
-        policy=None if in_loop is None else in_loop(description),
+        policy=None if in_loop is None else in_loop(description, space, settings.latency_range, say),
     )
 
 

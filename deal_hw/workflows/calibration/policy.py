@@ -11,6 +11,9 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.workflows.say import Say
 
+NOTED_POLICY = "policy"
+"""Entry of an imported recording's source: the policy whose commands it has, 16 digits of its SHA-256."""
+
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.parameters import ParameterSpace
@@ -42,6 +45,50 @@ def say_other_range(policy: PopulationDemonstration, robot: str, space: Paramete
         f"the policy that moved the robot was trained {what}. The DEAL paper trains it in the range that is "
         "searched. Simulators at the ends of the range may fall at once under this one, and then say little"
     )
+
+
+def imported_policy(
+    dataset: Dataset, runs: Mapping[int, Mapping[str, Any]], given: Path | None
+) -> OnnxPolicy | None:
+    """Return the policy that moved the robot in imported episodes; None: it is not known.
+
+    Args:
+        dataset: The dataset, with its own robot.yaml.
+        runs: Metadata of the episodes, by number.
+        given: The file that was named; None: the copy in the dataset, if they were imported with a policy.
+
+    Raises:
+        ConfigurationError: The file is another policy, or the dataset lost its copy.
+        InsufficientDataError: The episodes were imported with different policies.
+        PolicyError: The file cannot be run.
+    """
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    digests = sorted({str(run.get("import", {}).get(NOTED_POLICY, "")) for run in runs.values()})
+    if len(digests) > 1:
+        raise InsufficientDataError(
+            f"episodes {', '.join(map(str, runs))} were imported with {len(digests)} policies, or some "
+            "without one; name episodes of one policy (--episodes, --holdout)"
+        )
+    (noted,) = digests
+    if given is not None:
+        policy = OnnxPolicy(given)
+        if noted and not policy.digest.startswith(noted):
+            raise ConfigurationError(
+                f"{given} is not the policy with which the recordings were imported: its SHA-256 begins "
+                f"with {policy.digest[:16]}, that one's with {noted}; leave --policy out, or name the right "
+                "file"
+            )
+        return policy
+    if not noted:
+        return None
+    kept = dataset.policy_path(noted)
+    if not kept.is_file():
+        raise ConfigurationError(
+            f"{dataset.folder} has no copy of the policy that moved the robot (its SHA-256 begins with "
+            f"{noted}); name its file: --policy FILE"
+        )
+    return OnnxPolicy(kept)
 
 
 def recorded_policy(
@@ -98,14 +145,26 @@ def recorded_policy(
     return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))
 
 
-def policy_of_files(policy: OnnxPolicy, description: RobotDescription) -> PopulationDemonstration:
-    """Return the policy that moved the robot, for methods that run it in every simulator.
+def policy_of_files(
+    policy: OnnxPolicy,
+    description: RobotDescription,
+    space: ParameterSpace,
+    latency_range_s: tuple[float, float],
+    say: Say,
+) -> PopulationDemonstration:
+    """Return the policy that moved a user's robot, for methods that run it in every simulator.
+
+    Where nothing shows that it was trained in the range that is searched, a sentence tells it.
 
     Args:
-        policy: The policy. It gave or checked the commands of these recordings, so joints, units and
-            rate fit.
+        policy: The policy. It gave or checked the commands of these recordings, so joints, units and rate
+            fit.
         description: The robot by the user's model, sampled at the policy's rate.
+        space: What is searched.
+        latency_range_s: Range of the latency's search [s].
+        say: Called with the sentence.
     """
+    from deal_hw.parameters import ParameterDistribution
     from deal_hw.policies.demonstration import PopulationDemonstration
 
     spec = policy.spec
@@ -117,7 +176,16 @@ def policy_of_files(policy: OnnxPolicy, description: RobotDescription) -> Popula
         default_position=spec.default_position,
         control_rate_hz=spec.control_rate_hz,
     )
-    return PopulationDemonstration(policy, own, ran_before=True)
+    found = PopulationDemonstration(policy, own, ran_before=True)
+    trained = found.trained_under
+    if trained != ParameterDistribution.uniform(space, latency_range_s).digest():
+        what = f"names the distribution {trained}" if trained else "names no distribution of its training"
+        say(
+            f"the policy {what}, not that of the {len(space)} searched parameters. The DEAL paper trains it "
+            "in the range that is searched. Simulators at the ends of the range may fall at once under this "
+            "one, and then say little; --range-ratio narrows it"
+        )
+    return found
 
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:

@@ -7,14 +7,15 @@ recording of states alone can be aligned where the policy is known, and a wrong 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
-from deal_hw.types import FloatArray, IntArray
+from deal_hw.types import FloatArray, IntArray, Trajectory
+from deal_hw.workflows.calibration.policy import NOTED_POLICY
 
 if TYPE_CHECKING:
     from deal_hw.data.table import Table
@@ -73,9 +74,56 @@ def with_policy_commands(
         every = _samples_a_tick(policy.spec, period_s)
         choices = list(_choices(table, policy, every, period_s, facts))
         if table.command_s.size:
-            found.append(_checked(table, choices, period_s, name, say))
+            known = _checked(table, choices, period_s, name, say)
         else:
-            found.append(_given(table, choices, policy.spec, name, say))
+            known = _given(table, choices, policy.spec, name, say)
+        found.append(dataclasses.replace(known, source={**known.source, NOTED_POLICY: policy.digest[:16]}))
+    return found
+
+
+def with_commands_of(
+    policy: OnnxPolicy, tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
+) -> list[Table]:
+    """Return recordings as :func:`with_policy_commands` does, with the joints in their own order."""
+    found = with_policy_commands(tables, policy, facts, say)
+    return [table.in_order(own.joint_names) for table, own in zip(found, tables, strict=True)]
+
+
+def with_policy_clock(
+    trajectories: Mapping[int, Trajectory], policy: OnnxPolicy, facts: JointFacts, say: Callable[[str], None]
+) -> dict[int, Trajectory]:
+    """Return imported episodes whose commands have the states' clock, as :func:`with_policy_commands` does.
+
+    Args:
+        trajectories: Episodes by their numbers; commands of motors are shares of the actuators' range.
+        policy: The policy that moved the robot.
+        facts: The joints of its model.
+        say: Called with a sentence on each episode.
+
+    Raises:
+        PolicyMismatchError: The policy has other joints, or the same ones in another order.
+        ConfigurationError: See there.
+        DatasetError: See there.
+    """
+    from deal_hw.data.importing.grid import with_earlier_commands
+    from deal_hw.data.table import table_of
+
+    found = {}
+    for index, trajectory in trajectories.items():
+        table = table_of(trajectory, f"episode {index}")
+        if not table.command_s.size:
+            raise DatasetError(f"episode {index}: no command was ever in force; import the recording again")
+        gain = facts.gain[[facts.names.index(name) for name in table.actuated]]
+        table = dataclasses.replace(table, target=table.target * gain)
+        (checked,) = with_policy_commands([table], policy, facts, say)
+        if checked.joint_names != table.joint_names:
+            raise PolicyMismatchError(
+                f"the dataset's robot.yaml has the joints {', '.join(table.joint_names)}, the policy the "
+                f"same ones in the order {', '.join(checked.joint_names)}; write `joints` of robot.yaml in "
+                "the policy's order, and import again"
+            )
+        late_s = float(table.command_s[0] - checked.command_s[0])
+        found[index] = trajectory if late_s == 0 else with_earlier_commands(trajectory, late_s)
     return found
 
 
@@ -88,7 +136,7 @@ def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
     ratio = 1.0 / (spec.control_rate_hz * period_s)
     if spec.command_range or spec.observes_base or spec.clock_hz:
         raise ConfigurationError(
-            f"--policy with --model: the policy for {spec.robot!r} observes a base, a clock or a requested "
+            f"--policy: the policy for {spec.robot!r} observes a base, a clock or a requested "
             "velocity, which recordings of joints do not hold; record its commands, or leave --policy out"
         )
     if abs(ratio - round(ratio)) > WHOLE or round(ratio) < 1:
@@ -111,28 +159,13 @@ def _as_policy(table: Table, spec: PolicySpec) -> Table:
             f"{table.name} has the joints {', '.join(table.joint_names)}, the policy "
             f"{', '.join(spec.joint_names)}; give the policy that moved this robot"
         )
-    order = [table.joint_names.index(name) for name in spec.joint_names]
-    arrays = {
-        name: values[:, order]
-        for name in ("position", "velocity", "effort")
-        if (values := getattr(table, name)) is not None
-    }
-    units = tuple(table.units[i] for i in order)
     actuated = tuple(name for name in spec.joint_names if name in table.actuated)
     if actuated and set(actuated) != set(spec.actuated):
         raise PolicyMismatchError(
             f"{table.name} has commands of {', '.join(actuated)}, the policy of {', '.join(spec.actuated)}; "
             "give the policy that moved this robot, or name the other commands as `target` in the column map"
         )
-    columns = [table.actuated.index(name) for name in actuated]
-    return dataclasses.replace(
-        table,
-        joint_names=spec.joint_names,
-        units=units,
-        actuated=actuated,
-        target=table.target[:, columns],
-        **arrays,
-    )
+    return table.in_order(spec.joint_names)
 
 
 def _choices(

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -249,6 +249,8 @@ def calibrate_input(
         heldout_window_s=settings.heldout_window,
         policy=work.policy,
         smoothing_s=work.smoothing_s,
+        starts=settings.starts,
+        start_std=dict(settings.start_std),
     )
 
 
@@ -271,6 +273,8 @@ def calibrate_episodes(
     heldout_window_s: float = HELDOUT_WINDOW_S,
     smoothing_s: float | None = None,
     policy: PopulationPolicy | None = None,
+    starts: Literal["recorded", "drawn"] | None = "recorded",
+    start_std: Mapping[str, float] | None = None,
     thorough: bool = False,
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid, without writing results.
@@ -295,6 +299,10 @@ def calibrate_episodes(
         heldout_window_s: Held-out predictions restart from the measured state after this time [s].
         smoothing_s: Time over which start states are smoothed [s]; None for the default.
         policy: The policy that moved the robot all the time, for methods that need it.
+        starts: Where rollouts of the policy begin: in the recorded first state, or in drawn states; None:
+            drawn ones where the recordings do not show the first state well.
+        start_std: Standard deviation of entries of drawn start states, by name; others have the recordings'
+            own.
         thorough: Run checks to their end where they take more physics steps than the fits.
     """
     try:
@@ -304,7 +312,7 @@ def calibrate_episodes(
         from deal_hw.calib.data.noise import SMOOTHING_S
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
-        from deal_hw.calib.pipeline.methods import make_method
+        from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, make_method, search_of
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
@@ -325,6 +333,10 @@ def calibrate_episodes(
         policy=policy,
     )
     check_delays(problem)
+    if policy is not None and search_of(method) in CLOSED_LOOP_METHODS:
+        from deal_hw.workflows.calibration.starts import chosen_starts
+
+        problem.start_std = chosen_starts(problem, starts, start_std or {}, say)
 
     held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
 
@@ -352,7 +364,14 @@ def calibrate_episodes(
     from deal_hw.calib.validation.checks import latency_alarms
 
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
-    result = dataclasses.replace(result, alarms=alarms)
+    provenance = result.provenance
+    if problem.policy is not None and search_of(method) in CLOSED_LOOP_METHODS:
+        provenance = {
+            **provenance,
+            "start_states": "recorded" if problem.start_std is None else "drawn",
+            "start_std": dict(start_std or {}),
+        }
+    result = dataclasses.replace(result, alarms=alarms, provenance=provenance)
     if held_out is None:
         return result
     if len(result.space) > len(space):

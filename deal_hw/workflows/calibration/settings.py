@@ -100,6 +100,15 @@ class CalibrateSettings(Checked):
     generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of the search."""
 
+    starts: Literal["recorded", "drawn"] | None = None
+    """Start states of methods that run the recordings' policy in every simulator. recorded: the first state
+    of each recording. drawn: states drawn from the whole recordings, each moved by its uncertainty, with
+    rollouts of half a second or so. By default drawn where the first state is not known well."""
+
+    start_std: Annotated[Mapping[str, float] | Pairs, Range(0, 1e3)] = ()
+    """Uncertainty (standard deviation) of entries of drawn start states that the recordings do not show, as
+    NAME VALUE pairs [rad, m, rad/s, m/s], such as pole.velocity 0.5; by default that of the recordings."""
+
     checks: Literal["usual", "all"] = "usual"
     """Checks of recordings that the model does not explain: usual ends them where they take more physics
     steps than the fits; all runs them to their end."""
@@ -115,6 +124,7 @@ class CalibrateSettings(Checked):
 
     def __post_init__(self) -> None:
         self._keep(free=_words(self.free), known=_pairs(self.known), range=_triples(self.range))
+        self._keep(start_std=_pairs(self.start_std))
         super().__post_init__()
         low, high = self.latency_range
         if not low < high:
@@ -140,6 +150,13 @@ class CalibrateSettings(Checked):
                 f"fit does not explain the recordings, --search {self.method} --no-refine runs it alone"
             )
         check_method(self.named())
+        for option, there in (("--starts", self.starts is not None), ("--start-std", bool(self.start_std))):
+            if there and not self.in_closed_loop:
+                raise ConfigurationError(
+                    f"{option} would have no effect: {search_of(self.named())} runs no policy"
+                )
+        if self.starts == "recorded" and self.start_std:
+            raise ConfigurationError("--start-std would have no effect: --starts recorded moves no state")
         if self.search is not None and self.method and self.method not in SEARCHING:
             raise ConfigurationError(
                 f"--search would have no effect: --method {self.method} has no search inside"
@@ -323,25 +340,27 @@ class Recordings(Divided):
 class UserRobotSettings(Divided, CalibrateSettings):
     """Settings of a calibration of a user's robot."""
 
-    def check(self) -> None:
-        """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
-        super().check()
-        if self.in_closed_loop and not self.knows_policy:
+    def refuse_unknown_policy(self) -> None:
+        """Refuse a method that runs the policy that moved the robot, where nobody knows that policy.
+
+        Raises:
+            ConfigurationError: The method does.
+        """
+        if self.in_closed_loop:
             raise ConfigurationError(
                 f"{search_of(self.named())} runs the policy that moved the robot, which is unknown for "
-                "--model without --policy FILE.onnx, and for a dataset with its own robot.yaml; name it, or "
-                "use eki, deal or deal-paper-replay"
+                "--model without --policy FILE.onnx, and for a dataset with its own robot.yaml that was "
+                "imported without it; name it, or use eki, deal or deal-paper-replay"
             )
-
-    @property
-    def knows_policy(self) -> bool:
-        """Whether the policy that moved the robot was named."""
-        return False
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnDatasetSettings(UserRobotSettings, DatasetSettings):
     """Settings of a calibration from a dataset with its own robot.yaml."""
+
+    policy: File | None = None
+    """The policy (.onnx) that moved the robot: it checks the clock of recorded commands. Methods that run it
+    in every simulator need it, such as deal-unaligned; by default the one of `data import --policy`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,10 +384,11 @@ class FilesSettings(UserRobotSettings, Recordings):
     """The policy (.onnx) that moved the robot: it gives the commands of recordings without any, and checks
     the clock of recorded ones. Methods that run it in every simulator need it, such as deal-unaligned."""
 
-    @property
-    def knows_policy(self) -> bool:
-        """Whether the policy that moved the robot was named."""
-        return self.policy is not None
+    def check(self) -> None:
+        """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
+        super().check()
+        if self.policy is None:
+            self.refuse_unknown_policy()
 
     def __post_init__(self) -> None:
         self._keep(data=_listed(self.data), holdout=_listed(self.holdout), feet=_words(self.feet))
