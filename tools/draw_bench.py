@@ -10,9 +10,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from deal_hw.bench.figures import draw
+from deal_hw.bench.figures import draw, draw_transfer
 from deal_hw.bench.rows import load_rows
-from deal_hw.bench.transfer_figure import draw_transfer
 
 
 def draw_again(path: Path) -> Path | None:

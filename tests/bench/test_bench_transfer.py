@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from deal_hw.bench import transfer, transfer_target
+from deal_hw.bench.figures import draw_transfer
 from deal_hw.bench.rows import load_rows
 from deal_hw.bench.settings import Transfer
-from deal_hw.bench.transfer_figure import draw_transfer
 from deal_hw.cli.bench import bench
 from deal_hw.drivers.cartpole.description import SPACES
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError

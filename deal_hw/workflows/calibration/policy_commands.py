@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -20,8 +19,6 @@ from deal_hw.workflows.calibration.policy import NOTED_POLICY
 
 if TYPE_CHECKING:
     from deal_hw.data.table import Table
-    from deal_hw.description import RobotDescription
-    from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policy import PolicySpec
     from deal_hw.sim.mjcf.describe import Sampling
@@ -53,13 +50,13 @@ class _Ticks:
 
 
 def with_policy_commands(
-    tables: Sequence[Table], file: Path, facts: JointFacts, say: Callable[[str], None]
+    tables: Sequence[Table], policy: OnnxPolicy, facts: JointFacts, say: Callable[[str], None]
 ) -> list[Table]:
     """Return recordings with the commands of a policy, or with their own on the states' clock.
 
     Args:
         tables: Recordings; for a policy that observes a floating base with its place and orientation.
-        file: The policy that moved it, with its spec (.onnx).
+        policy: The policy that moved it.
         facts: The joints of its model.
         say: Called with a sentence on each recording.
 
@@ -67,42 +64,40 @@ def with_policy_commands(
         ConfigurationError: The policy is not for these joints, needs more than the recordings have, or runs
             at a rate at which they have no samples.
         DatasetError: Recorded commands are not those of the policy.
-        PolicyError: The file cannot be run.
+        PolicyError: It cannot be run.
     """
     from deal_hw.data.importing.grid import period_of
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
 
-    policy = OnnxPolicy(file)
-    found = []
+    found, name = [], policy.path.name
     for recorded in tables:
         table, period_s = _as_policy(recorded, policy.spec), period_of(recorded)
         _refuse_unseen(table, policy.spec)
         every = _samples_a_tick(policy.spec, period_s)
         choices = list(_choices(table, policy, every, period_s, facts))
         if table.command_s.size:
-            known = _checked(table, choices, period_s, file.name, say)
+            known = _checked(table, choices, period_s, name, say)
         else:
-            known = _given(table, choices, policy.spec, file.name, say)
+            known = _given(table, choices, policy.spec, name, say)
         found.append(dataclasses.replace(known, source={**known.source, NOTED_POLICY: policy.digest[:16]}))
     return found
 
 
 def with_commands_of(
-    file: Path, tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
+    policy: OnnxPolicy, tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
 ) -> list[Table]:
     """Return recordings as :func:`with_policy_commands` does, with the joints in their own order."""
-    found = with_policy_commands(tables, file, facts, say)
+    found = with_policy_commands(tables, policy, facts, say)
     return [table.in_order(own.joint_names) for table, own in zip(found, tables, strict=True)]
 
 
 def with_policy_clock(
-    trajectories: Mapping[int, Trajectory], file: Path, facts: JointFacts, say: Callable[[str], None]
+    trajectories: Mapping[int, Trajectory], policy: OnnxPolicy, facts: JointFacts, say: Callable[[str], None]
 ) -> dict[int, Trajectory]:
     """Return imported episodes whose commands have the states' clock, as :func:`with_policy_commands` does.
 
     Args:
         trajectories: Episodes by their numbers; commands of motors are shares of the actuators' range.
-        file: The policy that moved the robot, with its spec (.onnx).
+        policy: The policy that moved the robot.
         facts: The joints of its model.
         say: Called with a sentence on each episode.
 
@@ -121,7 +116,7 @@ def with_policy_clock(
             raise DatasetError(f"episode {index}: no command was ever in force; import the recording again")
         gain = facts.gain[[facts.names.index(name) for name in table.actuated]]
         table = dataclasses.replace(table, target=table.target * gain)
-        (checked,) = with_policy_commands([table], file, facts, say)
+        (checked,) = with_policy_commands([table], policy, facts, say)
         if checked.joint_names != table.joint_names:
             raise PolicyMismatchError(
                 f"the dataset's robot.yaml has the joints {', '.join(table.joint_names)}, the policy the "
@@ -133,35 +128,9 @@ def with_policy_clock(
     return found
 
 
-def at_policy_rate(rates: Sampling, file: Path) -> Sampling:
+def at_policy_rate(rates: Sampling, policy: OnnxPolicy) -> Sampling:
     """Return the sampling with the policy's control periods, for methods that run it in every simulator."""
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-
-    return dataclasses.replace(rates, samples_per_tick=_samples_a_tick(OnnxPolicy(file).spec, rates.period_s))
-
-
-def policy_of_files(file: Path, description: RobotDescription) -> PopulationDemonstration:
-    """Return the policy that moved the robot, for methods that run it in every simulator.
-
-    Args:
-        file: The policy. :func:`with_policy_commands` took it for these recordings, so joints, units and rate
-            fit.
-        description: The robot by the user's model, sampled by :func:`at_policy_rate`.
-    """
-    from deal_hw.policies.demonstration import PopulationDemonstration
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-
-    policy = OnnxPolicy(file)
-    spec = policy.spec
-    # A model's file has another name than the robot, and often another rest pose. Actions are around the
-    # policy's own pose, as in the commands that were computed.
-    own = dataclasses.replace(
-        description,
-        name=spec.robot,
-        default_position=spec.default_position,
-        control_rate_hz=spec.control_rate_hz,
-    )
-    return PopulationDemonstration(policy, own, ran_before=True)
+    return dataclasses.replace(rates, samples_per_tick=_samples_a_tick(policy.spec, rates.period_s))
 
 
 def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
