@@ -314,7 +314,9 @@ def test_a_datasets_wrong_clock_is_found_before_any_search(
     dataset = imported(own, tmp_path / "moved", "late.csv", policy.path, said)
     assert any("clocks are apart" in line for line in said)
     moved = Dataset.open(dataset).read(0).trajectory
-    late = imported(own, tmp_path / "late", "late.csv")
+    said.clear()
+    late = imported(own, tmp_path / "late", "late.csv", None, said)
+    assert any("hardly move together" in line and "have two clocks" in line for line in said)
     settings = OwnDatasetSettings(dataset=late, search="eki", policy=policy.path, threads=1, window=0.2)
     printed: list[str] = []
     work = calibration_input(settings, say=printed.append)
