@@ -134,6 +134,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
             "no model is given, so `calibrate` and `inspect` cannot use the dataset: add --model robot.xml "
             "or --robot robot.yaml"
         )
+    for name in [table.name for table in tables if table.base_position is not None]:
+        say(
+            f"{name}: base_position and base_velocity are not kept, as a dataset holds no place of a base. "
+            "To use them: deal-hw calibrate --model robot.xml --data FILE --columns columns.yaml"
+        )
     period = common_period(checked)
     if robot is None:
         recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]

@@ -22,7 +22,7 @@ from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
-from deal_hw.types import FloatArray, Trajectory
+from deal_hw.types import BaseTrajectory, FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
 from deal_hw.workflows.calibration.settings import (
     CalibrateSettings,
@@ -142,7 +142,8 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
     trajectories = [trajectory for _, trajectory in (*source.fitted, *source.held)]
     if division is not None:
         require_base(robot, source.feet, trajectories)
-    known_std, provenance = expected_std(settings.residual_std, robot), dict(source.provenance)
+    known_std = expected_std(settings.residual_std, robot, trajectories[0].base)
+    provenance = dict(source.provenance)
     fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
     if settings.named() in UNALIGNED_METHODS:
         say(
@@ -184,7 +185,11 @@ def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode
 
     robot = source.robot
     episode = align(trajectory, robot.description, name)
-    if robot.base is not None and trajectory.body is not None:
+    if robot.base is not None and trajectory.base is not None:
+        from deal_hw.sim.recordings.measured_base import with_measured_base
+
+        episode = with_measured_base(episode, robot, trajectory)
+    elif robot.base is not None and trajectory.body is not None:
         from deal_hw.sim.recordings.standing import with_sensed_base
 
         episode = with_sensed_base(episode, robot, trajectory, source.feet)
@@ -313,7 +318,9 @@ def usual_method(settings: CalibrateSettings, work: CalibrationInput, say: Say =
 
 
 def expected_std(
-    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
+    given: float | Mapping[str, float] | tuple[str, ...] | None,
+    robot: RobotModel,
+    base: BaseTrajectory | None = None,
 ) -> FloatArray | None:
     """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
 
@@ -321,6 +328,7 @@ def expected_std(
         given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
             line as words; None or no words: none is expected.
         robot: The robot.
+        base: Recorded place of its base; None: none.
 
     Raises:
         ConfigurationError: A number is missing, or is not above 0.
@@ -335,6 +343,8 @@ def expected_std(
         found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
         given = dict(zip(given[::2], found, strict=True))
     names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
+    moves = base is not None and bool(np.isfinite(base.velocity).all())
+    names += (("base_position",) if base is not None else ()) + (("base_velocity",) if moves else ())
     one = not isinstance(given, Mapping)
     values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
     for name in values:
@@ -356,6 +366,7 @@ def expected_std(
     std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
     if robot.base is not None:
         std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
+        std[:3], std[C : C + 3] = values.get("base_position", 1.0), values.get("base_velocity", 1.0)
     return std
 
 

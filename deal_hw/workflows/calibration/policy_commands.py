@@ -55,7 +55,7 @@ def with_policy_commands(
     """Return recordings with the commands of a policy, or with their own on the states' clock.
 
     Args:
-        tables: Recordings of a robot with a fixed base.
+        tables: Recordings; for a policy that observes a floating base with its place and orientation.
         policy: The policy that moved it.
         facts: The joints of its model.
         say: Called with a sentence on each recording.
@@ -71,6 +71,7 @@ def with_policy_commands(
     found, name = [], policy.path.name
     for recorded in tables:
         table, period_s = _as_policy(recorded, policy.spec), period_of(recorded)
+        _refuse_unseen(table, policy.spec)
         every = _samples_a_tick(policy.spec, period_s)
         choices = list(_choices(table, policy, every, period_s, facts))
         if table.command_s.size:
@@ -134,11 +135,6 @@ def at_policy_rate(rates: Sampling, policy: OnnxPolicy) -> Sampling:
 
 def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
     ratio = 1.0 / (spec.control_rate_hz * period_s)
-    if spec.command_range or spec.observes_base or spec.clock_hz:
-        raise ConfigurationError(
-            f"--policy: the policy for {spec.robot!r} observes a base, a clock or a requested "
-            "velocity, which recordings of joints do not hold; record its commands, or leave --policy out"
-        )
     if abs(ratio - round(ratio)) > WHOLE or round(ratio) < 1:
         raise ConfigurationError(
             f"--policy: it ran at {spec.control_rate_hz:g} Hz, and the recordings have {1 / period_s:.4g} "
@@ -146,6 +142,44 @@ def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
             f"{spec.control_rate_hz:g} Hz or a multiple of it"
         )
     return round(ratio)
+
+
+def _refuse_unseen(table: Table, spec: PolicySpec) -> None:
+    """Refuse a policy that observes what a recording does not hold."""
+    requested = any(term.quantity in ("command", "target_rotation") for term in spec.observation)
+    if requested or spec.clock_hz:
+        raise ConfigurationError(
+            f"--policy: the policy for {spec.robot!r} observes a clock, or a requested velocity or "
+            "orientation, which recordings do not hold; record its commands, or leave --policy out"
+        )
+    if spec.observes_base and (table.base_position is None or table.orientation is None):
+        raise ConfigurationError(
+            f"--policy: the policy for {spec.robot!r} observes a base, whose state {table.name} does not "
+            "hold; name base_position and orientation in the column map, record the commands, or leave "
+            "--policy out"
+        )
+
+
+def _states(table: Table, every: int) -> tuple[FloatArray, FloatArray]:
+    """Return the states that a policy observes: those of a base, if its place was recorded, then the joints.
+
+    Velocities that were not recorded are differences over one control period.
+    """
+    joint_speed = table.velocity if table.velocity is not None else _slopes(table, table.position, every)
+    if table.base_position is None or table.orientation is None:
+        return table.position, joint_speed
+    from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
+
+    place, speed, gyro = table.base_position, table.base_velocity, table.gyro
+    if speed is None:
+        speed = _slopes(table, place, every)
+    if gyro is None:
+        before, seconds = _earlier(table, every)
+        gyro = to_vector(table.orientation, table.orientation[before]) / seconds[:, None]
+    turn = to_vector(table.orientation, IDENTITY)
+    return np.concatenate([place, turn, table.position], axis=1), np.concatenate(
+        [speed, gyro, joint_speed], axis=1
+    )
 
 
 def _as_policy(table: Table, spec: PolicySpec) -> Table:
@@ -177,14 +211,14 @@ def _choices(
     spec = policy.spec
     centre, scale = _commands_of(spec, facts)
     number = np.round((table.time_s - table.time_s[0]) / period_s).astype(np.int64)
-    velocity = table.velocity if table.velocity is not None else _differences(table, every)
-    sound = np.isfinite(table.position).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    position, velocity = _states(table, every)
+    sound = np.isfinite(position).all(axis=1) & np.isfinite(velocity).all(axis=1)
     for first in range(every):
         rows = np.flatnonzero(sound & (number % every == first))
         builder = ObservationBuilder(spec)
         command = np.empty((len(rows), len(spec.actuated)))
         for k, row in enumerate(rows):
-            observation = builder.build(table.position[row], velocity[row])
+            observation = builder.build(position[row], velocity[row])
             action = np.clip(policy.act_batch(observation[None])[0], -1.0, 1.0)
             builder.record_action(action)
             command[k] = centre + scale * action
@@ -202,11 +236,16 @@ def _commands_of(spec: PolicySpec, facts: JointFacts) -> tuple[FloatArray, Float
     return np.array(spec.default_position)[places], scale
 
 
-def _differences(table: Table, every: int) -> FloatArray:
-    """Return velocities from differences to the sample one control period earlier: a policy sees no later."""
-    earlier = np.maximum(np.arange(len(table.time_s)) - every, 0)
-    seconds = np.maximum(table.time_s - table.time_s[earlier], 1e-9)
-    return np.asarray((table.position - table.position[earlier]) / seconds[:, None])
+def _earlier(table: Table, every: int) -> tuple[IntArray, FloatArray]:
+    """Return the sample one control period before each, (T,), and the time since, (T,) [s]."""
+    before = np.maximum(np.arange(len(table.time_s)) - every, 0)
+    return before, np.maximum(table.time_s - table.time_s[before], 1e-9)
+
+
+def _slopes(table: Table, values: FloatArray, every: int) -> FloatArray:
+    """Return differences to the sample one control period earlier, a second: a policy sees no later one."""
+    before, seconds = _earlier(table, every)
+    return np.asarray((values - values[before]) / seconds[:, None])
 
 
 def _checked(

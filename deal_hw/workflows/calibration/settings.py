@@ -327,7 +327,7 @@ class Recordings(Divided):
 
     feet: tuple[str, ...] = ()
     """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
-    recordings must contain the base's orientation and gyro."""
+    recordings must contain the base's orientation and gyro. Not with base_position in the column map."""
 
     leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
     """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
