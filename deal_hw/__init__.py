@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from deal_hw.workflows.running.settings import Go2LinkOptions as Go2LinkOptions
     from deal_hw.workflows.running.settings import LegOptions as LegOptions
     from deal_hw.workflows.running.settings import LinkOptions as LinkOptions
-    from deal_hw.workflows.running.simulated import SimulationOptions as SimulationOptions
+    from deal_hw.workflows.running.settings import SimulationOptions as SimulationOptions
     from deal_hw.workflows.stop import StopReport as StopReport
     from deal_hw.workflows.stop import stop as stop
     from deal_hw.workflows.train import Training as Training
@@ -57,8 +57,7 @@ _EXPORTS = {
     "workflows.replay": ("replay",),
     "workflows.robot": ("check_robot", "new_robot", "RobotCheck"),
     "workflows.running.report": ("RunReport",),
-    "workflows.running.settings": ("LinkOptions", "Go2LinkOptions", "LegOptions"),
-    "workflows.running.simulated": ("SimulationOptions",),
+    "workflows.running.settings": ("LinkOptions", "Go2LinkOptions", "LegOptions", "SimulationOptions"),
     "workflows.stop": ("stop", "StopReport"),
     "workflows.train": ("train", "Training"),
     "transport": ("WireOptions",),

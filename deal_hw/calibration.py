@@ -20,8 +20,6 @@ from deal_hw.types import FloatArray
 
 LATENCY_RANGE_S = (0.0, 0.04)
 """Default range of the latency search [s]."""
-SHORTEST_S = 1.0
-"""Shortest recording that can be calibrated [s]."""
 Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
 EXPLAINED_CHI2 = 1.3

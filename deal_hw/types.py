@@ -170,6 +170,19 @@ class BodyTrajectory:
 
 
 @dataclass(frozen=True, slots=True)
+class BaseTrajectory:
+    """Where a floating base is at the T samples of a recording, as motion capture or odometry report it.
+
+    Attributes:
+        position: Origin of the base's frame in the world, (T, 3) [m].
+        velocity: Its velocity in the world, (T, 3) [m/s]; NaN where nothing reports it.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Trajectory:
     """One recording: T state samples and C commands.
 
@@ -195,6 +208,7 @@ class Trajectory:
         events: Events.
         metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
         body: Further sensed state of a legged robot; None for other robots.
+        base: Place of a floating base; None where nothing reports it. Datasets do not hold it.
     """
 
     joint_names: tuple[str, ...]
@@ -218,6 +232,7 @@ class Trajectory:
     events: Sequence[Event] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict)
     body: BodyTrajectory | None = None
+    base: BaseTrajectory | None = None
 
     @property
     def duration_s(self) -> float:

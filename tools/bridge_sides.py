@@ -23,7 +23,7 @@ from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncod
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.transports.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import TransportError, TransportTimeoutError
-from deal_hw.robots import make_topic_transport
+from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions
 
 PERIOD_NS: Final = 2_000_000

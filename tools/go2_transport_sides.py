@@ -23,7 +23,7 @@ from deal_hw.control.loop.timing import LoopTiming, Spread
 from deal_hw.control.process.realtime import become_realtime, die_with_parent
 from deal_hw.drivers.transports.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import DealHwError, TransportError, TransportLostError, TransportTimeoutError
-from deal_hw.robots import make_topic_transport
+from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, TopicTransport, WireOptions
 
 _MARK: Final = struct.Struct("<IQ")

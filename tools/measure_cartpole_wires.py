@@ -21,7 +21,7 @@ from measuring import Rows, markdown, parser, read_rows, spread
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.realtime import priority
 from deal_hw.errors import TransportTimeoutError
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.testing.robot_suite import default_command
 from deal_hw.workflows.emulation.process import EmulatorProcess
 

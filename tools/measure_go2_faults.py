@@ -32,7 +32,7 @@ from deal_hw.drivers.go2.emulator.command_log import DAMPING, OFF, STIFF
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.transports.topics import LOW_COMMAND
 from deal_hw.motions.posture import PostureConfig
-from deal_hw.robots import make_topic_transport
+from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions
 
 POSTURE = PostureConfig(fold_s=0.3, rise_s=0.6, settle_s=0.2, lie_s=0.6)

@@ -30,7 +30,7 @@ import numpy as np
 from measuring import head, parser, program, write_document
 
 from deal_hw.bench.rows import Cells, Row, run_cells
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.drivers.go2.descriptions.driver import DRIVER, LEG_LIMITS
 from deal_hw.drivers.go2.emulator.profiles import PROFILES
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth

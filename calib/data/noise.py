@@ -265,7 +265,7 @@ def smooth_states(
     """Estimate the state at every sample; ``noise_std`` is that of (position, velocity), (2 C,).
 
     Noise-free positions and their reported velocities are kept: smoothing would only round off the impacts.
-    Measured angular velocities of a base are smoothed. Its rotation vector (coordinates ``rotation``) becomes
+    Measured velocities of a base are smoothed. Its rotation vector (coordinates ``rotation``) becomes
     zero, because its reference is the smoothed orientation. Unmeasured coordinates keep the episode's
     estimate.
 
@@ -283,11 +283,12 @@ def smooth_states(
     position, velocity, gain, slope_gain = _local_polynomials(episode.position, episode.period_s, smoothing_s)
     # Twice the propagated noise: kinks of stick-slip and saturation are not polynomials.
     std = 2 * np.concatenate([np.outer(gain, noise_std[:C]), np.outer(slope_gain, noise_std[:C])], axis=1)
-    gyro = [c for c in range(C)[rotation] if seen[C + c]]
-    if gyro:
-        smooth, _, gyro_gain, _ = _local_polynomials(episode.velocity[:, gyro], episode.period_s, smoothing_s)
-        position[:, gyro], velocity[:, gyro] = 0.0, smooth
-        std[:, C + np.array(gyro)] = 2 * np.outer(gyro_gain, noise_std[C:][gyro])
+    known = np.flatnonzero(seen[C:])
+    if known.size:
+        smooth, _, own_gain, _ = _local_polynomials(episode.velocity[:, known], episode.period_s, smoothing_s)
+        position[:, [c for c in range(C)[rotation] if seen[C + c]]] = 0.0
+        velocity[:, known] = smooth
+        std[:, C + known] = 2 * np.outer(own_gain, noise_std[C:][known])
     if episode.estimate_std is not None:
         estimate = np.broadcast_to(episode.estimate_std, (len(episode.sample), 2 * C))
         given = np.isfinite(estimate).all(axis=0) & ~seen

@@ -27,12 +27,12 @@ from deal_hw.calib.fit.intervals import IDENTIFIABLE_STD, WEAK_SHARE
 from deal_hw.calibration import CalibrationResult, std_words
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import DealHwError
+from deal_hw.motions.excitation.limits import largest_factor
 from deal_hw.motions.excitation.plan import (
     OF_FAMILY,
     ExcitationDesign,
     ExcitationPlan,
     describe_design,
-    largest_factor,
     make_plan,
 )
 from deal_hw.parameters import ParameterDistribution, ParameterSpace

@@ -13,12 +13,12 @@ import numpy as np
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, MakeBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.motions.excitation.limits import largest_factor
 from deal_hw.motions.excitation.plan import (
     FAMILIES,
     ExcitationDesign,
     ExcitationPlan,
     Family,
-    largest_factor,
     make_plan,
 )
 

@@ -16,11 +16,10 @@ from typing import Any
 
 from deal_hw.bench.figures import draw
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells, RowTable
+from deal_hw.bench.rows import Cells, RowTable, noted_in
 from deal_hw.bench.settings import FixedRange, Mismatch
 from deal_hw.bench.tables import line, print_summary
 from deal_hw.bench.tasks import check_tasks, make_case
-from deal_hw.errors import DealHwError
 
 PAPER_NOTE = "the truth is the nominal model: its values, kept without any recording, have an error of 0 here"
 KEY = (
@@ -140,7 +139,7 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
     if cell.protocol == "paper":
         row["note"] = PAPER_NOTE
     budget = usual_budget(cell.method, population, generations, refine=cell.refined)
-    try:
+    with noted_in(row):
         case = make_case(
             cell.task,
             cell.profile,
@@ -154,6 +153,4 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
         )
         part, _ = calibration_row(case, cell.method, budget, threads)
         row |= part
-    except DealHwError as err:
-        row["error"] = f"{type(err).__name__}: {err}"
     return row

@@ -20,11 +20,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, RowTable, printed
+from deal_hw.bench.rows import Cells, Row, RowTable, noted_in, printed
 from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget, Progress
 from deal_hw.documentation import page
-from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
+from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
@@ -236,11 +236,10 @@ def run_cell(
             config = PROBLEMS[name](_Ask(Path(folder), seed, real, settings.seconds))
         except ConfigurationError as err:
             return row | {"skipped": str(err)}
-        try:
+        with noted_in(row):
             work = calibration_input(config)
-            return row | _compared(work, config, seed, budget, threads, settings)
-        except DealHwError as err:
-            return row | {"error": f"{type(err).__name__}: {err}"}
+            row |= _compared(work, config, seed, budget, threads, settings)
+        return row
 
 
 @dataclass(slots=True)

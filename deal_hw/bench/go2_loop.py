@@ -16,16 +16,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, RowTable, per_parameter, printed
+from deal_hw.bench.rows import Cells, Row, RowTable, noted_in, per_parameter, printed
 from deal_hw.bench.scores import check_truth
 from deal_hw.bench.settings import Go2Loop
 from deal_hw.calibration import CalibrationResult
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth
-from deal_hw.errors import DealHwError
 from deal_hw.motions.scores.velocity_error import velocity_error
 from deal_hw.motions.velocity import ScriptVelocity
 from deal_hw.parameters import ParameterDistribution
@@ -89,7 +88,7 @@ def loop_row(
         "steps": steps,
         "error": "",
     }
-    try:
+    with noted_in(row):
         truth, out = draw_truth(profile, seed), folder / f"{profile}_{seed}"
         check_truth(walk_space(), truth.walk_parameters())
         out.mkdir(parents=True, exist_ok=True)
@@ -99,8 +98,6 @@ def loop_row(
         row |= calibration_part(found.result, truth)
         row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
         row |= policies_part(found.result, truth, steps, out, walks)
-    except DealHwError as err:
-        row["error"] = f"{type(err).__name__}: {err}"
     return row
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.figures import draw
-from deal_hw.bench.rows import Cells, RowTable, per_parameter
+from deal_hw.bench.rows import Cells, RowTable, noted_in, per_parameter
 from deal_hw.bench.scores import error_percent, fisher_std, interval_score, log_error_x100
 from deal_hw.bench.settings import Loop
 from deal_hw.bench.tables import line, print_summary
@@ -24,7 +24,7 @@ from deal_hw.calib.pipeline.methods import check_method, is_default
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
-from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.errors import ConfigurationError
 from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
@@ -210,12 +210,10 @@ def loop_row(
         "seed": seed,
         "error": "",
     }
-    try:
+    with noted_in(row):
         case = make_case("cartpole", profile, seed, range_ratio)
         part, result = calibration_row(case, method, Budget(refine=refine), threads)
         row |= part
         if refine and train:
             row |= transfer_row(case, result, folder)
-    except DealHwError as err:
-        row["error"] = f"{type(err).__name__}: {err}"
     return row

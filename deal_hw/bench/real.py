@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.figures import draw
-from deal_hw.bench.rows import Cells, RowTable
+from deal_hw.bench.rows import Cells, RowTable, noted_in
 from deal_hw.bench.settings import Real
 from deal_hw.bench.tables import line, print_real
 from deal_hw.calib.pipeline.methods import check_method, is_default
-from deal_hw.calibration import Budget
-from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
@@ -92,7 +92,7 @@ def split_name(source: CalibrateSettings) -> str:
     """Return the name of the held-out part."""
     judges: tuple[Any, ...] = ()
     if isinstance(source, DatasetSettings | FilesSettings):
-        judges = source.judges
+        judges = source.holdout
     if judges:
         return "+".join(Path(str(one)).stem for one in judges)
     part = source.holdout_part if isinstance(source, UserRobotSettings) else None
@@ -191,7 +191,7 @@ def run_cell(
         "seed": seed,
         "error": "",
     }
-    try:
+    with noted_in(row):
         result = calibrate_episodes(
             work.robot,
             work.space,
@@ -206,12 +206,15 @@ def run_cell(
             # An uncalibrated model has no latency.
             latency_s=0.0 if method == "nominal" else None,
         )
-    except DealHwError as err:
-        row["error"] = f"{type(err).__name__}: {err}"
-        return row
+        row |= result_part(result, window_s)
+    return row
+
+
+def result_part(result: CalibrationResult, window_s: float) -> dict[str, Any]:
+    """Return a result's part of the row; its held-out predictions restart after ``window_s`` [s]."""
     unit = result.space.normalize(result.estimate)
     rmse = result.provenance.get("heldout_rmse", {})
-    row |= {f"heldout_nrmse_{name}": value for name, value in result.heldout_nrmse.items()}
+    row: dict[str, Any] = {f"heldout_nrmse_{name}": value for name, value in result.heldout_nrmse.items()}
     row |= {f"heldout_rmse_{name}": value for name, value in rmse.get("mean", {}).items()}
     row |= {f"heldout_pooled_{name}": value for name, value in rmse.get("pooled", {}).items()}
     row |= {

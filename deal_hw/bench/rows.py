@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 import platform
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from deal_hw.calibration import CalibrationResult
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
-from deal_hw.errors import DatasetError, shown
+from deal_hw.errors import DatasetError, DealHwError, shown
 from deal_hw.reading import read_json
 from deal_hw.types import FloatArray
 
@@ -52,6 +53,15 @@ class RowTable:
     line: Callable[[Row], str]
     summary: Callable[[Sequence[Row]], None]
     draw: Callable[[Path, Sequence[Row]], None] | None = None
+
+
+@contextlib.contextmanager
+def noted_in(row: Row) -> Iterator[None]:
+    """Note an error in the row of a cell, so that the other cells still run."""
+    try:
+        yield
+    except DealHwError as err:
+        row["error"] = f"{type(err).__name__}: {err}"
 
 
 def printed(summary: Callable[[Sequence[Row]], Sequence[str]]) -> Callable[[Sequence[Row]], None]:

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row, RowTable, printed
+from deal_hw.bench.rows import Cells, Row, RowTable, noted_in, printed
 from deal_hw.bench.settings import Speed
 from deal_hw.bench.tasks import TASKS, Case, check_tasks, make_case
-from deal_hw.errors import DealHwError
 from deal_hw.workflows.calibration.run import calibrate_episodes
 
 if TYPE_CHECKING:
@@ -84,11 +83,9 @@ def run_cell(
     """
     row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
     row |= {"population": population, "generations": generations, "seed": seed, "error": ""}
-    try:
+    with noted_in(row):
         case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
         row |= measure(case, method, population, generations, threads)
-    except DealHwError as err:
-        row["error"] = f"{type(err).__name__}: {err}"
     return row
 
 

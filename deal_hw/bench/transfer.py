@@ -22,14 +22,14 @@ import numpy as np
 
 from deal_hw.bench.figures import draw_transfer
 from deal_hw.bench.loop import calibration_row
-from deal_hw.bench.rows import Cells, Row, RowTable, describe_call
+from deal_hw.bench.rows import Cells, Row, RowTable, describe_call, noted_in
 from deal_hw.bench.scores import error_percent, log_error_x100
 from deal_hw.bench.settings import Transfer
 from deal_hw.bench.tasks import TASKS, Case, check_tasks, make_case
 from deal_hw.bench.transfer_target import WORKS, judged, speed_profile, truth_of
 from deal_hw.calib.pipeline.methods import check_method, is_default, usual_budget
 from deal_hw.data.run_folder import git_commit
-from deal_hw.errors import CalibrationError, ConfigurationError, DealHwError, PolicyError
+from deal_hw.errors import CalibrationError, ConfigurationError, PolicyError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import training_task
@@ -280,7 +280,7 @@ def transfer_row(
         "command": " ".join(describe_call("deal-hw")["argv"]),
         "error": "",
     }
-    try:
+    with noted_in(row):
         base = base_policy(setting, say)
         target = draw_target(setting, seed, base)
         row |= _base_part(target)
@@ -296,8 +296,6 @@ def transfer_row(
         oracle = _oracle_return(setting, seed, target)
         row["return_oracle"] = oracle
         row["share_of_oracle"] = row["return"] / oracle if oracle > 0 else None
-    except DealHwError as err:
-        row["error"] = f"{type(err).__name__}: {err}"
     return row
 
 

@@ -24,7 +24,7 @@ from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpo
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.ranges import Checked, Range
-from deal_hw.robots import claim_name
+from deal_hw.robots.connect import claim_name
 from deal_hw.signals import reason, taken
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.common import run_until

@@ -10,24 +10,20 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import tyro
 
-from deal_hw.calibration import Progress
+from deal_hw.calibration import Progress, ProgressCallback
 from deal_hw.cli.calibrate_output import print_files, print_result, print_verdict, show_progress
 from deal_hw.cli.json_output import only_document
-from deal_hw.errors import ConfigurationError
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
-from deal_hw.workflows.calibration.best_so_far import (
-    CHECKPOINT,
-    SO_FAR,
-    check_resume,
-    saying_how_to_resume,
-    watching,
-)
+from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
-from deal_hw.workflows.calibration.run import CalibrateReport, calibrate_input, finish
+from deal_hw.workflows.calibration.run import CalibrateReport, ResultFolder, calibrate_input, finish
 from deal_hw.workflows.calibration.settings import (
     RECORDINGS,
     CalibrateSettings,
@@ -42,6 +38,9 @@ from deal_hw.workflows.calibration.settings import (
 from deal_hw.workflows.calibration.space import write_parameters
 from deal_hw.workflows.kinds import Kinds
 from deal_hw.workflows.say import silent, to_stderr
+
+if TYPE_CHECKING:
+    from deal_hw.sim.recordings.overlay import Overlay
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,16 +90,12 @@ class CalibrateDataset(CalibrateOptions, DriverDatasetSettings):
 
     dataset: tyro.conf.Positional[Path]
 
-    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
-
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOwnDataset(CalibrateOptions, OwnDatasetSettings):
     """Find the simulator parameters that explain a dataset with its own robot.yaml."""
 
     dataset: tyro.conf.Positional[Path]
-
-    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
 
     write_parameters: Path | None = None
     """Write a --parameters file for the robot's model, to edit, and end."""
@@ -189,14 +184,12 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     """
     config.check()
     say = silent if config.quiet else to_stderr
-    folder = _run_folder(config) / "calibration"
-    checkpoint = folder / CHECKPOINT
-    check_resume(checkpoint, config.resume)
+    results = ResultFolder(path=_run_folder(config) / "calibration", resume=config.resume)
     with _without_windows():
         work = calibration_input(config, say=say)
     method = usual_method(config, work, say)
     with (
-        saying_how_to_resume(checkpoint),
+        results.resumable(),
         watching(
             config.watch, config.watch_save, work.space, work.robot.description, work.shown, config.latency
         ) as watch,
@@ -214,16 +207,13 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             method,
             progress=progress,
             say=say,
-            checkpoint=checkpoint,
-            resume=config.resume,
-            keep=folder / SO_FAR,
+            results=results,
         )
     report = finish(
         work,
         result,
-        folder,
+        results,
         config.provenance,
-        checkpoint,
         page=config.report,
         advise=config.advise,
         threads=config.threads,
@@ -231,14 +221,63 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     if not config.quiet:
         print_result(report.result, work.advice, work.name)
         print_files(report.files)
-        _print_next(report, work.name, folder.parent)
+        _print_next(report, work.name, results.path.parent)
         print_verdict(report.result)
     return report
 
 
 @contextlib.contextmanager
+def watching(
+    watch: bool,
+    save: Path | None,
+    space: ParameterSpace,
+    description: RobotDescription,
+    trajectory: Trajectory,
+    latency_s: float | None,
+) -> Iterator[ProgressCallback | None]:
+    """Show a running search until the block ends.
+
+    Args:
+        watch: In a window, or in a browser if there is no desktop.
+        save: File of the view, .rrd.
+        space: The parameters.
+        description: The robot.
+        trajectory: The recording whose predictions are shown.
+        latency_s: The latency, if it is known [s].
+
+    Yields:
+        A function to call with the progress; None if nothing is shown.
+    """
+    if not watch and save is None:
+        yield None
+        return
+    try:
+        from deal_hw.viz.live import live_viewer
+        from deal_hw.viz.population_view import MEAN, population_view
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "viz") from err
+    from deal_hw.sim.recordings.overlay import compute_overlay
+
+    def predict(mean: FloatArray, population_latency_s: float) -> Overlay:
+        latency = population_latency_s if latency_s is None else latency_s
+        return compute_overlay(trajectory, description, space, {MEAN: mean}, latency_s=latency)
+
+    with contextlib.ExitStack() as stack:
+        address = ""
+        if watch:
+            address, page = stack.enter_context(live_viewer())
+            if page:
+                to_stderr(f"watch the search at {page}  (this machine only)")
+        yield stack.enter_context(population_view(space, address=address, save=save, predict=predict)).show
+
+
+@contextlib.contextmanager
 def _without_windows() -> Iterator[None]:
-    """Let MuJoCo be loaded without its library for windows, which starts a process to ask for its version."""
+    """Let MuJoCo be loaded without its library for windows, which starts a process to ask for its version.
+
+    Not from Python: a program that calls :func:`deal_hw.calibrate` may draw with ``mujoco.Renderer`` later,
+    which needs that library.
+    """
     name, given = "MUJOCO_GL", os.environ.get("MUJOCO_GL")
     os.environ.setdefault(name, "disable")
     try:

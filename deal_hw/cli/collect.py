@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from deal_hw.cli.piped import Quiet, is_quiet
 from deal_hw.cli.show import Terminal
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.workflows.collect import COLLECT, CollectSettings, CollectSimulatedSettings, run
 from deal_hw.workflows.running.report import RunReport
 

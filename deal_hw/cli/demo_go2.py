@@ -21,7 +21,7 @@ from deal_hw.cli.deploy import KINDS as DEPLOY
 from deal_hw.cli.deploy import deploy
 from deal_hw.cli.train import KINDS as TRAIN
 from deal_hw.cli.train import train
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.run_folder import RunFolder

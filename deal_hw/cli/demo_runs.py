@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Final
 
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.checks.suite import check as check_recording
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.errors import SafetyError, TransportError

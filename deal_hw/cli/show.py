@@ -6,14 +6,16 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from deal_hw.cli.design_excitation import note, print_design
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.control.process.channel import MAKING_PASSIVE, RUNNING, Beat
-from deal_hw.workflows.design_excitation import ExcitationReport
-from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.view import OnBeat, RunView, ignore
 from deal_hw.workflows.say import to_stderr
+
+if TYPE_CHECKING:
+    from deal_hw.workflows.design_excitation import ExcitationReport
+    from deal_hw.workflows.running.report import EpisodeReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +98,15 @@ class Terminal(RunView):
     def notify(self, done: int, total: int, text: str) -> None:
         """See :class:`RunView`."""
         if not self._quiet and sys.stderr.isatty():
+            from deal_hw.cli.design_excitation import note
+
             note(done, total, text)
 
     def designed(self, robot: str, report: ExcitationReport) -> None:
         """See :class:`RunView`."""
         if not self._quiet:
+            from deal_hw.cli.design_excitation import print_design
+
             print_design(robot, report)
 
     def ended(self, report: EpisodeReport) -> None:

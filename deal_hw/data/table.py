@@ -31,6 +31,8 @@ class Table:
         orientation: Base orientation, quaternion w x y z, (T, 4), or None.
         gyro: Angular velocity of the base in its own frame, (T, 3) [rad/s], or None.
         source: Origin and changes: plain JSON values.
+        base_position: Place of the base in the world, (T, 3) [m], or None.
+        base_velocity: Its velocity in the world, (T, 3) [m/s], or None.
     """
 
     joint_names: tuple[str, ...]
@@ -45,6 +47,8 @@ class Table:
     orientation: FloatArray | None
     gyro: FloatArray | None
     source: dict[str, Any]
+    base_position: FloatArray | None = None
+    base_velocity: FloatArray | None = None
 
     @property
     def actuated_index(self) -> tuple[int, ...]:
@@ -96,7 +100,7 @@ class Table:
         """Return the recording with these samples only, (T,); commands stay."""
         optional: dict[str, Any] = {
             name: values[kept]
-            for name in ("velocity", "effort", "orientation", "gyro")
+            for name in ("velocity", "effort", "orientation", "gyro", "base_position", "base_velocity")
             if (values := getattr(self, name)) is not None
         }
         return dataclasses.replace(self, time_s=self.time_s[kept], position=self.position[kept], **optional)

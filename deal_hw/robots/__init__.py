@@ -1,40 +1,28 @@
-"""The one table of robots and how each is reached: built-in robots and those of installed plug-ins."""
+"""The one table of robots: built-in ones and those of installed plug-ins; `connect` reaches them."""
 
-from deal_hw.robots.connect import (
-    adopt_robot,
+from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
+from deal_hw.robots.registry import (
     balanced,
-    carries_topics,
-    claim_name,
     default_transport,
+    driven_entry,
+    driven_robots,
     driver_description,
+    emulated_robots,
     has_task,
-    make_robot,
-    make_topic_transport,
-    make_transport,
-    on_this_computer,
-    other_wires,
+    is_known,
     parameter_spaces,
-    reached_over,
+    plug_ins,
     recorded_description,
     robot_description,
+    robot_entry,
+    robots,
     same_machine,
     trained_robots,
     training_task,
-    walked,
-    wire_claim,
-)
-from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
-from deal_hw.robots.registry import (
-    driven_entry,
-    driven_robots,
-    emulated_robots,
-    is_known,
-    plug_ins,
-    robot_entry,
-    robots,
     transport_entry,
     transport_of,
     transports,
+    walked,
 )
 
 __all__ = [
@@ -42,10 +30,7 @@ __all__ = [
     "RobotEntry",
     "TransportEntry",
     "WireEntry",
-    "adopt_robot",
     "balanced",
-    "carries_topics",
-    "claim_name",
     "default_transport",
     "driven_entry",
     "driven_robots",
@@ -53,14 +38,8 @@ __all__ = [
     "emulated_robots",
     "has_task",
     "is_known",
-    "make_robot",
-    "make_topic_transport",
-    "make_transport",
-    "on_this_computer",
-    "other_wires",
     "parameter_spaces",
     "plug_ins",
-    "reached_over",
     "recorded_description",
     "robot_description",
     "robot_entry",
@@ -72,5 +51,4 @@ __all__ = [
     "transport_of",
     "transports",
     "walked",
-    "wire_claim",
 ]

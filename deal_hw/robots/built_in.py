@@ -66,6 +66,7 @@ CARTPOLE: Final = RobotEntry(
     name="cartpole",
     api_version=API_VERSION,
     driver="deal_hw.drivers.cartpole.robots.robot:CartpoleRobot",
+    recorded="deal_hw.drivers.cartpole.description:DESCRIPTION",
     wires=(
         WireEntry(
             name="serial",

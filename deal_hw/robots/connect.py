@@ -1,33 +1,24 @@
-"""Robots and transports by name: what the verbs call, over the table of robots."""
+"""Connecting to robots by name: drivers, transports, and claims of a port."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.clock import Clock
-from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding
-from deal_hw.parameters import ParameterSpace
 from deal_hw.robots.entry import RobotEntry, TransportEntry, WireEntry
 from deal_hw.robots.registry import (
     driven_entry,
-    is_known,
-    robot_entry,
-    robots,
     transport_entry,
     transport_of,
     transports,
     wires,
 )
 from deal_hw.transport import WireOptions
-from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.motions.scores.balance import BalanceResult
-    from deal_hw.motions.scores.velocity_error import Track
-    from deal_hw.policies.tasks import TrainingTask
     from deal_hw.robot import Robot
     from deal_hw.transport import TopicTransport, Transport
 
@@ -208,109 +199,11 @@ def reached_over(name: str, transport_name: str) -> tuple[RobotEntry, WireEntry]
     )
 
 
-def driver_description(name: str) -> RobotDescription:
-    """Return the facts about a robot in its driver, with the rates of its real wire.
-
-    Raises:
-        UnknownNameError: There is no such robot.
-        ConfigurationError: It has a description, but no driver.
-    """
-    return driven_entry(name).driver_description()
-
-
-def recorded_description(name: str) -> RobotDescription:
-    """Return the facts under which a robot's recordings were made: its driver's, where it has one.
-
-    Raises:
-        UnknownNameError: There is no such robot.
-    """
-    return robot_entry(name).recorded_description()
-
-
-def robot_description(name: str) -> RobotDescription:
-    """Return the facts about a robot, whether it has a driver or not.
-
-    Raises:
-        UnknownNameError: There is no such robot.
-        MissingExtraError: The package that carries the robot's model is not installed.
-    """
-    return robot_entry(name).model_description()
-
-
-def parameter_spaces(name: str) -> Mapping[str, Callable[[], ParameterSpace]]:
-    """Return a robot's parameter sets by name; the first is the default.
-
-    Raises:
-        UnknownNameError: There is no such robot.
-        ConfigurationError: A plug-in's robot has none.
-    """
-    return robot_entry(name).parameter_spaces()
-
-
-def default_transport(name: str) -> str:
-    """Return the transport that usually reaches a robot.
-
-    Raises:
-        UnknownNameError: There is no such robot.
-        ConfigurationError: It has a description, but no driver.
-    """
-    return driven_entry(name).wires[0].name
-
-
-def same_machine(one: str, other: str) -> bool:
-    """Return whether two names are entries of one machine: a Go2 on a stand is a Go2.
-
-    A name may be that of a robot which is not installed any more, as in the note of a run.
-    """
-    return _machine(one) == _machine(other)
-
-
-def walked(name: str, trajectory: Trajectory) -> Track | None:
-    """Return a robot's path by its own sensors; None if it does not walk or has no odometry."""
-    entry = robot_entry(name)
-    found: Track | None = entry.load(entry.odometry)(trajectory) if entry.odometry else None
-    return found
-
-
-def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
-    """Return how well a robot's pole was held up; None without a pole, or without a duration."""
-    entry = robot_entry(name)
-    found: BalanceResult | None = entry.load(entry.balance)(trajectory) if entry.balance else None
-    return found
-
-
-def training_task(name: str) -> TrainingTask:
-    """Return a robot's training task.
-
-    Raises:
-        UnknownNameError: There is none; the message lists the robots.
-    """
-    if not has_task(name):
-        raise UnknownNameError("robot with a training environment", name, trained_robots())
-    entry = robot_entry(name)
-    found: TrainingTask = entry.load(entry.task)
-    return found
-
-
-def has_task(name: str) -> bool:
-    """Return whether a robot has a training task."""
-    return is_known(name) and bool(robot_entry(name).task)
-
-
-def trained_robots() -> tuple[str, ...]:
-    """Return the names of the robots with a training task."""
-    return tuple(sorted(entry.name for entry in robots().entries() if entry.task))
-
-
 def other_wires(name: str, port: str, transport_name: str, clock: Clock) -> Iterator[Finding]:
     """Yield findings on what else a port carries, after a robot did not answer there."""
     entry = driven_entry(name)
     if entry.other_wires:
         yield from entry.load(entry.other_wires)(port, transport_name, clock)
-
-
-def _machine(name: str) -> str:
-    return (robot_entry(name).machine if is_known(name) else "") or name
 
 
 def _simulator(entry: RobotEntry, simulator: str) -> Any:

@@ -110,6 +110,8 @@ class RobotEntry:
         wires: How it is reached; the first is the usual one.
         description: The :class:`~deal_hw.description.RobotDescription` for simulation and calibration, if it
             is not the driver's.
+        recorded: The driver's own description, where a module has it without the driver. "": that of the
+            driver.
         spaces: Parameter sets by name, each a function that returns the
             :class:`~deal_hw.parameters.ParameterSpace`; the first is the default.
         simulators: Drivers for simulators of others in place of the robot, by the simulator's name.
@@ -133,6 +135,7 @@ class RobotEntry:
     driver: Reference = ""
     wires: tuple[WireEntry, ...] = ()
     description: Reference = ""
+    recorded: Reference = ""
     spaces: Reference = ""
     simulators: Mapping[str, Reference] = field(default_factory=dict)
     machine: str = ""
@@ -184,7 +187,9 @@ class RobotEntry:
 
     def driver_description(self) -> RobotDescription:
         """Return the facts in the driver, with the rates of the real wire."""
-        found: RobotDescription = self.load(self.driver).description
+        found: RobotDescription = (
+            self.load(self.recorded) if self.recorded else self.load(self.driver).description
+        )
         return found
 
     def recorded_description(self) -> RobotDescription:

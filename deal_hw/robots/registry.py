@@ -8,16 +8,23 @@ name is the robot's or the transport's, its value ``module:ENTRY`` leads to a :c
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
+from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError, short
+from deal_hw.parameters import ParameterSpace
 from deal_hw.robots import built_in
 from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
+from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.velocity_error import Track
+    from deal_hw.policies.tasks import TrainingTask
 
 ROBOT_GROUP: Final = "deal_hw.robots"
 TRANSPORT_GROUP: Final = "deal_hw.transports"
@@ -247,3 +254,101 @@ def transport_of(wire: str) -> TransportEntry:
 def wires() -> tuple[WireEntry, ...]:
     """Return the wires of all robots."""
     return tuple(wire for entry in robots().entries() for wire in entry.wires)
+
+
+def driver_description(name: str) -> RobotDescription:
+    """Return the facts about a robot in its driver, with the rates of its real wire.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    return driven_entry(name).driver_description()
+
+
+def recorded_description(name: str) -> RobotDescription:
+    """Return the facts under which a robot's recordings were made: its driver's, where it has one.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    return robot_entry(name).recorded_description()
+
+
+def robot_description(name: str) -> RobotDescription:
+    """Return the facts about a robot, whether it has a driver or not.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        MissingExtraError: The package that carries the robot's model is not installed.
+    """
+    return robot_entry(name).model_description()
+
+
+def parameter_spaces(name: str) -> Mapping[str, Callable[[], ParameterSpace]]:
+    """Return a robot's parameter sets by name; the first is the default.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: A plug-in's robot has none.
+    """
+    return robot_entry(name).parameter_spaces()
+
+
+def default_transport(name: str) -> str:
+    """Return the transport that usually reaches a robot.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    return driven_entry(name).wires[0].name
+
+
+def same_machine(one: str, other: str) -> bool:
+    """Return whether two names are entries of one machine: a Go2 on a stand is a Go2.
+
+    A name may be that of a robot which is not installed any more, as in the note of a run.
+    """
+    return _machine(one) == _machine(other)
+
+
+def walked(name: str, trajectory: Trajectory) -> Track | None:
+    """Return a robot's path by its own sensors; None if it does not walk or has no odometry."""
+    entry = robot_entry(name)
+    found: Track | None = entry.load(entry.odometry)(trajectory) if entry.odometry else None
+    return found
+
+
+def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
+    """Return how well a robot's pole was held up; None without a pole, or without a duration."""
+    entry = robot_entry(name)
+    found: BalanceResult | None = entry.load(entry.balance)(trajectory) if entry.balance else None
+    return found
+
+
+def training_task(name: str) -> TrainingTask:
+    """Return a robot's training task.
+
+    Raises:
+        UnknownNameError: There is none; the message lists the robots.
+    """
+    if not has_task(name):
+        raise UnknownNameError("robot with a training environment", name, trained_robots())
+    entry = robot_entry(name)
+    found: TrainingTask = entry.load(entry.task)
+    return found
+
+
+def has_task(name: str) -> bool:
+    """Return whether a robot has a training task."""
+    return is_known(name) and bool(robot_entry(name).task)
+
+
+def trained_robots() -> tuple[str, ...]:
+    """Return the names of the robots with a training task."""
+    return tuple(sorted(entry.name for entry in robots().entries() if entry.task))
+
+
+def _machine(name: str) -> str:
+    return (robot_entry(name).machine if is_known(name) else "") or name

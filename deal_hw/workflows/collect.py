@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from deal_hw.calibration import SHORTEST_S
+from deal_hw.data.recording.excitation import SHORTEST_S
 from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.motions.excitation.level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
-from deal_hw.motions.excitation.plan import FAMILIES, read_plan
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import FROM_PYTHON, File, RunSeconds, Seed, from_settings, given, refuse
 from deal_hw.workflows.robot_kinds import robot_kinds
@@ -22,13 +21,10 @@ from deal_hw.workflows.running.settings import (
     LegOptions,
     RecordOptions,
     RunOptions,
+    SimulationOptions,
     legs_of,
     plan_options,
-)
-from deal_hw.workflows.running.simulated import (
-    SimulationOptions,
     require_simulation,
-    run_simulated,
 )
 from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
@@ -182,6 +178,8 @@ def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> Ru
 
 def _rehearse(config: CollectSimulatedSettings, view: RunView) -> RunReport:
     """Record a user's robot in simulation."""
+    from deal_hw.workflows.running.simulated import run_simulated
+
     require_simulation(config.robot, config.simulation)
     folder = dataset_folder(config.out, config.dataset)
     excite, seconds = _excitation(config, view)
@@ -223,7 +221,11 @@ def _refuse_ignored(config: CollectSettings | CollectSimulatedSettings) -> None:
 
 def _excitation(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> tuple[str, float]:
     """Return the excitation for the control process and its length [s]; an optimal one is computed here."""
-    if not config.excite or config.excite in FAMILIES:
+    if not config.excite:
+        return "", config.seconds
+    from deal_hw.motions.excitation.plan import FAMILIES, read_plan
+
+    if config.excite in FAMILIES:
         return config.excite, config.seconds
     if config.excite != "optimal":
         path = Path(config.excite)

@@ -12,7 +12,6 @@ from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.ranges import Checked, Range
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
-from deal_hw.workflows.calibration.policy_commands import with_commands_of
 from deal_hw.workflows.calibration.recordings import at_rest_without_commands, kinds_of, on_grid
 from deal_hw.workflows.options import given, refuse
 from deal_hw.workflows.robot import is_ours, load_robot, recorded_robot
@@ -111,7 +110,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     tables = [table for path in foreign for table in load_tables(path, columns, joints, say, printed, kinds)]
     if facts is not None:
         if config.policy is not None:
-            tables = with_commands_of(config.policy, tables, facts, say)
+            from deal_hw.policies.onnx_runtime import OnnxPolicy
+            from deal_hw.workflows.calibration.policy_commands import with_commands_of
+
+            tables = with_commands_of(OnnxPolicy(config.policy), tables, facts, say)
         tables = at_rest_without_commands(tables, facts, say)
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
     if episodes:
@@ -131,6 +133,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         say(
             "no model is given, so `calibrate` and `inspect` cannot use the dataset: add --model robot.xml "
             "or --robot robot.yaml"
+        )
+    for name in [table.name for table in tables if table.base_position is not None]:
+        say(
+            f"{name}: base_position and base_velocity are not kept, as a dataset holds no place of a base. "
+            "To use them: deal-hw calibrate --model robot.xml --data FILE --columns columns.yaml"
         )
     period = common_period(checked)
     if robot is None:

@@ -26,15 +26,12 @@ from deal_hw.workflows.running.settings import (
     Go2RunOptions,
     RecordOptions,
     RunOptions,
+    SimulationOptions,
     StandOptions,
     legs_of,
     plan_options,
     refuse_unrecorded,
-)
-from deal_hw.workflows.running.simulated import (
-    SimulationOptions,
     require_simulation,
-    run_simulated,
 )
 from deal_hw.workflows.running.supervised import dataset_folder, recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
@@ -210,6 +207,8 @@ def _rehearse(
     config: ReplaySimulatedSettings, view: RunView, robot: str, path: Path, trajectory: Trajectory
 ) -> RunReport:
     """Replay on a user's robot in simulation."""
+    from deal_hw.workflows.running.simulated import run_simulated
+
     require_simulation(robot, config.simulation)
     description = user_robot(robot).description()
     behaviour = ReplayBehaviour(trajectory, description)

@@ -15,7 +15,8 @@ from deal_hw.control.process.run_note import FoundRun, find_runs
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.errors import ConfigurationError, DealHwError, PortBusyError
 from deal_hw.ranges import Checked, Range
-from deal_hw.robots import claim_name, default_transport, make_robot, same_machine, wire_claim
+from deal_hw.robots import default_transport, same_machine
+from deal_hw.robots.connect import claim_name, make_robot, wire_claim
 from deal_hw.signals import taken
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import FROM_PYTHON, from_settings, given, refuse

@@ -29,6 +29,7 @@ from deal_hw.calib.validation.signatures import (
     SignatureResponse,
     held_direction,
     place_in_play,
+    signatures,
 )
 from deal_hw.calib.validation.wider_models import zero_parameters
 from deal_hw.calibration import Budget
@@ -230,6 +231,14 @@ def test_contact_comes_in_bursts() -> None:
     assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].do
     # Far above the noise they are a part of what the model lacks.
     assert not [f for f in name_causes(_evidence(wrong), 1000.0) if f.code == "contact"]
+
+
+def test_a_joint_without_a_drive_has_no_gear(small_problem: Callable[..., Problem]) -> None:
+    """Play was named at the pole of a cart, which swings freely."""
+    problem = small_problem()
+    fit = with_rows(refine(problem, problem.space.nominal, 0.0, (0.2,), iterations=1))
+    geared = {s.where for s in signatures(problem, fit) if s.cause in ("backlash", "lag")}
+    assert geared == {"cart"}
 
 
 def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:

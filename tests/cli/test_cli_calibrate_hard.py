@@ -82,6 +82,9 @@ def test_a_held_out_recording_worse_than_nominal_is_red(calibrated: Calibrated, 
     """The held-out robot is the nominal one, the fitted one another: the verdict says not to use it."""
     (tmp_path / "rec.csv").write_text(recording(4.0, 0.3, 1))
     (tmp_path / "other.csv").write_text(recording(3.0, 0.1, 2))
-    code, printed, _ = calibrated(DAMPING, "--holdout", str(tmp_path / "other.csv"))
+    code, printed, folder = calibrated(DAMPING, "--holdout", str(tmp_path / "other.csv"))
     assert code == EXIT_OK and "Traceback" not in printed
     assert "red: " in printed and "is worse. Do not use it. Check units" in printed
+    # Other programs read it in the result.
+    result = json.loads((folder / "result.json").read_text())
+    assert result["verdict"] == "red" and "Do not use it" in result["verdict_reason"]

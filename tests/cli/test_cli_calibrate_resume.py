@@ -23,7 +23,7 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
-from deal_hw.workflows.calibration.best_so_far import BestSoFar
+from deal_hw.workflows.calibration.run import BestSoFar
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 

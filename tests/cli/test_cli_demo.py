@@ -30,8 +30,7 @@ from deal_hw.cli.demo import KINDS as DEMO
 from deal_hw.cli.demo import Stages, demo
 from deal_hw.cli.demo_runs import deployed, numbers, recorded
 from deal_hw.cli.main import EXIT_INTERRUPTED, main
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.process.channel import RUNNING, Beat
+from deal_hw.control.process.channel import RUNNING, Beat, Outcome
 from deal_hw.control.process.supervisor import Supervisor
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.cartpole.description import k9_space

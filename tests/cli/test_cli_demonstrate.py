@@ -16,7 +16,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Identifiability
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.collect import collect
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth

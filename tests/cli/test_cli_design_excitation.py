@@ -15,7 +15,7 @@ import pytest
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
 from deal_hw.cli.design_excitation import design_excitation
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth

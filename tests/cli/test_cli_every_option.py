@@ -15,9 +15,10 @@ from verb_options import Option, dataclasses_of, kind_of, options
 
 from deal_hw.cli.main import VERBS, parse
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.errors import DealHwError
-from deal_hw.robots import driver_description, make_robot
+from deal_hw.robots import driver_description
+from deal_hw.robots.connect import make_robot
 from deal_hw.types import Trajectory
 from deal_hw.workflows import collect, deploy, replay
 from deal_hw.workflows.doctor import examine
@@ -145,9 +146,9 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def made(*arguments: Any) -> Any:
         did.append([value for value in arguments if not hasattr(value, "now_ns")])
-        from deal_hw import robots
+        from deal_hw.robots import connect, is_known
 
-        kind = robots.make_robot if robots.is_known(arguments[0]) else robots.make_topic_transport
+        kind = connect.make_robot if is_known(arguments[0]) else connect.make_topic_transport
         return kind(*arguments)
 
     monkeypatch.setattr(examine, "make_robot", made)

@@ -347,8 +347,8 @@ def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
         searched = (space.names, space.nominal, space.low, space.high)
         did.append(reported((robot.model, searched, episodes, holdout, rest)))
 
-    def finish(work: Any, result: Any, folder: Path, *settings: Any, **rest: Any) -> None:
-        did.append(reported((work.provenance, folder, settings, rest)))
+    def finish(work: Any, result: Any, results: Any, *settings: Any, **rest: Any) -> None:
+        did.append(reported((work.provenance, results, settings, rest)))
         raise SeenError
 
     @contextlib.contextmanager

@@ -16,7 +16,8 @@ from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
 from deal_hw.cli.design_excitation import design_excitation
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.record import CycleRecord

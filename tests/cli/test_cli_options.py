@@ -31,6 +31,7 @@ FINE_AT_ZERO = {
     "web_port",
     "at",
     "latency",
+    "start_std",
     "drop",
     "duplicate",
     "corrupt",

@@ -41,7 +41,7 @@ from deal_hw.errors import (
 from deal_hw.motions.excitation.waveforms import Sweep, random_steps
 from deal_hw.parameters import Parameter
 from deal_hw.reading import object_of, texts
-from deal_hw.robots import make_topic_transport, make_transport
+from deal_hw.robots.connect import make_topic_transport, make_transport
 from deal_hw.schema import from_values
 from deal_hw.sim.engine.single import SingleSimulation
 from deal_hw.sim.mjcf.changes import differences

@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.collect import collect
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.types import Status, Trajectory
 from deal_hw.workflows.emulation.process import EmulatorProcess

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice

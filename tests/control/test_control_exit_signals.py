@@ -19,7 +19,8 @@ from fakes.go2 import STIFF, FakeBench
 
 from deal_hw import signals
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.process.realtime import PARENT_DIED, kill_self_after, parent_is_gone
 from deal_hw.control.process.supervisor import PATIENCE_S, Supervisor
 from deal_hw.control.safety.passive import PassiveConfig, make_passive

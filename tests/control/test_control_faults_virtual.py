@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from fakes.linear_policy import LinearPolicy, feedback_spec
 
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot

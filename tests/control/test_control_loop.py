@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from fakes.linear_policy import LinearPolicy, feedback_spec
 
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.record import CycleFlag, CycleRecord

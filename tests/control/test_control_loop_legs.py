@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
-from deal_hw.control.process.channel import RUNNING
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, _newest
+from deal_hw.control.process.channel import RUNNING, Outcome
 from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision
 from deal_hw.data.recording.record import CycleRecord, encode

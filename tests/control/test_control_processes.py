@@ -27,8 +27,7 @@ from deal_hw.cli.deploy import KINDS as DEPLOY
 from deal_hw.cli.deploy import deploy
 from deal_hw.cli.replay import KINDS as REPLAY
 from deal_hw.cli.replay import replay
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.process.channel import RUNNING, Beat
+from deal_hw.control.process.channel import RUNNING, Beat, Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -530,7 +529,7 @@ def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy
         import deal_hw.policies.onnx_runtime
         from deal_hw.workflows.running.plan import RunPlan, make_behaviour
         from deal_hw.clock import MonotonicClock
-        from deal_hw.robots import make_robot
+        from deal_hw.robots.connect import make_robot
         robot = make_robot("cartpole", "serial", "/dev/null", MonotonicClock())
         make_behaviour(RunPlan(robot="cartpole", motion="chirp"), robot.description)
         heavy = ("torch", "mujoco", "scipy", "rerun", "pandas")

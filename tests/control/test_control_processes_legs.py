@@ -18,8 +18,7 @@ import pytest
 from fakes.logind import FakeLogind
 
 from deal_hw.cli.show import Terminal
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.process.channel import RUNNING, Beat
+from deal_hw.control.process.channel import RUNNING, Beat, Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError

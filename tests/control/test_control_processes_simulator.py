@@ -12,12 +12,12 @@ import pytest
 from fakes.unitree_mujoco import PUBLISHED, SUBSCRIBED, UnitreeMujoco
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import SafetyError, TransportTimeoutError, VersionMismatchError
 from deal_hw.motions.posture import PostureConfig
-from deal_hw.robots import make_topic_transport
+from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions
 from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.running.plan import RunPlan

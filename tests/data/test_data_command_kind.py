@@ -118,3 +118,11 @@ def test_real_servos(path: Path) -> None:
     legs = [f"{leg}_{part}" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
     (made,) = load_tables(path, joints=legs if "go2" in str(path) else None)
     assert command_kind(made, servo=True).severity is Severity.OK
+
+
+@pytest.mark.parametrize("factor", [180 / np.pi, np.pi / 180, 1000.0])
+def test_positions_in_another_unit_are_no_efforts(factor: float) -> None:
+    """The check of the units says degrees or millimetres; "look like efforts" beside it is wrong."""
+    command = wish(12.0, 0)
+    made = table(factor * play(command, servo=True, seed=0), command)
+    assert command_kind(made, servo=True).severity is Severity.OK

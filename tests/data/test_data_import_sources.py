@@ -383,7 +383,7 @@ def test_unknown_files(tmp_path: Path) -> None:
     ):
         with pytest.raises(DatasetError, match=words):
             read_channels(path)
-    with pytest.raises(DatasetError, match="cannot tell which channel is the time"):
+    with pytest.raises(DatasetError, match=r"cannot tell which channel is the time.*\(in Python: columns=\)"):
         load_tables(write(tmp_path / "a.csv", "a,b\n1,2\n"))
     with pytest.raises(DatasetError, match="cannot tell which channels are the joints' positions"):
         load_tables(write(tmp_path / "b.csv", "time,b\n1,2\n"))
@@ -401,7 +401,7 @@ def test_a_map_without_a_time_takes_the_channel_of_that_name(tmp_path: Path) -> 
 
 def test_doubled_columns_and_other_kinds_of_file_are_named(tmp_path: Path) -> None:
     """Which column is doubled; that a file called .mcap is none; that one ends in the middle."""
-    with pytest.raises(DatasetError, match="'b', 'c' stand there more than once"):
+    with pytest.raises(DatasetError, match="there more than once: 'b', 'c'"):
         load_tables(write(tmp_path / "a.csv", "time,b,c,b,c\n0,1,2,3,4\n"))
     with pytest.raises(DatasetError, match=r"begins with b'no mcap', MCAP with .*another kind of file"):
         read_mcap(write(tmp_path / "x.mcap", "no mcap"))

@@ -94,7 +94,7 @@ def test_a_guess_is_printed_as_the_map_that_says_the_same(header: str, tmp_path:
     path.write_text(f"{header}\n0,1,2,3,4,5\n10,6,8,7,9,10\n", encoding="utf-8")
     output: list[str] = []
     (guessed,) = load_tables(path, joints=JOINTS, say=output.append)
-    assert "no column map given; this one was guessed" in output[0]
+    assert "no column map given; this one was guessed" in output[0] and "in Python by columns=" in output[0]
     text = "\n".join(line for line in output if line.startswith("  "))
     (tmp_path / "columns.yaml").write_text(text, encoding="utf-8")
     (read,) = load_tables(path, read_column_map(tmp_path / "columns.yaml"), JOINTS)

@@ -383,7 +383,7 @@ def test_the_chip_moves_the_same_robot_as_the_float_servo() -> None:
 def test_the_emulator_runs_the_chip_behind_a_port(tmp_path: Path) -> None:
     """`emulate cartpole --firmware avr` as a process: connect, home, and the serial number of seed 3."""
     from deal_hw.clock import MonotonicClock
-    from deal_hw.robots import make_robot
+    from deal_hw.robots.connect import make_robot
     from deal_hw.workflows.emulation.process import EmulatorProcess
 
     with EmulatorProcess(

@@ -41,7 +41,7 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
-from deal_hw.robots import claim_name, make_robot
+from deal_hw.robots.connect import claim_name, make_robot
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, OneBadFrame, RecordFaults
 from deal_hw.testing.pseudo_terminal import PseudoTerminal

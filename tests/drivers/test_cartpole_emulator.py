@@ -24,7 +24,7 @@ from deal_hw.errors import (
     TransportLostError,
     UnknownNameError,
 )
-from deal_hw.robots import adopt_robot, make_robot
+from deal_hw.robots.connect import adopt_robot, make_robot
 from deal_hw.testing.pseudo_terminal import PseudoTerminal
 from deal_hw.testing.robot_suite import default_command
 from deal_hw.transport import Message

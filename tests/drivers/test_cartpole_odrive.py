@@ -31,7 +31,7 @@ from deal_hw.errors import (
     TransportTimeoutError,
     WrongDeviceError,
 )
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command

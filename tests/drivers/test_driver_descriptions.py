@@ -17,14 +17,10 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.robots import (
-    make_robot,
-    parameter_spaces,
-    robot_description,
-    robots,
-)
+from deal_hw.robots import parameter_spaces, robot_description, robots
 from deal_hw.robots.ant import description as ant_model
 from deal_hw.robots.ant.description import DEFAULT, PAPER
+from deal_hw.robots.connect import make_robot
 from deal_hw.robots.humanoid import description as humanoid_model
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model, model_with

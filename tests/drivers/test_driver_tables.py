@@ -8,16 +8,8 @@ import pytest
 from deal_hw.clock import MonotonicClock
 from deal_hw.errors import ConfigurationError, PortNotFoundError, UnknownNameError
 from deal_hw.robot import Robot
-from deal_hw.robots import (
-    adopt_robot,
-    carries_topics,
-    default_transport,
-    driver_description,
-    make_robot,
-    robot_description,
-    robots,
-    transports,
-)
+from deal_hw.robots import default_transport, driver_description, robot_description, robots, transports
+from deal_hw.robots.connect import adopt_robot, carries_topics, make_robot
 
 pytestmark = pytest.mark.real_time
 
@@ -88,7 +80,7 @@ def test_a_driver_loads_neither_torch_nor_mujoco_nor_scipy() -> None:
     code = (
         "import sys\n"
         "from deal_hw.clock import MonotonicClock\n"
-        "from deal_hw.robots import make_robot\n"
+        "from deal_hw.robots.connect import make_robot\n"
         "make_robot('cartpole', 'serial', 'x', MonotonicClock())\n"
         "print([m for m in ('torch', 'mujoco', 'scipy', 'pytest', 'rerun') if m in sys.modules])\n"
     )

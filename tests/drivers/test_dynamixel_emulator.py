@@ -35,7 +35,7 @@ from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError
 from deal_hw.findings import Finding, Severity
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.transport import Transport
 
 pytestmark = pytest.mark.real_time

@@ -23,7 +23,7 @@ from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.drivers.transports import topics
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
-from deal_hw.robots import make_topic_transport
+from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions
 from deal_hw.workflows.emulation.go2 import free_port, summary
 from deal_hw.workflows.emulation.process import EmulatorProcess

@@ -11,8 +11,8 @@ from fakes.go2 import STIFF, FakeGo2
 from fakes.unitree_mujoco import UnitreeMujoco
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.process.channel import RUNNING
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.process.channel import RUNNING, Outcome
 from deal_hw.control.safety.passive import make_passive
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.go2.descriptions import on_stand
@@ -38,7 +38,7 @@ from deal_hw.errors import (
 )
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.types import RobotState, Status
 

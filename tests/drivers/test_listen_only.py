@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
@@ -21,7 +22,7 @@ from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, UnknownNameError
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.robot import Robot
-from deal_hw.robots import adopt_robot, make_robot
+from deal_hw.robots.connect import adopt_robot, make_robot
 from deal_hw.transport import Message, Transport
 
 pytestmark = pytest.mark.real_time

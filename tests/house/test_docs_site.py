@@ -80,7 +80,7 @@ def test_each_alarm_is_on_its_page(pages: dict[str, str]) -> None:
     assert {path for path, *_ in found} >= {
         "calib/fit/intervals.py",
         "calib/validation/checks.py",
-        "deal_hw/workflows/calibration/best_so_far.py",
+        "deal_hw/workflows/calibration/run.py",
     }
     assert all(part.strip("… ") for row in found for part in row)
     page = pages["reference/alarms.md"]

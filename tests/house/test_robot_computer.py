@@ -60,7 +60,7 @@ from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
 from deal_hw.control.safety.safety import Safety
-from deal_hw.robots import make_robot, make_transport
+from deal_hw.robots.connect import make_robot, make_transport
 from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.errors import DealHwError
 from deal_hw.transport import WireOptions

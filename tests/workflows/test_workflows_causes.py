@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.process.supervisor import ChildEnd
-from deal_hw.robots import on_this_computer
+from deal_hw.robots.connect import on_this_computer
 from deal_hw.workflows import causes
 from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
 from deal_hw.workflows.running.episode import account

@@ -17,6 +17,7 @@ from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyMismatchError
+from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.mjcf.joint_facts import JointFacts, joint_facts
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.policy_commands import with_policy_commands
@@ -34,9 +35,9 @@ STATES_A_TICK = 4
 
 
 @pytest.fixture(scope="module")
-def policy() -> Path:
+def policy() -> OnnxPolicy:
     """The policy that moves the robot."""
-    return required_policy("cartpole")
+    return OnnxPolicy(required_policy("cartpole"))
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +47,9 @@ def facts() -> JointFacts:
 
 
 @pytest.fixture(scope="module")
-def table(policy: Path) -> Table:
+def table(policy: OnnxPolicy) -> Table:
     """Five seconds of balancing with noise and a latency, as a file of states and commands would be read."""
-    return balanced(policy, "sensor")
+    return balanced(policy.path, "sensor")
 
 
 def balanced(policy: Path, profile: str) -> Table:
@@ -91,7 +92,9 @@ def states_file(table: Table, folder: Path) -> Path:
     return file
 
 
-def test_states_alone_get_the_commands_that_were_sent(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_states_alone_get_the_commands_that_were_sent(
+    table: Table, policy: OnnxPolicy, facts: JointFacts
+) -> None:
     """The sample of each period that the policy saw is found, and its commands are those of the run."""
     printed: list[str] = []
     (found,) = with_policy_commands([without_commands(table)], policy, facts, printed.append)
@@ -104,7 +107,7 @@ def test_states_alone_get_the_commands_that_were_sent(table: Table, policy: Path
     assert f"every {STATES_A_TICK} later" in printed[0] and "50 Hz" in printed[0]
 
 
-def test_differences_stand_in_for_velocities(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_differences_stand_in_for_velocities(table: Table, policy: OnnxPolicy, facts: JointFacts) -> None:
     """Without recorded velocities they are those over one control period, as this robot reports them."""
     bare = dataclasses.replace(without_commands(table), velocity=None)
     (found,) = with_policy_commands([bare], policy, facts, lambda _: None)
@@ -112,7 +115,7 @@ def test_differences_stand_in_for_velocities(table: Table, policy: Path, facts: 
     assert np.corrcoef(found.target[:, 0], known.target[:, 0])[0, 1] > 0.95
 
 
-def test_commands_on_the_states_clock_stay(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_commands_on_the_states_clock_stay(table: Table, policy: OnnxPolicy, facts: JointFacts) -> None:
     """They are the policy's, soon after the states that it saw; nothing is changed."""
     printed: list[str] = []
     (found,) = with_policy_commands([table], policy, facts, printed.append)
@@ -122,7 +125,7 @@ def test_commands_on_the_states_clock_stay(table: Table, policy: Path, facts: Jo
 
 @pytest.mark.parametrize("apart_s", [-0.8, 0.6])
 def test_another_clock_is_found_and_undone(
-    table: Table, policy: Path, facts: JointFacts, apart_s: float
+    table: Table, policy: OnnxPolicy, facts: JointFacts, apart_s: float
 ) -> None:
     """A recording whose commands come from another clock is aligned, and the distance is reported."""
     printed: list[str] = []
@@ -135,21 +138,21 @@ def test_another_clock_is_found_and_undone(
     assert "clocks are apart" in printed[0]
 
 
-def test_commands_of_another_policy_are_refused(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_commands_of_another_policy_are_refused(table: Table, policy: OnnxPolicy, facts: JointFacts) -> None:
     """Commands that no shift in time explains: reported before any fit, with what to do."""
     wrong = dataclasses.replace(table, target=table.target[::-1])
     with pytest.raises(DatasetError, match=r"rec.csv: the recorded commands are not those of .*column map"):
         with_policy_commands([wrong], policy, facts, lambda _: None)
 
 
-def test_commands_that_never_change_are_refused(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_commands_that_never_change_are_refused(table: Table, policy: OnnxPolicy, facts: JointFacts) -> None:
     """They cannot be the policy's."""
     still = dataclasses.replace(table, target=np.zeros_like(table.target))
     with pytest.raises(DatasetError, match="not those of"):
         with_policy_commands([still], policy, facts, lambda _: None)
 
 
-def test_joints_in_another_order_are_sorted(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_joints_in_another_order_are_sorted(table: Table, policy: OnnxPolicy, facts: JointFacts) -> None:
     """The recording follows the policy's order."""
     turned = dataclasses.replace(
         table,
@@ -163,7 +166,7 @@ def test_joints_in_another_order_are_sorted(table: Table, policy: Path, facts: J
     np.testing.assert_array_equal(found.position, table.position)
 
 
-def test_a_policy_that_does_not_fit_is_refused(table: Table, policy: Path, facts: JointFacts) -> None:
+def test_a_policy_that_does_not_fit_is_refused(table: Table, policy: OnnxPolicy, facts: JointFacts) -> None:
     """Other joints, a rate without a sample for each command, a policy of a walking robot, a short file."""
     other = dataclasses.replace(table, joint_names=("cart", "arm"))
     with pytest.raises(PolicyMismatchError, match="joints cart, arm"):
@@ -172,27 +175,29 @@ def test_a_policy_that_does_not_fit_is_refused(table: Table, policy: Path, facts
     with pytest.raises(ConfigurationError, match="no whole multiple"):
         with_policy_commands([slow], policy, facts, lambda _: None)
     with pytest.raises(PolicyMismatchError, match="FL_hip"):
-        with_policy_commands([table], required_policy("go2"), facts, lambda _: None)
+        with_policy_commands([table], OnnxPolicy(required_policy("go2")), facts, lambda _: None)
     short = without_commands(table).rows(np.arange(len(table.time_s)) < 8)
     with pytest.raises(DatasetError, match="record longer"):
         with_policy_commands([short], policy, facts, lambda _: None)
 
 
-def test_a_file_of_states_is_prepared_with_its_policy(table: Table, policy: Path, tmp_path: Path) -> None:
+def test_a_file_of_states_is_prepared_with_its_policy(
+    table: Table, policy: OnnxPolicy, tmp_path: Path
+) -> None:
     """`calibrate --model --data states.csv --policy`: the episodes have the policy's commands."""
     file = states_file(table, tmp_path)
     settings = FilesSettings(model=DESCRIPTION.mjcf, data=(file,))
     with pytest.raises(DatasetError, match="--policy"):
         calibration_input(settings)
     printed: list[str] = []
-    work = calibration_input(dataclasses.replace(settings, policy=str(policy)), say=printed.append)
+    work = calibration_input(dataclasses.replace(settings, policy=str(policy.path)), say=printed.append)
     assert any("no commands, so they are those of" in line for line in printed)
     assert sum(len(np.unique(e.target)) for e in work.episodes) > 50
 
 
 @pytest.mark.parametrize("velocities", [True, False])
 def test_states_alone_are_compared_as_distributions(
-    table: Table, policy: Path, tmp_path: Path, velocities: bool
+    table: Table, policy: OnnxPolicy, tmp_path: Path, velocities: bool
 ) -> None:
     """The policy runs in every simulator; a clock in common is said, and a poor result is red."""
     if not velocities:
@@ -201,7 +206,7 @@ def test_states_alone_are_compared_as_distributions(
     found = deal_hw.calibrate(
         DESCRIPTION.mjcf,
         [states_file(table, tmp_path)],
-        policy=policy,
+        policy=policy.path,
         method="moments-unaligned",
         free=("cart.frictionloss", "cart.servo_stiffness"),
         population=8,
@@ -216,12 +221,12 @@ def test_states_alone_are_compared_as_distributions(
     assert np.all((space.low <= found.result.estimate) & (found.result.estimate <= space.high))
 
 
-def test_simulators_go_on_from_the_policys_past(policy: Path, tmp_path: Path) -> None:
+def test_simulators_go_on_from_the_policys_past(policy: OnnxPolicy, tmp_path: Path) -> None:
     """A file begins while the policy runs: the first command of a rollout is the one that it gave there."""
     found = deal_hw.calibrate(
         DESCRIPTION.mjcf,
-        [states_file(balanced(policy, "ideal"), tmp_path)],
-        policy=policy,
+        [states_file(balanced(policy.path, "ideal"), tmp_path)],
+        policy=policy.path,
         method="moments-unaligned",
         free=("cart.frictionloss",),
         population=4,
@@ -241,7 +246,7 @@ def test_simulators_go_on_from_the_policys_past(policy: Path, tmp_path: Path) ->
 
 
 @pytest.fixture(scope="module")
-def own(table: Table, policy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def own(table: Table, policy: OnnxPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the states, a file with the commands 0.6 s late, and a robot.yaml of the cart-pole."""
     folder = tmp_path_factory.mktemp("own")
     states_file(table, folder)
@@ -274,13 +279,13 @@ def imported(
     return out
 
 
-def test_a_dataset_of_states_alone_keeps_its_policy(own: Path, policy: Path, tmp_path: Path) -> None:
+def test_a_dataset_of_states_alone_keeps_its_policy(own: Path, policy: OnnxPolicy, tmp_path: Path) -> None:
     """`data import --policy` computes the commands; `calibrate DATASET` runs the kept policy by itself."""
     said: list[str] = []
-    dataset = imported(own, tmp_path / "dataset", "states.csv", policy, said)
+    dataset = imported(own, tmp_path / "dataset", "states.csv", policy.path, said)
     assert any("no commands, so they are those of" in line for line in said)
     (kept,) = (dataset / "policies").iterdir()
-    assert kept.read_bytes() == policy.read_bytes()
+    assert kept.read_bytes() == policy.path.read_bytes()
     printed: list[str] = []
     found = deal_hw.calibrate(
         dataset=dataset,
@@ -295,20 +300,24 @@ def test_a_dataset_of_states_alone_keeps_its_policy(own: Path, policy: Path, tmp
     assert found.inputs.policy is not None and found.inputs.policy.ran_before
     assert found.inputs.robot.description.control_rate_hz == pytest.approx(DESCRIPTION.control_rate_hz)
     assert any("not that of the 2 searched parameters" in line for line in printed)
-    named = OwnDatasetSettings(dataset=dataset, method="moments-unaligned", policy=policy, threads=1)
+    named = OwnDatasetSettings(dataset=dataset, method="moments-unaligned", policy=policy.path, threads=1)
     work = calibration_input(named, say=printed.append)
     assert "both have one clock" in " ".join(printed)
     np.testing.assert_array_equal(work.episodes[0].target, found.inputs.episodes[0].target)
 
 
-def test_a_datasets_wrong_clock_is_found_before_any_search(own: Path, policy: Path, tmp_path: Path) -> None:
+def test_a_datasets_wrong_clock_is_found_before_any_search(
+    own: Path, policy: OnnxPolicy, tmp_path: Path
+) -> None:
     """Commands 0.6 s late are moved: at the import, or in the calibration."""
     said: list[str] = []
-    dataset = imported(own, tmp_path / "moved", "late.csv", policy, said)
+    dataset = imported(own, tmp_path / "moved", "late.csv", policy.path, said)
     assert any("clocks are apart" in line for line in said)
     moved = Dataset.open(dataset).read(0).trajectory
-    late = imported(own, tmp_path / "late", "late.csv")
-    settings = OwnDatasetSettings(dataset=late, search="eki", policy=policy, threads=1, window=0.2)
+    said.clear()
+    late = imported(own, tmp_path / "late", "late.csv", None, said)
+    assert any("hardly move together" in line and "have two clocks" in line for line in said)
+    settings = OwnDatasetSettings(dataset=late, search="eki", policy=policy.path, threads=1, window=0.2)
     printed: list[str] = []
     work = calibration_input(settings, say=printed.append)
     assert any("clocks are apart" in line for line in printed)
@@ -319,7 +328,7 @@ def test_a_datasets_wrong_clock_is_found_before_any_search(own: Path, policy: Pa
     assert work.policy is None
 
 
-def test_a_policy_that_is_not_the_datasets_is_refused(own: Path, policy: Path, tmp_path: Path) -> None:
+def test_a_policy_that_is_not_the_datasets_is_refused(own: Path, policy: OnnxPolicy, tmp_path: Path) -> None:
     """No policy for a method that runs one, another one, one of another size, a lost copy, no robot."""
     plain = imported(own, tmp_path / "plain", "late.csv")
     unaligned = OwnDatasetSettings(dataset=plain, method="deal-unaligned", threads=1)
@@ -330,13 +339,13 @@ def test_a_policy_that_is_not_the_datasets_is_refused(own: Path, policy: Path, t
         calibration_input(dataclasses.replace(unaligned, policy=other))
     with pytest.raises(ConfigurationError, match=r"commands of no joint.*--policy FILE\.onnx"):
         imported(own, tmp_path / "none", "states.csv")
-    dataset = imported(own, tmp_path / "dataset", "states.csv", policy)
+    dataset = imported(own, tmp_path / "dataset", "states.csv", policy.path)
     kept = dataclasses.replace(unaligned, dataset=dataset)
     with pytest.raises(ConfigurationError, match="is not the policy with which the recordings were imported"):
         calibration_input(dataclasses.replace(kept, policy=other))
     next((dataset / "policies").iterdir()).unlink()
     with pytest.raises(ConfigurationError, match=r"has no copy of the policy.*--policy FILE"):
         calibration_input(kept)
-    without = ImportSettings(paths=(own / "states.csv",), out=tmp_path / "x", policy=policy)
+    without = ImportSettings(paths=(own / "states.csv",), out=tmp_path / "x", policy=policy.path)
     with pytest.raises(ConfigurationError, match="--policy needs the robot that it moved"):
         import_recordings(without)

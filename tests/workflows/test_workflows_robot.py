@@ -10,7 +10,7 @@ import pytest
 
 import deal_hw
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import ConfigurationError, DatasetError

@@ -13,7 +13,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.motions.posture import PostureConfig
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.transport import WireOptions
 from deal_hw.types import Trajectory
 from deal_hw.workflows import replay

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import deal_hw
-from deal_hw.control.loop.control_loop import Outcome
+from deal_hw.control.process.channel import Outcome
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults

@@ -6,7 +6,6 @@ Settings and report come first, then the repeater of commands, then the loop; no
 from __future__ import annotations
 
 import contextlib
-import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -15,7 +14,15 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.control.loop.timing import LoopTiming, LoopTimingReport
-from deal_hw.control.process.channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
+from deal_hw.control.process.channel import (
+    ARMING,
+    CONNECTING,
+    HANDING_BACK,
+    HOMING,
+    MAKING_PASSIVE,
+    RUNNING,
+    Outcome,
+)
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
@@ -26,19 +33,6 @@ from deal_hw.robot import Robot
 from deal_hw.schema import plain
 from deal_hw.transport import Message
 from deal_hw.types import Event, JointCommand, RobotState
-
-
-class Outcome(enum.Enum):
-    """How a run ended."""
-
-    FINISHED = "finished"
-    STOPPED = "stopped"
-    """Ended by the operator."""
-    TRIPPED = "tripped"
-    """Ended by the safety module."""
-    FAILED = "failed"
-    """Ended by an error."""
-
 
 HOME_TIMEOUT_S: Final = 20.0
 """Longest homing [s]."""

@@ -7,6 +7,7 @@ datagram that the peer does not take at once is refused and counted.
 from __future__ import annotations
 
 import contextlib
+import enum
 import json
 import socket
 import struct
@@ -37,6 +38,18 @@ STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, MAKING_PASSIVE, HANDING_
 HEARTBEAT = "\0"
 """The supervisor's heartbeat."""
 _BEAT = struct.Struct("<cqdI")
+
+
+class Outcome(enum.Enum):
+    """How a run ended."""
+
+    FINISHED = "finished"
+    STOPPED = "stopped"
+    """Ended by the operator."""
+    TRIPPED = "tripped"
+    """Ended by the safety module."""
+    FAILED = "failed"
+    """Ended by an error."""
 
 
 def socket_pair(buffer_bytes: int = BUFFER_BYTES) -> tuple[socket.socket, socket.socket]:

@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from deal_hw.data.checks.meaning import FACTORS, SCALE_TOLERANCE
 from deal_hw.data.table import Table
 from deal_hw.findings import Finding, Severity
 from deal_hw.types import FloatArray
@@ -125,6 +126,9 @@ def _is_effort(position: FloatArray, command: FloatArray, period_s: float) -> bo
     correlation, slope, near = _following(position, command, period_s)
     if correlation > PERHAPS and PERHAPS_SLOPE[0] < slope < PERHAPS_SLOPE[1] and near:
         return False
+    if correlation > FOLLOWS and _in_another_unit(slope):
+        # The check of the units names it; efforts would be a second, wrong cause.
+        return False
     half = max(round(SMOOTHED_S / period_s / 2), 1)
     times = np.arange(-half, half + 1) * period_s
     fit = np.linalg.pinv(np.stack([np.ones_like(times), times, 0.5 * times**2], axis=1))
@@ -139,6 +143,13 @@ def _is_effort(position: FloatArray, command: FloatArray, period_s: float) -> bo
         if 1 - left > EXPLAINED and weights[2] > 0:
             return bool(abs(weights[0] / size[0] - 1.0) > SERVO_SHARE)
     return False
+
+
+def _in_another_unit(slope: float) -> bool:
+    """Return whether a position moves as much more or less than its command as another unit makes it."""
+    return any(
+        abs(ratio / factor - 1) < SCALE_TOLERANCE for factor in FACTORS for ratio in (slope, 1 / slope)
+    )
 
 
 def _following(position: FloatArray, command: FloatArray, period_s: float) -> tuple[float, float, bool]:

@@ -156,7 +156,8 @@ def _assignment(found: _Match, at: int) -> Finding:
         return Finding(
             "assignment",
             Severity.WARN,
-            f"{text}; check whether it is free, blocked, or another joint's channel",
+            f"{text}; check whether it is free, blocked, or another joint's channel, or whether commands and "
+            "measurements have two clocks (the policy that moved the robot, --policy, shows that)",
         )
     return Finding(
         "assignment", Severity.OK, f"each of {M} joints follows its own command (at least {_least(C):.2f})"

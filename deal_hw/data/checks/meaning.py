@@ -87,7 +87,8 @@ def check_slip(table: Table) -> Finding:
     )
 
 
-_FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
+FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
+"""Ratios of two units that are mistaken for each other, and their names."""
 
 
 def check_units(table: Table, limits: FloatArray | None) -> tuple[Finding, bool]:
@@ -107,7 +108,7 @@ def check_units(table: Table, limits: FloatArray | None) -> tuple[Finding, bool]
         ratio = spans[0] / spans[1]
         factors = [
             (f"the {larger}'s range is about {factor:.3g} times the {smaller}'s", factor)
-            for factor in _FACTORS
+            for factor in FACTORS
             for larger, smaller, share in (
                 ("command", "measurement", ratio / factor),
                 ("measurement", "command", 1 / (ratio * factor)),
@@ -124,7 +125,7 @@ def check_units(table: Table, limits: FloatArray | None) -> tuple[Finding, bool]
             )
     explained = [name for names in alike_factor.values() for name in names]
     found = [
-        f"{', '.join(names)}: {words} ({_FACTORS[factor]})" for (words, factor), names in alike_factor.items()
+        f"{', '.join(names)}: {words} ({FACTORS[factor]})" for (words, factor), names in alike_factor.items()
     ] + found
     found += _beyond_limits(table, limits, explained)
     if found:

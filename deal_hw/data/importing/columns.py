@@ -36,6 +36,7 @@ POSITION_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180, "m": 1.
 EFFORT_UNITS: Mapping[str, float] = {"N": 1.0, "Nm": 1.0}
 """Unit of a motor's target -> newtons or newton metres."""
 QUATERNION_ORDERS = ("wxyz", "xyzw")
+FRAMES = ("world", "base")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,18 +181,22 @@ class Vector:
     Attributes:
         columns: The channels; a single one is an array with all of them.
         order: "wxyz" or "xyzw" for a quaternion.
-        unit: "rad" or "deg" (a second) for a gyroscope.
+        unit: "rad" or "deg" (a second) for a gyroscope; "m" or "mm" (a second) for a base.
+        frame: Axes of a velocity, one of :data:`FRAMES`.
     """
 
     columns: tuple[str, ...]
     order: str = "wxyz"
     unit: str = "rad"
+    frame: str = "world"
 
     def __post_init__(self) -> None:
         if self.order not in QUATERNION_ORDERS:
             raise UnknownNameError("order of a quaternion", self.order, QUATERNION_ORDERS)
-        if self.unit not in ("rad", "deg"):
-            raise UnknownNameError("unit of a gyroscope", self.unit, ("rad", "deg"))
+        if self.frame not in FRAMES:
+            raise UnknownNameError("frame of a velocity", self.frame, FRAMES)
+        if self.unit not in POSITION_UNITS:
+            raise UnknownNameError("unit of a vector", self.unit, POSITION_UNITS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,6 +227,8 @@ class ColumnMap:
         command_time: Time of the commands if they have their own stamps.
         orientation: Quaternion of the base.
         gyro: Angular velocity of the base in its own frame.
+        base_position: Place of the base in the world: the origin of the free joint's body.
+        base_velocity: Its velocity.
         source: Origin of the map: a file, or a guess.
     """
 
@@ -234,6 +241,8 @@ class ColumnMap:
     command_time: TimeColumn | None = None
     orientation: Vector | None = None
     gyro: Vector | None = None
+    base_position: Vector | None = None
+    base_velocity: Vector | None = None
     source: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -289,6 +298,8 @@ def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
         joints=tuple(_joint(entry, defaults) for entry in top["joints"]),
         orientation=_vector("orientation", top.get("orientation"), 4),
         gyro=_vector("gyro", top.get("gyro"), 3),
+        base_position=_vector("base_position", top.get("base_position"), 3, ("m", "mm")),
+        base_velocity=_vector("base_velocity", top.get("base_velocity"), 3, ("m", "mm")),
         source=source,
         **patterns,
     )
@@ -358,17 +369,21 @@ def _normalised(what: str, value: Any) -> Normalised:
     return Normalised(file=pairs[0], robot=pairs[1])
 
 
-def _vector(what: str, value: Any, size: int) -> Vector | None:
+def _vector(what: str, value: Any, size: int, units: tuple[str, ...] = ("rad", "deg")) -> Vector | None:
     if value is None:
         return None
     if isinstance(value, str):
         value = {"column": value}
-    values = _mapping(what, value, {"column", "columns", "order", "unit"})
+    values = _mapping(what, value, {"column", "columns", "order", "unit", "frame"})
     columns: Sequence[Any] = values.get("columns") or [values.get("column")]
     if len(columns) not in (1, size) or any(not isinstance(name, (str, int)) for name in columns):
         raise ConfigurationError(f"{what}: name {size} columns, or one array of {size}")
+    unit = str(values.get("unit", units[0])).removesuffix("/s")
+    if unit not in units:
+        raise UnknownNameError(f"unit of {what}", unit, units)
     return Vector(
         columns=tuple(map(str, columns)),
         order=str(values.get("order", "wxyz")),
-        unit=str(values.get("unit", "rad")).removesuffix("/s"),
+        unit=unit,
+        frame=str(values.get("frame", "world")),
     )

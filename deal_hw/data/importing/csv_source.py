@@ -65,7 +65,7 @@ def _parse(path: Path, lines: _Lines, most_numbers: int) -> tuple[dict[str, Floa
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled or all(_is_number(name) for name in names):
         found = (
-            f"{short(', '.join(map(repr, doubled)), 80)} stand there more than once"
+            f"there more than once: {short(', '.join(map(repr, doubled)), 80)}"
             if doubled
             else "it has numbers"
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError
-from deal_hw.types import BodyTrajectory, FloatArray, IntArray, Status, Trajectory
+from deal_hw.types import BaseTrajectory, BodyTrajectory, FloatArray, IntArray, Status, Trajectory
 
 EVEN = 0.02
 """Steps between samples count as even if they differ from whole periods by at most this share."""
@@ -169,6 +169,8 @@ def with_earlier_commands(trajectory: Trajectory, by_s: float) -> Trajectory:
 def _clock(table: Table) -> tuple[FloatArray, IntArray]:
     """Return stamps and rows of the samples that can be used: finite positions, one sample a stamp."""
     sound = np.isfinite(table.time_s) & np.isfinite(table.position).all(axis=1)
+    if table.base_position is not None:
+        sound &= np.isfinite(table.base_position).all(axis=1)
     rows = np.flatnonzero(sound)
     clock = table.time_s[rows]
     back = np.flatnonzero(np.diff(clock) < 0)
@@ -214,8 +216,9 @@ def _recording(
     )
     if table.orientation is not None:
         values["orientation"] = _one_hemisphere(table.orientation[rows])
-    if table.gyro is not None:
-        values["gyro"] = table.gyro[rows]
+    for name in ("gyro", "base_position", "base_velocity"):
+        if (found := getattr(table, name)) is not None:
+            values[name] = found[rows]
     index = np.round(np.diff(clock) / period).clip(1).cumsum().astype(np.int64)
     index = np.concatenate(([0], index))
     # A few ppm between this recording's clock and the grid's accumulate, so evenness is judged step by step.
@@ -305,6 +308,13 @@ def _body(measured: dict[str, FloatArray], T: int, J: int) -> BodyTrajectory | N
     )
 
 
+def _base(measured: dict[str, FloatArray], T: int) -> BaseTrajectory | None:
+    """Return the place of a base; None if nothing reports it."""
+    if "base_position" not in measured:
+        return None
+    return BaseTrajectory(measured["base_position"], measured.get("base_velocity", np.full((T, 3), np.nan)))
+
+
 def _trajectory(
     table: Table,
     device_s: FloatArray,
@@ -347,6 +357,7 @@ def _trajectory(
         sent_s=sent_s,
         sent_sequence=np.arange(C),
         body=_body(measured, device_s.size, len(table.joint_names)),
+        base=_base(measured, device_s.size),
         requested_position=target,
         position_target=target,
         stiffness=each(servo.stiffness),

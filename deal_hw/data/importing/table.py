@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
-from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
+from deal_hw.data.importing.columns import POSITION_UNITS, TIME_UNITS, ColumnMap, JointColumns, Vector
 from deal_hw.data.importing.guess import guess_time, unguessed
 from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError, short
@@ -56,11 +57,14 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
         raise DatasetError(f"{channels.path}: the column map names no position")
     if target is None:
         command_s, target = np.empty(0), np.empty((0, 0))
-    orientation, gyro = _orientation(channels, columns.orientation), _gyro(channels, columns.gyro)
-    for name, values in (("orientation", orientation), ("gyro", gyro)):
+    orientation, gyro = _orientation(channels, columns.orientation), _triple(channels, "gyro", columns.gyro)
+    place = _triple(channels, "base_position", columns.base_position)
+    speed = _triple(channels, "base_velocity", columns.base_velocity)
+    of_base = {"orientation": orientation, "gyro": gyro, "base_position": place, "base_velocity": speed}
+    for name, values in of_base.items():
         if values is not None and len(values) != time_s.size:
             raise DatasetError(f"{channels.path}: {name} has {len(values)} rows, time has {time_s.size}")
-    kept = ~np.isnan(position).all(axis=1)
+    kept = np.asarray(~np.isnan(position).all(axis=1))
     sent = ~np.isnan(target).all(axis=1) if target.size else np.zeros(command_s.size, dtype=bool)
     if not kept.any():
         raise DatasetError(f"{channels.path}: every position is empty; check the channel in the column map")
@@ -80,6 +84,8 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
         target=target[sent],
         orientation=None if orientation is None else orientation[kept],
         gyro=None if gyro is None else gyro[kept],
+        base_position=None if place is None else place[kept],
+        base_velocity=_in_world(channels, columns.base_velocity, speed, orientation, kept),
         source={
             "file": channels.path.name,
             "part": channels.part,
@@ -269,13 +275,35 @@ def _orientation(channels: Channels, vector: Vector | None) -> FloatArray | None
     return values[:, [3, 0, 1, 2]] if vector.order == "xyzw" else values
 
 
-def _gyro(channels: Channels, vector: Vector | None) -> FloatArray | None:
+def _triple(channels: Channels, name: str, vector: Vector | None) -> FloatArray | None:
+    """Return a vector of three channels in SI, (T, 3), or None."""
     if vector is None:
         return None
     values = _vector(channels, vector)
     if values.ndim != 2 or values.shape[1] != 3:
-        raise DatasetError(f"{channels.path}: gyro has shape {values.shape}; it has 3 columns, x y z")
-    return np.deg2rad(values) if vector.unit == "deg" else values
+        raise DatasetError(f"{channels.path}: {name} has shape {values.shape}; it has 3 columns, x y z")
+    return POSITION_UNITS[vector.unit] * values
+
+
+def _in_world(
+    channels: Channels,
+    vector: Vector | None,
+    velocity: FloatArray | None,
+    orientation: FloatArray | None,
+    kept: npt.NDArray[np.bool_],
+) -> FloatArray | None:
+    """Return the kept rows of a base's velocity with the world's axes, (T, 3), or None."""
+    if vector is None or velocity is None or vector.frame == "world":
+        return None if velocity is None else velocity[kept]
+    if orientation is None:
+        raise DatasetError(
+            f"{channels.path}: base_velocity has the base's axes, and there is no orientation to turn them; "
+            "name it in the column map"
+        )
+    w, axis, v = orientation[kept, :1], orientation[kept, 1:], velocity[kept]
+    # v + 2 w (u x v) + 2 u x (u x v), with the quaternion (w, u) of the base in the world.
+    turned = np.cross(axis, v)
+    return np.asarray(v + 2.0 * (w * turned + np.cross(axis, turned)))
 
 
 TURN = 2 * np.pi

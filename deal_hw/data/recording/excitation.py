@@ -10,6 +10,9 @@ import numpy as np
 from deal_hw.schema import plain
 from deal_hw.types import Trajectory
 
+SHORTEST_S = 1.0
+"""Shortest recording that can be calibrated [s]."""
+
 
 @dataclass(frozen=True, slots=True)
 class Excitation:

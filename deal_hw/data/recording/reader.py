@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,10 @@ from deal_hw.errors import (
     shown,
 )
 from deal_hw.schema import read_json
-from deal_hw.transport import Message
 from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
+
+if TYPE_CHECKING:
+    from deal_hw.transport import Message
 
 _BLOCK = 4096
 """Number of messages that are decoded at once."""
@@ -129,6 +131,8 @@ def read_wire(path: Path) -> Iterator[Message]:
         TornRecordingError: It has no footer or is damaged.
         DatasetError: It cannot be read or is not an episode of deal-hw.
     """
+    from deal_hw.transport import Message
+
     try:
         for channel, (stamp_ns, payload) in _wire_rows(Path(path)):
             yield Message(channel, payload, stamp_ns)

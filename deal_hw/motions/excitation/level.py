@@ -15,8 +15,7 @@ from deal_hw.data.recording.excitation import Excitation
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.excitation.behaviours import RichConfig, Segment
-from deal_hw.motions.excitation.limits import room
-from deal_hw.motions.excitation.plan import largest_factor
+from deal_hw.motions.excitation.limits import largest_factor, room
 
 LEAST_FOLLOWED = 0.3
 """An actuated joint that covers less than this share of its commanded range hardly moves."""

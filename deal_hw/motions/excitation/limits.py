@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from deal_hw.description import RobotDescription
@@ -93,3 +96,9 @@ def fit_to_limits(description: RobotDescription, offsets: FloatArray, *, smooth:
         ratio = np.where(over, most, 0.0) / np.where(over, found, 1.0)
         scale = np.where(over, np.minimum(scale, ratio), scale)
     return np.asarray(scale)
+
+
+def largest_factor(default: Sequence[float], most: Sequence[float]) -> float:
+    """Return the largest factor, at least 1, on defaults, (A,), that stays within limits, (A,)."""
+    ratios = [m / d for d, m in zip(default, most, strict=True) if d > 0 and math.isfinite(d)]
+    return max(min(ratios, default=1.0), 1.0)

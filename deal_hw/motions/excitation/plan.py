@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +20,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError, shown
 from deal_hw.motions.behaviours import Behaviour, centre, position_command
 from deal_hw.motions.excitation.behaviours import Segment, segment_command
 from deal_hw.motions.excitation.centring import Centring
-from deal_hw.motions.excitation.limits import fit_to_limits, room
+from deal_hw.motions.excitation.limits import fit_to_limits, largest_factor, room
 from deal_hw.motions.excitation.waveforms import (
     Arrangement,
     Law,
@@ -260,12 +259,6 @@ def _check_factors(description: RobotDescription, design: ExcitationDesign) -> N
                     f"{what} factor {factor:g} on robot {description.name!r}: allowed is above 0 and up to "
                     f"{greatest:.3g}; the safety filter would clip more"
                 )
-
-
-def largest_factor(default: Sequence[float], most: Sequence[float]) -> float:
-    """Return the largest factor, at least 1, on defaults, (A,), that stays within limits, (A,)."""
-    ratios = [m / d for d, m in zip(default, most, strict=True) if d > 0 and math.isfinite(d)]
-    return max(min(ratios, default=1.0), 1.0)
 
 
 def describe_design(design: ExcitationDesign) -> str:

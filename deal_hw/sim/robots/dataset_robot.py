@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 
@@ -18,8 +18,9 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, short
 from deal_hw.reading import read_json, reading
 from deal_hw.schema import from_values
-from deal_hw.sim.robots.robot_file import FILE_NAME, write_robot_file
-from deal_hw.sim.robots.user_robot import UserRobot
+
+if TYPE_CHECKING:
+    from deal_hw.sim.robots.user_robot import UserRobot
 
 FOLDER: Final = "robot"
 """Its folder in a dataset."""
@@ -103,6 +104,8 @@ def _copy(robot: UserRobot, folder: Path) -> dict[str, str]:
             f"model {robot.mjcf} names {outside[0]} by an absolute path, so the dataset cannot hold a copy "
             "of it; write it relative to the MJCF"
         )
+    from deal_hw.sim.robots.robot_file import FILE_NAME, write_robot_file
+
     text = write_robot_file(dataclasses.replace(robot.file, mjcf=name))
     (folder / FILE_NAME).write_text(text, encoding="utf-8")
     found = {

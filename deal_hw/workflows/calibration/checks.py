@@ -54,16 +54,39 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Tr
         if feet:
             raise ConfigurationError("--feet are for a model with a free joint; this one's base is fixed")
         return
+    placed = [t for t in recordings if t.base is not None]
+    if placed:
+        _require_poses(placed, recordings, feet)
+        return
     without = [t for t in recordings if not _base_is_measured(t)]
     if without or not feet:
         lacks = "recordings of the base (orientation and gyro in the column map)" if without else "--feet"
         raise ConfigurationError(
             f"the model floats (free joint {free!r}) and needs {lacks}: the IMU and the standing feet "
-            "(sphere geoms, floor at height 0) give the base's motion. Add these, or record with the "
-            "trunk held and remove the free joint from a copy of the MJCF"
+            "(sphere geoms, floor at height 0) give the base's motion. Add these; or name base_position and "
+            "orientation of motion capture or odometry in the column map; or record with the trunk held and "
+            "remove the free joint from a copy of the MJCF"
         )
     for name in feet:
         element_id(robot.model, "geom", name)
+
+
+def _require_poses(
+    placed: Sequence[Trajectory], recordings: Sequence[Trajectory], feet: Sequence[str]
+) -> None:
+    """Check recordings of which some contain the base's place: all must, with its orientation."""
+    if len(placed) < len(recordings):
+        raise ConfigurationError(
+            f"{len(placed)} of {len(recordings)} recordings contain the base's place (base_position in the "
+            "column map); calibrate the others separately"
+        )
+    if any(t.body is None or not np.isfinite(t.body.orientation).all() for t in placed):
+        raise ConfigurationError(
+            "a recording contains the base's place (base_position) without its orientation at every sample, "
+            "so its state is unknown; name the quaternion as `orientation` in the column map"
+        )
+    if feet:
+        raise ConfigurationError("--feet would have no effect: the recordings contain the base's place")
 
 
 def _base_is_measured(trajectory: Trajectory) -> bool:

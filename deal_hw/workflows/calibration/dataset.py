@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,18 +14,6 @@ from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.policy import (
-    imported_policy,
-    recorded_policy,
-    refuse_closed_loop,
-    say_other_range,
-    say_unknown_range,
-)
-from deal_hw.workflows.calibration.policy_commands import (
-    at_policy_rate,
-    policy_of_files,
-    with_policy_clock,
-)
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
@@ -63,7 +52,7 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
 
     dataset, description = _opened(settings)
     robot_name = dataset.description["name"]
-    fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
+    fit, held = choose_episodes(dataset, settings.episodes, settings.holdout, say)
     robot = load_model(description)
     space = named_space(robot_name, settings.space)
     if settings.parameters is not None:
@@ -72,6 +61,8 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
     episodes = {i: dataset.read(i) for i in (*fit, *held)}
     policy = None
     if settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
+
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
         say_other_range(policy, robot_name, space, say)
@@ -103,36 +94,43 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.engine.model import load_model
     from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
-    from deal_hw.sim.mjcf.joint_facts import joint_facts
 
-    division = settings.division(judged=bool(settings.judges))
+    division = settings.division(judged=bool(settings.holdout))
     dataset, description = _opened(settings)
-    fit, held = choose_episodes(dataset, settings.episodes, settings.judges, say)
+    fit, held = choose_episodes(dataset, settings.episodes, settings.holdout, say)
     if held and settings.holdout_part is None:
         division = dataclasses.replace(division, share=0.0)
     trajectories = {i: dataset.read(i).trajectory for i in (*fit, *held)}
-    given = None if settings.policy is None else Path(settings.policy)
-    file = imported_policy(dataset, {i: t.metadata for i, t in trajectories.items()}, given)
-    if settings.in_closed_loop and file is None:
-        refuse_closed_loop(settings.named())
+    policy = None
+    if settings.policy is not None or settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import imported_policy
+
+        given = None if settings.policy is None else Path(settings.policy)
+        policy = imported_policy(dataset, {i: t.metadata for i, t in trajectories.items()}, given)
+        if policy is None:
+            settings.refuse_unknown_policy()
     model = compile_mjcf(description.mjcf)
-    if given is not None:
-        trajectories = with_policy_clock(trajectories, given, joint_facts(description.mjcf, model), say)
+    if policy is not None and settings.policy is not None:
+        from deal_hw.sim.mjcf.joint_facts import joint_facts
+        from deal_hw.workflows.calibration.policy_commands import with_policy_clock
+
+        trajectories = with_policy_clock(trajectories, policy, joint_facts(description.mjcf, model), say)
     trajectories, telemetry = sound_recordings(trajectories, dataset.folder, settings.spikes, say)
     space = searched_space(settings, model, say)
     timestep = float(model.opt.timestep) if settings.physics_step is None else settings.physics_step
     rates = sampling(1.0 / description.state_rate_hz, timestep, settings.window)
-    in_loop = file if settings.in_closed_loop else None
-    if in_loop is not None:
-        rates = at_policy_rate(rates, in_loop)
+    in_loop = None
+    if policy is not None and settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import policy_of_files
+        from deal_hw.workflows.calibration.policy_commands import at_policy_rate
+
+        rates = at_policy_rate(rates, policy)
+        in_loop = functools.partial(policy_of_files, policy)
     description = dataclasses.replace(
         description,
         device_rate_hz=1.0 / rates.step_s,
         control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
     )
-    policy = None if in_loop is None else policy_of_files(in_loop, description)
-    if policy is not None:
-        say_unknown_range(policy, space, settings.latency_range, say)
     return Source(
         robot=load_model(with_speed_limits(description, model, space), rates.step_s),
         space=space,
@@ -148,7 +146,7 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="import recordings of other motion, and name their episodes with --holdout",
-        policy=policy,
+        policy=None if in_loop is None else in_loop(description, space, settings.latency_range, say),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +11,6 @@ from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.checks import examine_recording
-from deal_hw.workflows.calibration.policy import say_unknown_range
-from deal_hw.workflows.calibration.policy_commands import (
-    at_policy_rate,
-    policy_of_files,
-    with_policy_commands,
-)
 from deal_hw.workflows.calibration.recordings import (
     Recorded,
     at_rest_without_commands,
@@ -32,6 +27,7 @@ from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.data.table import Table
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
@@ -62,11 +58,20 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
     model = compile_mjcf(path)
     space = searched_space(settings, model, say)
     facts = joint_facts(path, model)
-    fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), facts, say)
+    policy = None
+    if settings.policy is not None:
+        from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+        policy = OnnxPolicy(settings.policy)
+    fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), policy, facts, say)
     rates = common_rates([*fitted, *held], model, settings.physics_step, settings.window)
-    in_loop = None if settings.policy is None or not settings.in_closed_loop else Path(settings.policy)
-    if in_loop is not None:
-        rates = at_policy_rate(rates, in_loop)
+    in_loop = None
+    if policy is not None and settings.in_closed_loop:
+        from deal_hw.workflows.calibration.policy import policy_of_files
+        from deal_hw.workflows.calibration.policy_commands import at_policy_rate
+
+        rates = at_policy_rate(rates, policy)
+        in_loop = functools.partial(policy_of_files, policy)
     description = describe(path, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
     parts = without(
@@ -80,9 +85,6 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
         for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }
     robot = load_model(description, rates.step_s)
-    run = None if in_loop is None else policy_of_files(in_loop, description)
-    if run is not None:
-        say_unknown_range(run, space, settings.latency_range, say)
     fitted, held = parts
     return Source(
         robot=robot,
@@ -107,7 +109,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
-        policy=run,
+        policy=None if in_loop is None else in_loop(description, space, settings.latency_range, say),
     )
 
 
@@ -126,6 +128,7 @@ def _refuse_same(data: Sequence[Recorded], holdout: Sequence[Recorded]) -> None:
 def _tables(
     settings: FilesSettings,
     groups: Sequence[tuple[str, Sequence[Recorded]]],
+    policy: OnnxPolicy | None,
     facts: JointFacts,
     say: Say,
 ) -> list[list[Table]]:
@@ -136,8 +139,9 @@ def _tables(
     columns = None if path is None else read_column_map(Path(path))
     printed: dict[str, str] = {}
     found = [read_tables(sources, columns, facts, say, name, printed) for name, sources in groups]
-    if settings.policy is not None:
-        policy = Path(settings.policy)
+    if policy is not None:
+        from deal_hw.workflows.calibration.policy_commands import with_policy_commands
+
         found = [with_policy_commands(tables, policy, facts, say) for tables in found]
     found = [at_rest_without_commands(tables, facts, say) for tables in found]
     refuse_copies(list(itertools.chain(*found)))

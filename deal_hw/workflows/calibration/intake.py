@@ -9,19 +9,21 @@ only they can see. All that follows is here, once.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from deal_hw.calib.pipeline.methods import UNALIGNED_METHODS
+from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
-from deal_hw.types import FloatArray, Trajectory
+from deal_hw.types import BaseTrajectory, FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
-from deal_hw.workflows.calibration.policy import say_that_alignment_is_better
 from deal_hw.workflows.calibration.settings import (
     CalibrateSettings,
     DriverDatasetSettings,
@@ -30,13 +32,6 @@ from deal_hw.workflows.calibration.settings import (
     UserRobotSettings,
 )
 from deal_hw.workflows.calibration.source import Division, Source
-from deal_hw.workflows.calibration.walking import (
-    GAIT_SMOOTHING_S,
-    WALK_TELLS,
-    all_walk,
-    weighed,
-    while_walking,
-)
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -48,6 +43,14 @@ if TYPE_CHECKING:
 STRETCH_S = 2.5
 """Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
 HELDOUT_STRETCH_S = 20.0
+GAIT_SMOOTHING_S = 0.04
+"""Landing feet change joint velocities within about 10 ms; longer smoothing biases the states there [s]."""
+WALK_TELLS = (
+    "a walk shows the joints' gains and the floor's friction, but hardly their dry friction, not their "
+    "armature, and masses only if the motors' efforts weigh the robot"
+)
+WEIGHING_S = 0.35
+"""Time that a robot stands still before it walks [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,9 +142,16 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
     trajectories = [trajectory for _, trajectory in (*source.fitted, *source.held)]
     if division is not None:
         require_base(robot, source.feet, trajectories)
-    known_std, provenance = expected_std(settings.residual_std, robot), dict(source.provenance)
+    known_std = expected_std(settings.residual_std, robot, trajectories[0].base)
+    provenance = dict(source.provenance)
     fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
-    say_that_alignment_is_better(settings.named(), say)
+    if settings.named() in UNALIGNED_METHODS:
+        say(
+            f"{settings.named()} compares distributions of motion. In these recordings commands and states "
+            "have one clock, so predictions can be compared, too, and every robot that was measured was "
+            f"predicted better by that ({page('results/paper.md')}): leave --method out, unless the motion "
+            "diverges from any prediction"
+        )
     shown = trajectories[0]
     walks = division is None and all_walk(robot, trajectories)
     if walks:
@@ -175,7 +185,11 @@ def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode
 
     robot = source.robot
     episode = align(trajectory, robot.description, name)
-    if robot.base is not None and trajectory.body is not None:
+    if robot.base is not None and trajectory.base is not None:
+        from deal_hw.sim.recordings.measured_base import with_measured_base
+
+        episode = with_measured_base(episode, robot, trajectory)
+    elif robot.base is not None and trajectory.body is not None:
         from deal_hw.sim.recordings.standing import with_sensed_base
 
         episode = with_sensed_base(episode, robot, trajectory, source.feet)
@@ -184,6 +198,54 @@ def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode
     if source.division is not None:
         episode = fill_gaps(episode)
     return episode if source.sample_hz is None else thin(episode, source.sample_hz)
+
+
+def all_walk(robot: RobotModel, recordings: Iterable[Trajectory]) -> bool:
+    """Return whether all recordings are of a policy that walks."""
+    if robot.base is None:
+        return False
+    from deal_hw.motions.scores.velocity_error import wanted_velocity
+
+    return all(wanted_velocity(r) is not None for r in recordings)
+
+
+def while_walking(episode: SampledEpisode, trajectory: Trajectory) -> SampledEpisode:
+    """Return the episode; of a walk, without standing up and lying down."""
+    from deal_hw.motions.scores.velocity_error import wanted_velocity
+
+    wanted = wanted_velocity(trajectory)
+    if wanted is None:
+        return episode
+    rows = slice(episode.first_row, episode.first_row + len(episode.sample))
+    host_s = trajectory.device_s[rows] + np.median(trajectory.receive_s - trajectory.device_s)
+    walks = (host_s >= wanted.time_s[0]) & (host_s <= wanted.end_s)
+    return dataclasses.replace(episode, usable=episode.usable & walks)
+
+
+def weighed(space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, say: Say) -> ParameterSpace:
+    """Return the space with the trunk's mass, if it is searched, as weighed by the motors' efforts.
+
+    No motion on feet can separate masses from gains, since all forces scale together. The motors' efforts
+    can, in the last moments before the robot walks.
+    """
+    from deal_hw.motions.scores.velocity_error import wanted_velocity
+    from deal_hw.sim.legged.weighing import standing_mass
+
+    trunk, wanted, body = robot.description.floating_base, wanted_velocity(trajectory), trajectory.body
+    names = [p.name for p in space if p.kind == "body_mass" and p.elements == (trunk,)]
+    if not names or wanted is None or body is None:
+        return space
+    since_s = trajectory.receive_s - wanted.time_s[0]
+    rows = (since_s > -WEIGHING_S) & (since_s < 0) & np.isfinite(trajectory.effort).all(axis=1)
+    if not rows.any() or not trajectory.effort[rows].any():
+        return space
+    whole = standing_mass(robot, body.orientation[rows], trajectory.position[rows], trajectory.effort[rows])
+    mass = whole - float(robot.model.body_mass.sum() - robot.model.body(trunk).mass[0])
+    say(
+        f"{names[0]}: {mass:.2f} kg, weighed by the motors' efforts while the robot stands (whole robot "
+        f"{whole:.2f} kg); it is not fitted; to set another mass: --known {names[0]} KG"
+    )
+    return space.with_known({names[0]: mass})
 
 
 def divided(
@@ -256,7 +318,9 @@ def usual_method(settings: CalibrateSettings, work: CalibrationInput, say: Say =
 
 
 def expected_std(
-    given: float | Mapping[str, float] | tuple[str, ...] | None, robot: RobotModel
+    given: float | Mapping[str, float] | tuple[str, ...] | None,
+    robot: RobotModel,
+    base: BaseTrajectory | None = None,
 ) -> FloatArray | None:
     """Return the expected prediction error (std), positions then velocities, (2 C,), or None.
 
@@ -264,6 +328,7 @@ def expected_std(
         given: One number for all joints of a fixed robot, or one for each name [rad or m]; from the command
             line as words; None or no words: none is expected.
         robot: The robot.
+        base: Recorded place of its base; None: none.
 
     Raises:
         ConfigurationError: A number is missing, or is not above 0.
@@ -278,6 +343,8 @@ def expected_std(
         found = [*map(_number, given[1::2]), *([math.nan] * (len(given) % 2))]
         given = dict(zip(given[::2], found, strict=True))
     names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
+    moves = base is not None and bool(np.isfinite(base.velocity).all())
+    names += (("base_position",) if base is not None else ()) + (("base_velocity",) if moves else ())
     one = not isinstance(given, Mapping)
     values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
     for name in values:
@@ -299,6 +366,7 @@ def expected_std(
     std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
     if robot.base is not None:
         std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
+        std[:3], std[C : C + 3] = values.get("base_position", 1.0), values.get("base_velocity", 1.0)
     return std
 
 

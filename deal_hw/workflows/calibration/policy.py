@@ -1,14 +1,13 @@
-"""The policy of a dataset's recordings, for methods that run it in every simulator."""
+"""The policy that moved the robot, for methods that run it in every simulator."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, UNALIGNED_METHODS, search_of
 from deal_hw.description import RobotDescription
-from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.workflows.say import Say
 
@@ -19,43 +18,7 @@ if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.parameters import ParameterSpace
     from deal_hw.policies.demonstration import PopulationDemonstration
-
-
-def check_policy_runs(method: str) -> None:
-    """Check that a method runs the policy that moved the robot.
-
-    Raises:
-        ConfigurationError: It does not, so a named policy would have no effect.
-    """
-    search = search_of(method)
-    if search not in CLOSED_LOOP_METHODS:
-        raise ConfigurationError(f"--policy would have no effect: {search} runs no policy")
-
-
-def refuse_closed_loop(method: str) -> None:
-    """Refuse a method that runs the policy that moved the robot, where nobody knows that policy.
-
-    Raises:
-        ConfigurationError: The method does.
-    """
-    search = search_of(method)
-    if search in CLOSED_LOOP_METHODS:
-        raise ConfigurationError(
-            f"{search} runs the policy that moved the robot, which is unknown for --model without --policy "
-            "FILE.onnx, and for a dataset with its own robot.yaml that was imported without it; name it, or "
-            "use eki, deal or deal-paper-replay"
-        )
-
-
-def say_that_alignment_is_better(method: str, say: Say) -> None:
-    """Say it where a search compares distributions of recordings whose commands and states are aligned."""
-    if method in UNALIGNED_METHODS:
-        say(
-            f"{method} compares distributions of motion. In these recordings commands and states have one "
-            "clock, so predictions can be compared, too, and every robot that was measured was predicted "
-            f"better by that ({page('results/paper.md')}): leave --method out, unless the motion diverges "
-            "from any prediction"
-        )
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
 
 
 def say_other_range(policy: PopulationDemonstration, robot: str, space: ParameterSpace, say: Say) -> None:
@@ -84,34 +47,10 @@ def say_other_range(policy: PopulationDemonstration, robot: str, space: Paramete
     )
 
 
-def say_unknown_range(
-    policy: PopulationDemonstration, space: ParameterSpace, latency_range_s: tuple[float, float], say: Say
-) -> None:
-    """Say where nothing shows that a user's policy was trained in the range that is searched.
-
-    Args:
-        policy: The policy that moved the robot.
-        space: What is searched.
-        latency_range_s: Range of the latency's search [s].
-        say: Called with the sentence.
-    """
-    from deal_hw.parameters import ParameterDistribution
-
-    if policy.trained_under == ParameterDistribution.uniform(space, latency_range_s).digest():
-        return
-    trained = policy.trained_under
-    what = f"names the distribution {trained}" if trained else "names no distribution of its training"
-    say(
-        f"the policy {what}, not that of the {len(space)} searched parameters. The DEAL paper trains it in "
-        "the range that is searched. Simulators at the ends of the range may fall at once under this one, "
-        "and then say little; --range-ratio narrows it"
-    )
-
-
 def imported_policy(
     dataset: Dataset, runs: Mapping[int, Mapping[str, Any]], given: Path | None
-) -> Path | None:
-    """Return the file of the policy that moved the robot in imported episodes; None: it is not known.
+) -> OnnxPolicy | None:
+    """Return the policy that moved the robot in imported episodes; None: it is not known.
 
     Args:
         dataset: The dataset, with its own robot.yaml.
@@ -133,13 +72,14 @@ def imported_policy(
         )
     (noted,) = digests
     if given is not None:
-        found = OnnxPolicy(given).digest
-        if noted and not found.startswith(noted):
+        policy = OnnxPolicy(given)
+        if noted and not policy.digest.startswith(noted):
             raise ConfigurationError(
                 f"{given} is not the policy with which the recordings were imported: its SHA-256 begins "
-                f"with {found[:16]}, that one's with {noted}; leave --policy out, or name the right file"
+                f"with {policy.digest[:16]}, that one's with {noted}; leave --policy out, or name the right "
+                "file"
             )
-        return given
+        return policy
     if not noted:
         return None
     kept = dataset.policy_path(noted)
@@ -148,7 +88,7 @@ def imported_policy(
             f"{dataset.folder} has no copy of the policy that moved the robot (its SHA-256 begins with "
             f"{noted}); name its file: --policy FILE"
         )
-    return kept
+    return OnnxPolicy(kept)
 
 
 def recorded_policy(
@@ -203,6 +143,49 @@ def recorded_policy(
         )
     ahead, left, turn = source.reach()[0]
     return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))
+
+
+def policy_of_files(
+    policy: OnnxPolicy,
+    description: RobotDescription,
+    space: ParameterSpace,
+    latency_range_s: tuple[float, float],
+    say: Say,
+) -> PopulationDemonstration:
+    """Return the policy that moved a user's robot, for methods that run it in every simulator.
+
+    Where nothing shows that it was trained in the range that is searched, a sentence tells it.
+
+    Args:
+        policy: The policy. It gave or checked the commands of these recordings, so joints, units and rate
+            fit.
+        description: The robot by the user's model, sampled at the policy's rate.
+        space: What is searched.
+        latency_range_s: Range of the latency's search [s].
+        say: Called with the sentence.
+    """
+    from deal_hw.parameters import ParameterDistribution
+    from deal_hw.policies.demonstration import PopulationDemonstration
+
+    spec = policy.spec
+    # A model's file has another name than the robot, and often another rest pose. Actions are around the
+    # policy's own pose, as in the commands that were computed.
+    own = dataclasses.replace(
+        description,
+        name=spec.robot,
+        default_position=spec.default_position,
+        control_rate_hz=spec.control_rate_hz,
+    )
+    found = PopulationDemonstration(policy, own, ran_before=True)
+    trained = found.trained_under
+    if trained != ParameterDistribution.uniform(space, latency_range_s).digest():
+        what = f"names the distribution {trained}" if trained else "names no distribution of its training"
+        say(
+            f"the policy {what}, not that of the {len(space)} searched parameters. The DEAL paper trains it "
+            "in the range that is searched. Simulators at the ends of the range may fall at once under this "
+            "one, and then say little; --range-ratio narrows it"
+        )
+    return found
 
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -20,8 +19,6 @@ from deal_hw.workflows.calibration.policy import NOTED_POLICY
 
 if TYPE_CHECKING:
     from deal_hw.data.table import Table
-    from deal_hw.description import RobotDescription
-    from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policy import PolicySpec
     from deal_hw.sim.mjcf.describe import Sampling
@@ -53,13 +50,13 @@ class _Ticks:
 
 
 def with_policy_commands(
-    tables: Sequence[Table], file: Path, facts: JointFacts, say: Callable[[str], None]
+    tables: Sequence[Table], policy: OnnxPolicy, facts: JointFacts, say: Callable[[str], None]
 ) -> list[Table]:
     """Return recordings with the commands of a policy, or with their own on the states' clock.
 
     Args:
-        tables: Recordings of a robot with a fixed base.
-        file: The policy that moved it, with its spec (.onnx).
+        tables: Recordings; for a policy that observes a floating base with its place and orientation.
+        policy: The policy that moved it.
         facts: The joints of its model.
         say: Called with a sentence on each recording.
 
@@ -67,41 +64,40 @@ def with_policy_commands(
         ConfigurationError: The policy is not for these joints, needs more than the recordings have, or runs
             at a rate at which they have no samples.
         DatasetError: Recorded commands are not those of the policy.
-        PolicyError: The file cannot be run.
+        PolicyError: It cannot be run.
     """
     from deal_hw.data.importing.grid import period_of
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
 
-    policy = OnnxPolicy(file)
-    found = []
+    found, name = [], policy.path.name
     for recorded in tables:
         table, period_s = _as_policy(recorded, policy.spec), period_of(recorded)
+        _refuse_unseen(table, policy.spec)
         every = _samples_a_tick(policy.spec, period_s)
         choices = list(_choices(table, policy, every, period_s, facts))
         if table.command_s.size:
-            known = _checked(table, choices, period_s, file.name, say)
+            known = _checked(table, choices, period_s, name, say)
         else:
-            known = _given(table, choices, policy.spec, file.name, say)
+            known = _given(table, choices, policy.spec, name, say)
         found.append(dataclasses.replace(known, source={**known.source, NOTED_POLICY: policy.digest[:16]}))
     return found
 
 
 def with_commands_of(
-    file: Path, tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
+    policy: OnnxPolicy, tables: Sequence[Table], facts: JointFacts, say: Callable[[str], None]
 ) -> list[Table]:
     """Return recordings as :func:`with_policy_commands` does, with the joints in their own order."""
-    found = with_policy_commands(tables, file, facts, say)
+    found = with_policy_commands(tables, policy, facts, say)
     return [table.in_order(own.joint_names) for table, own in zip(found, tables, strict=True)]
 
 
 def with_policy_clock(
-    trajectories: Mapping[int, Trajectory], file: Path, facts: JointFacts, say: Callable[[str], None]
+    trajectories: Mapping[int, Trajectory], policy: OnnxPolicy, facts: JointFacts, say: Callable[[str], None]
 ) -> dict[int, Trajectory]:
     """Return imported episodes whose commands have the states' clock, as :func:`with_policy_commands` does.
 
     Args:
         trajectories: Episodes by their numbers; commands of motors are shares of the actuators' range.
-        file: The policy that moved the robot, with its spec (.onnx).
+        policy: The policy that moved the robot.
         facts: The joints of its model.
         say: Called with a sentence on each episode.
 
@@ -120,7 +116,7 @@ def with_policy_clock(
             raise DatasetError(f"episode {index}: no command was ever in force; import the recording again")
         gain = facts.gain[[facts.names.index(name) for name in table.actuated]]
         table = dataclasses.replace(table, target=table.target * gain)
-        (checked,) = with_policy_commands([table], file, facts, say)
+        (checked,) = with_policy_commands([table], policy, facts, say)
         if checked.joint_names != table.joint_names:
             raise PolicyMismatchError(
                 f"the dataset's robot.yaml has the joints {', '.join(table.joint_names)}, the policy the "
@@ -132,44 +128,13 @@ def with_policy_clock(
     return found
 
 
-def at_policy_rate(rates: Sampling, file: Path) -> Sampling:
+def at_policy_rate(rates: Sampling, policy: OnnxPolicy) -> Sampling:
     """Return the sampling with the policy's control periods, for methods that run it in every simulator."""
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-
-    return dataclasses.replace(rates, samples_per_tick=_samples_a_tick(OnnxPolicy(file).spec, rates.period_s))
-
-
-def policy_of_files(file: Path, description: RobotDescription) -> PopulationDemonstration:
-    """Return the policy that moved the robot, for methods that run it in every simulator.
-
-    Args:
-        file: The policy. :func:`with_policy_commands` took it for these recordings, so joints, units and rate
-            fit.
-        description: The robot by the user's model, sampled by :func:`at_policy_rate`.
-    """
-    from deal_hw.policies.demonstration import PopulationDemonstration
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-
-    policy = OnnxPolicy(file)
-    spec = policy.spec
-    # A model's file has another name than the robot, and often another rest pose. Actions are around the
-    # policy's own pose, as in the commands that were computed.
-    own = dataclasses.replace(
-        description,
-        name=spec.robot,
-        default_position=spec.default_position,
-        control_rate_hz=spec.control_rate_hz,
-    )
-    return PopulationDemonstration(policy, own, ran_before=True)
+    return dataclasses.replace(rates, samples_per_tick=_samples_a_tick(policy.spec, rates.period_s))
 
 
 def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
     ratio = 1.0 / (spec.control_rate_hz * period_s)
-    if spec.command_range or spec.observes_base or spec.clock_hz:
-        raise ConfigurationError(
-            f"--policy: the policy for {spec.robot!r} observes a base, a clock or a requested "
-            "velocity, which recordings of joints do not hold; record its commands, or leave --policy out"
-        )
     if abs(ratio - round(ratio)) > WHOLE or round(ratio) < 1:
         raise ConfigurationError(
             f"--policy: it ran at {spec.control_rate_hz:g} Hz, and the recordings have {1 / period_s:.4g} "
@@ -177,6 +142,44 @@ def _samples_a_tick(spec: PolicySpec, period_s: float) -> int:
             f"{spec.control_rate_hz:g} Hz or a multiple of it"
         )
     return round(ratio)
+
+
+def _refuse_unseen(table: Table, spec: PolicySpec) -> None:
+    """Refuse a policy that observes what a recording does not hold."""
+    requested = any(term.quantity in ("command", "target_rotation") for term in spec.observation)
+    if requested or spec.clock_hz:
+        raise ConfigurationError(
+            f"--policy: the policy for {spec.robot!r} observes a clock, or a requested velocity or "
+            "orientation, which recordings do not hold; record its commands, or leave --policy out"
+        )
+    if spec.observes_base and (table.base_position is None or table.orientation is None):
+        raise ConfigurationError(
+            f"--policy: the policy for {spec.robot!r} observes a base, whose state {table.name} does not "
+            "hold; name base_position and orientation in the column map, record the commands, or leave "
+            "--policy out"
+        )
+
+
+def _states(table: Table, every: int) -> tuple[FloatArray, FloatArray]:
+    """Return the states that a policy observes: those of a base, if its place was recorded, then the joints.
+
+    Velocities that were not recorded are differences over one control period.
+    """
+    joint_speed = table.velocity if table.velocity is not None else _slopes(table, table.position, every)
+    if table.base_position is None or table.orientation is None:
+        return table.position, joint_speed
+    from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
+
+    place, speed, gyro = table.base_position, table.base_velocity, table.gyro
+    if speed is None:
+        speed = _slopes(table, place, every)
+    if gyro is None:
+        before, seconds = _earlier(table, every)
+        gyro = to_vector(table.orientation, table.orientation[before]) / seconds[:, None]
+    turn = to_vector(table.orientation, IDENTITY)
+    return np.concatenate([place, turn, table.position], axis=1), np.concatenate(
+        [speed, gyro, joint_speed], axis=1
+    )
 
 
 def _as_policy(table: Table, spec: PolicySpec) -> Table:
@@ -208,14 +211,14 @@ def _choices(
     spec = policy.spec
     centre, scale = _commands_of(spec, facts)
     number = np.round((table.time_s - table.time_s[0]) / period_s).astype(np.int64)
-    velocity = table.velocity if table.velocity is not None else _differences(table, every)
-    sound = np.isfinite(table.position).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    position, velocity = _states(table, every)
+    sound = np.isfinite(position).all(axis=1) & np.isfinite(velocity).all(axis=1)
     for first in range(every):
         rows = np.flatnonzero(sound & (number % every == first))
         builder = ObservationBuilder(spec)
         command = np.empty((len(rows), len(spec.actuated)))
         for k, row in enumerate(rows):
-            observation = builder.build(table.position[row], velocity[row])
+            observation = builder.build(position[row], velocity[row])
             action = np.clip(policy.act_batch(observation[None])[0], -1.0, 1.0)
             builder.record_action(action)
             command[k] = centre + scale * action
@@ -233,11 +236,16 @@ def _commands_of(spec: PolicySpec, facts: JointFacts) -> tuple[FloatArray, Float
     return np.array(spec.default_position)[places], scale
 
 
-def _differences(table: Table, every: int) -> FloatArray:
-    """Return velocities from differences to the sample one control period earlier: a policy sees no later."""
-    earlier = np.maximum(np.arange(len(table.time_s)) - every, 0)
-    seconds = np.maximum(table.time_s - table.time_s[earlier], 1e-9)
-    return np.asarray((table.position - table.position[earlier]) / seconds[:, None])
+def _earlier(table: Table, every: int) -> tuple[IntArray, FloatArray]:
+    """Return the sample one control period before each, (T,), and the time since, (T,) [s]."""
+    before = np.maximum(np.arange(len(table.time_s)) - every, 0)
+    return before, np.maximum(table.time_s - table.time_s[before], 1e-9)
+
+
+def _slopes(table: Table, values: FloatArray, every: int) -> FloatArray:
+    """Return differences to the sample one control period earlier, a second: a policy sees no later one."""
+    before, seconds = _earlier(table, every)
+    return np.asarray((values - values[before]) / seconds[:, None])
 
 
 def _checked(

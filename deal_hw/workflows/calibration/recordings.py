@@ -39,7 +39,6 @@ def read_tables(
     ``printed`` has the guessed column maps that were printed already; new ones are added.
     """
     from deal_hw.data.importing.load import load_tables, tables_of
-    from deal_hw.data.importing.memory_source import read_memory
 
     tables: list[Table] = []
     joints, kinds = facts.names, kinds_of(facts)
@@ -47,6 +46,8 @@ def read_tables(
         if isinstance(source, str | Path):
             tables += load_tables(Path(source), columns, joints, say, printed, kinds)
         else:
+            from deal_hw.data.importing.memory_source import read_memory
+
             channels = read_memory(source, f"{name}[{number}]")
             tables += tables_of([channels], columns, joints, say, printed, kinds)
     return tables

@@ -1,12 +1,17 @@
-"""The steps of every calibration with recordings on the device's grid: search, judge, report, write."""
+"""The steps of every calibration with recordings on the device's grid: search, judge, report, write.
+
+A calibration that is stopped writes its best fit so far, and keeps the state from which it can continue.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -15,17 +20,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from deal_hw.calibration import (
+    BEFORE_SEARCH,
     LATENCY_RANGE_S,
     Budget,
     CalibrationResult,
+    Progress,
     ProgressCallback,
+    percent,
 )
-from deal_hw.errors import InsufficientDataError, MissingExtraError
+from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError
+from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.best_so_far import SO_FAR, BestSoFar, keeping_best, saying_how_to_resume
 from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSettings
-from deal_hw.workflows.calibration.starts import chosen_starts
 from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
@@ -35,6 +42,90 @@ if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
     from deal_hw.workflows.calibration.intake import CalibrationInput
+
+
+CHECKPOINT = "checkpoint.npz"
+SO_FAR = "so_far"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultFolder:
+    """The folder of a calibration: its state while it runs, then its results.
+
+    Attributes:
+        path: The folder.
+        resume: Continue from the state that a stopped calibration has left there.
+
+    Raises:
+        ConfigurationError: There is no such state.
+    """
+
+    path: Path
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        if self.resume and not self.checkpoint.exists():
+            raise ConfigurationError(
+                f"nothing to resume: {self.checkpoint} does not exist; leave --resume out to begin a "
+                "calibration"
+            )
+
+    @property
+    def checkpoint(self) -> Path:
+        """File of the state; removed when the results are written."""
+        return self.path / CHECKPOINT
+
+    @property
+    def so_far(self) -> Path:
+        """Folder of the best fit of a stopped calibration; removed when the results are written."""
+        return self.path / SO_FAR
+
+    def write(
+        self,
+        robot: RobotModel,
+        result: CalibrationResult,
+        report: ReportInputs | None = None,
+        *,
+        stopped: bool = False,
+    ) -> dict[str, Path]:
+        """Write a result and return its files by name. A Ctrl-C takes effect after the last file.
+
+        Args:
+            robot: The robot.
+            result: The result.
+            report: Contents of report.html; None: it is not written.
+            stopped: It is the best fit of a stopped calibration: the state to resume from stays.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C; the files are complete.
+        """
+        from deal_hw.calib.report.page import write_result
+        from deal_hw.data.files import interrupts_deferred
+
+        # A Ctrl-C here must neither lose an hour's work nor leave half of the files.
+        with interrupts_deferred():
+            files = write_result(self.so_far if stopped else self.path, robot, result, report)
+            if not stopped:
+                self.checkpoint.unlink(missing_ok=True)
+                shutil.rmtree(self.so_far, ignore_errors=True)
+        return files
+
+    @contextlib.contextmanager
+    def resumable(self) -> Iterator[None]:
+        """On Ctrl-C say where the state is and how to continue, and raise the interrupt again."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            if self.checkpoint.exists():
+                to_stderr(
+                    f"\ncalibration stopped; its state is in {self.checkpoint}. The same command with "
+                    "--resume continues, to the same result"
+                )
+            else:
+                to_stderr(
+                    "\ncalibration stopped before the search; there is no state to --resume, begin again"
+                )
+            raise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +141,85 @@ class CalibrateReport:
     files: dict[str, Path]
 
 
+class BestSoFar:
+    """Receives the progress of a calibration: keeps the best fit for an interrupt, and reports clear gains.
+
+    Args:
+        space: The parameters.
+        judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
+        and "null"; None without held-out data.
+        say: Called with a sentence on each fit whose error is 5 % lower than the one reported before, and
+            with each message before the search.
+        progress: Called with the progress, too; None: nobody else is.
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        judge: Callable[[FloatArray, float], Mapping[str, float]] | None,
+        say: Say = silent,
+        progress: ProgressCallback | None = None,
+    ) -> None:
+        self._space, self._judge, self._say, self._progress = space, judge, say, progress
+        self._began = time.monotonic()
+        self._error = self._said = math.inf
+        self.result: CalibrationResult | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        """Note a step of the calibration."""
+        if progress.estimate is not None:
+            self._compare(progress, progress.estimate)
+        if progress.stage == BEFORE_SEARCH:
+            self._say(f"{BEFORE_SEARCH}: {progress.message}")
+        if self._progress is not None:
+            self._progress(progress)
+
+    def _compare(self, progress: Progress, estimate: FloatArray) -> None:
+        """Compare a fit with the best one so far."""
+        latency_s = progress.latency_s or 0.0
+        errors = self._judge(estimate, latency_s) if self._judge is not None else {}
+        error = errors.get("calibrated", progress.values.get("chi2", math.inf))
+        if self.result is not None and not error < self._error:
+            return
+        self._error = error
+        low_high = np.stack([self._space.low, self._space.high], axis=1)
+        self.result = CalibrationResult(
+            method=f"interrupted after {progress.stage}",
+            space=self._space,
+            estimate=estimate,
+            interval=low_high,
+            latency_s=latency_s,
+            latency_interval_s=(latency_s, latency_s),
+            chi2=progress.values.get("chi2", math.nan),
+            heldout_nrmse=errors,
+            alarms=(
+                Finding.alarm(
+                    f"The calibration was interrupted after {progress.stage}, "
+                    f"{time.monotonic() - self._began:.0f} s.",
+                    "No interval was computed; the given ones are the search ranges.",
+                    "Run the same command with --resume to continue.",
+                ),
+            ),
+        )
+        if self._error > 0.95 * self._said:
+            return
+        self._said = self._error
+        self._say(f"{time.monotonic() - self._began:.0f} s, {progress.stage}: {self.sentence}")
+
+    @property
+    def sentence(self) -> str:
+        """Error of the best fit, as a sentence."""
+        if self.result is None:
+            return "no fit yet"
+        errors = self.result.heldout_nrmse
+        if errors:
+            return (
+                f"held-out error {percent(errors['calibrated'])} of the signal's range "
+                f"(your own model: {percent(errors['nominal'])})"
+            )
+        return f"residuals {math.sqrt(max(self.result.chi2, 0.0)):.2g} times the sensor's noise"
+
+
 def calibrate_input(
     settings: CalibrateSettings,
     work: CalibrationInput,
@@ -57,9 +227,7 @@ def calibrate_input(
     *,
     progress: ProgressCallback | None = None,
     say: Say = silent,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    keep: Path | None = None,
+    results: ResultFolder | None = None,
 ) -> CalibrationResult:
     """Calibrate with the settings; see :func:`calibrate_episodes`."""
     return calibrate_episodes(
@@ -76,9 +244,7 @@ def calibrate_input(
         threads=settings.threads,
         progress=progress,
         say=say,
-        checkpoint=checkpoint,
-        resume=resume,
-        keep=keep,
+        results=results,
         known_std=work.known_std,
         heldout_window_s=settings.heldout_window,
         policy=work.policy,
@@ -102,9 +268,7 @@ def calibrate_episodes(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     say: Say = silent,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    keep: Path | None = None,
+    results: ResultFolder | None = None,
     known_std: FloatArray | None = None,
     heldout_window_s: float = HELDOUT_WINDOW_S,
     smoothing_s: float | None = None,
@@ -128,9 +292,8 @@ def calibrate_episodes(
         threads: Simulation threads.
         progress: Called with the progress.
         say: Called with a sentence on each better fit, and on its file.
-        checkpoint: File for the state after each generation; None for no file.
-        resume: Continue from that file.
-        keep: Folder for the best fit so far on Ctrl-C; None for no folder.
+        results: Folder for the state after each generation, and on Ctrl-C for the best fit so far; None:
+            nothing is written.
         known_std: Standard deviation of the prediction error, positions then velocities, (2 C,); None: the
         sensor noise, estimated from the recordings.
         heldout_window_s: Held-out predictions restart from the measured state after this time [s].
@@ -171,6 +334,8 @@ def calibrate_episodes(
     )
     check_delays(problem)
     if policy is not None and search_of(method) in CLOSED_LOOP_METHODS:
+        from deal_hw.workflows.calibration.starts import chosen_starts
+
         problem.start_std = chosen_starts(problem, starts, start_std or {}, say)
 
     held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
@@ -184,15 +349,18 @@ def calibrate_episodes(
     searcher = make_method(method, refine=budget.refine, thorough=thorough)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
-    with (
-        threadpool_limits(1, user_api="blas"),
-        keeping_best(best, keep, robot) if keep is not None else contextlib.nullcontext(),
-    ):
+    with threadpool_limits(1, user_api="blas"):
         store = None
-        if checkpoint is not None:
+        if results is not None:
             identity = run_identity(problem, searcher, budget, rng)
-            store = SearchCheckpoint(checkpoint, identity, fresh=not resume)
-        result = searcher.run(problem, budget, rng, best, store)
+            store = SearchCheckpoint(results.checkpoint, identity, fresh=not results.resume)
+        try:
+            result = searcher.run(problem, budget, rng, best, store)
+        except KeyboardInterrupt:
+            if results is not None and best.result is not None:
+                results.write(robot, best.result, stopped=True)
+                to_stderr(f"\nbest so far: {best.sentence}; written to {results.so_far}, without intervals")
+            raise
     from deal_hw.calib.validation.checks import latency_alarms
 
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
@@ -237,9 +405,8 @@ def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None
 def finish(
     work: CalibrationInput,
     result: CalibrationResult,
-    folder: Path,
+    results: ResultFolder,
     settings: Mapping[str, Any],
-    checkpoint: Path,
     *,
     page: bool = True,
     advise: bool = True,
@@ -250,9 +417,8 @@ def finish(
     Args:
         work: The inputs.
         result: The result.
-        folder: Where to write.
+        results: Where to write.
         settings: More provenance: plain JSON values.
-        checkpoint: File of the state to resume from; removed after the results are written.
         page: Write report.html.
         advise: Compute which motion to record next for weak parameters.
         threads: Simulation threads.
@@ -260,19 +426,14 @@ def finish(
     Raises:
         KeyboardInterrupt: Ctrl-C. A message says whether there are results; if so, they are complete.
     """
-    from deal_hw.calib.report.page import write_result
-    from deal_hw.data.files import interrupts_deferred
-
-    with saying_how_to_resume(checkpoint):
+    with results.resumable():
         result, report = judged(work, result, settings, page=page, advise=advise, threads=threads)
     try:
-        # A Ctrl-C here must neither lose an hour's work nor leave half of the files.
-        with interrupts_deferred():
-            files = write_result(folder, work.robot, result, report)
-            checkpoint.unlink(missing_ok=True)
-            shutil.rmtree(folder / SO_FAR, ignore_errors=True)
+        files = results.write(work.robot, result, report)
     except KeyboardInterrupt:
-        to_stderr(f"\ninterrupted after the end of the calibration: the results in {folder} are complete")
+        to_stderr(
+            f"\ninterrupted after the end of the calibration: the results in {results.path} are complete"
+        )
         raise
     return CalibrateReport(result=result, files=files)
 

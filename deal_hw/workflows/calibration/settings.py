@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
 from deal_hw.calib.pipeline.methods import (
     CLOSED_LOOP_METHODS,
@@ -27,7 +27,6 @@ from deal_hw.data.files import dataset_of
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
-from deal_hw.workflows.calibration.policy import check_policy_runs, refuse_closed_loop
 from deal_hw.workflows.calibration.source import Division
 from deal_hw.workflows.kinds import InputKind, Kinds, fitting
 from deal_hw.workflows.options import File, Ratio, Seed, Threads
@@ -209,8 +208,8 @@ class CalibrateSettings(Checked):
             space = space.with_free(self.free)
         if self.range_ratio is not None:
             space = space.with_ratio(self.range_ratio)
-        space = space.with_known(dict(_pairs(self.known)))
-        for parameter, low, high in _triples(self.range):
+        space = space.with_known(dict(self.known))
+        for parameter, low, high in cast(Triples, self.range):
             space = space.with_range(parameter, low, high)
         if not len(space):
             raise ConfigurationError(
@@ -230,7 +229,7 @@ class DatasetSettings(CalibrateSettings):
     """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out
     ones."""
 
-    holdout: Annotated[int | tuple[int, ...], Range(0, 1_000_000)] = ()
+    holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
     """Held-out episodes, which only test the result, by number (the first is 0). By default those collected
     with --motion chirp."""
 
@@ -239,19 +238,14 @@ class DatasetSettings(CalibrateSettings):
     period."""
 
     def __post_init__(self) -> None:
-        self._keep(dataset=dataset_of(self.dataset), holdout=_listed(self.holdout))
-        self._keep(episodes=_listed(self.episodes))
-        wrong = [str(one) for one in _listed(self.holdout) if not isinstance(one, int)]
+        judges: tuple[Any, ...] = _listed(self.holdout)
+        self._keep(dataset=dataset_of(self.dataset), episodes=_listed(self.episodes), holdout=judges)
+        wrong = [str(one) for one in judges if not isinstance(one, int)]
         if wrong:
             raise ConfigurationError(
                 f"--holdout {' '.join(wrong)}: with a dataset give episode numbers; files go with --model"
             )
         super().__post_init__()
-
-    @property
-    def judges(self) -> tuple[int, ...]:
-        """Held-out episodes."""
-        return _listed(self.holdout)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,8 +266,10 @@ class DriverDatasetSettings(DatasetSettings):
     def check(self) -> None:
         """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
         super().check()
-        if self.policy is not None:
-            check_policy_runs(self.named())
+        if self.policy is not None and not self.in_closed_loop:
+            raise ConfigurationError(
+                f"--policy would have no effect: {search_of(self.named())} runs no policy"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,7 +327,7 @@ class Recordings(Divided):
 
     feet: tuple[str, ...] = ()
     """Sphere geoms of the feet of a floating robot. The standing feet give the base's height and velocity;
-    recordings must contain the base's orientation and gyro."""
+    recordings must contain the base's orientation and gyro. Not with base_position in the column map."""
 
     leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
     """Parts of recordings that the model cannot explain, such as contacts: FILE FROM TO [s from start]."""
@@ -344,16 +340,18 @@ class Recordings(Divided):
 class UserRobotSettings(Divided, CalibrateSettings):
     """Settings of a calibration of a user's robot."""
 
-    def check(self) -> None:
-        """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
-        super().check()
-        if not self.knows_policy:
-            refuse_closed_loop(self.named())
+    def refuse_unknown_policy(self) -> None:
+        """Refuse a method that runs the policy that moved the robot, where nobody knows that policy.
 
-    @property
-    def knows_policy(self) -> bool:
-        """Whether the policy that moved the robot was named, or may be noted in the recordings."""
-        raise NotImplementedError
+        Raises:
+            ConfigurationError: The method does.
+        """
+        if self.in_closed_loop:
+            raise ConfigurationError(
+                f"{search_of(self.named())} runs the policy that moved the robot, which is unknown for "
+                "--model without --policy FILE.onnx, and for a dataset with its own robot.yaml that was "
+                "imported without it; name it, or use eki, deal or deal-paper-replay"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -363,11 +361,6 @@ class OwnDatasetSettings(UserRobotSettings, DatasetSettings):
     policy: File | None = None
     """The policy (.onnx) that moved the robot: it checks the clock of recorded commands. Methods that run it
     in every simulator need it, such as deal-unaligned; by default the one of `data import --policy`."""
-
-    @property
-    def knows_policy(self) -> bool:
-        """See :attr:`UserRobotSettings.knows_policy`; the reader of the dataset says if it is unknown."""
-        return True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,15 +384,11 @@ class FilesSettings(UserRobotSettings, Recordings):
     """The policy (.onnx) that moved the robot: it gives the commands of recordings without any, and checks
     the clock of recorded ones. Methods that run it in every simulator need it, such as deal-unaligned."""
 
-    @property
-    def knows_policy(self) -> bool:
-        """Whether the policy that moved the robot was named."""
-        return self.policy is not None
-
-    @property
-    def judges(self) -> tuple[Any, ...]:
-        """Held-out recordings."""
-        return _listed(self.holdout)
+    def check(self) -> None:
+        """Check the combination of settings; errors as :meth:`CalibrateSettings.check`."""
+        super().check()
+        if self.policy is None:
+            self.refuse_unknown_policy()
 
     def __post_init__(self) -> None:
         self._keep(data=_listed(self.data), holdout=_listed(self.holdout), feet=_words(self.feet))

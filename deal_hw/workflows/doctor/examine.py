@@ -16,13 +16,12 @@ from deal_hw.errors import DealHwError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
 from deal_hw.ranges import Checked, Range
 from deal_hw.robot import Robot
-from deal_hw.robots import (
-    default_transport,
+from deal_hw.robots import default_transport, plug_ins
+from deal_hw.robots.connect import (
     make_robot,
     make_topic_transport,
     on_this_computer,
     other_wires,
-    plug_ins,
     reached_over,
 )
 from deal_hw.transport import WireOptions

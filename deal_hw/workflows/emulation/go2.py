@@ -19,7 +19,8 @@ from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.errors import ConfigurationError, MissingExtraError, shown
 from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
-from deal_hw.robots import make_topic_transport, robot_entry
+from deal_hw.robots import robot_entry
+from deal_hw.robots.connect import make_topic_transport
 from deal_hw.workflows.emulation.common import (
     choose_truth,
     happenings,

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from deal_hw.robots import reached_over, robot_entry
+from deal_hw.robots import robot_entry
+from deal_hw.robots.connect import reached_over
 from deal_hw.robots.emulation import Emulation, EmulatorRequest
 from deal_hw.testing.faults import FaultRates
 from deal_hw.workflows.emulation.common import read_truth, serve

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import Clock, VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import read_trajectory

@@ -15,7 +15,7 @@ from deal_hw.control.process.claim import LocalClaim
 from deal_hw.control.process.realtime import TRANSPORT_PRIORITY, priority
 from deal_hw.control.process.run_note import RunNote
 from deal_hw.robot import Robot
-from deal_hw.robots import claim_name, wire_claim
+from deal_hw.robots.connect import claim_name, wire_claim
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.say import Say
 

@@ -111,7 +111,7 @@ def _run(
     from deal_hw.motions.planned_end import PlannedEnd
     from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, velocity_data
     from deal_hw.motions.velocity import END_KEY, KeyboardVelocity, NotedVelocity
-    from deal_hw.robots import adopt_robot, make_robot
+    from deal_hw.robots.connect import adopt_robot, make_robot
     from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
     plan = RunPlan.from_json(orders)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.loop.control_loop import Outcome
 from deal_hw.control.loop.timing import LoopTimingReport
 from deal_hw.control.process.channel import (
     CONNECTING,
@@ -19,6 +18,7 @@ from deal_hw.control.process.channel import (
     MAKING_PASSIVE,
     STARTING,
     Beat,
+    Outcome,
 )
 from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.supervisor import ChildEnd, Supervisor
@@ -27,15 +27,12 @@ from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.errors import DealHwError
-from deal_hw.motions.scores.balance import BalanceResult
-from deal_hw.motions.scores.replay_error import ReplayError, replay_error
-from deal_hw.motions.scores.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.robot import Robot
-from deal_hw.robots import balanced, on_this_computer, robot_entry, walked
+from deal_hw.robots import balanced, robot_entry, walked
+from deal_hw.robots.connect import on_this_computer
 from deal_hw.signals import OPERATOR, name
 from deal_hw.version import __version__
 from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
-from deal_hw.workflows.running.keyboard import keys
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.sleep_lock import ASLEEP
@@ -43,6 +40,9 @@ from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.replay_error import ReplayError
+    from deal_hw.motions.scores.velocity_error import VelocityError
     from deal_hw.types import Trajectory
 
 
@@ -117,12 +117,11 @@ class EpisodeRun:
         )
         if self._stop_cause:
             supervisor.stop(self._stop_cause)
-        listening = (
-            keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say)
-            if self._plan.velocity == "keyboard"
-            else contextlib.nullcontext()
-        )
-        with listening:
+        with contextlib.ExitStack() as listening:
+            if self._plan.velocity == "keyboard":
+                from deal_hw.workflows.running.keyboard import keys
+
+                listening.enter_context(keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say))
             self._say_passive(None)
             end = supervisor.run()
             self._say_passive(end.passive_confirmed)
@@ -175,6 +174,8 @@ class EpisodeRun:
         """Return how well the robot followed the requested velocity, by its own sensors."""
         if not robot_entry(self._plan.robot).odometry:
             return None
+        from deal_hw.motions.scores.velocity_error import velocity_error, wanted_velocity
+
         wanted, track = wanted_velocity(trajectory), walked(self._plan.robot, trajectory)
         return None if wanted is None or track is None else velocity_error(track, wanted)
 
@@ -188,6 +189,8 @@ class EpisodeRun:
         """Return the distance of a replay's motion from the recorded one."""
         if self._plan.motion != "replay":
             return None
+        from deal_hw.motions.scores.replay_error import replay_error
+
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
         return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
 

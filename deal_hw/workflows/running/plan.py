@@ -10,21 +10,13 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.motions.excitation.level import with_excitation_level
-from deal_hw.motions.excitation.plan import (
-    FAMILIES,
-    ExcitationBehaviour,
-    ExcitationDesign,
-    ExcitationPlan,
-    make_plan,
-    read_plan,
-)
 from deal_hw.motions.planned_end import PlannedEnd
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.motions.velocity import (
@@ -38,6 +30,9 @@ from deal_hw.policy import VERDICT, Policy
 from deal_hw.schema import OPEN, from_values, plain
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.running.view import RunView
+
+if TYPE_CHECKING:
+    from deal_hw.motions.excitation.plan import ExcitationPlan
 
 Motion = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
 """Motions of a run; `balance` runs the policy all the time."""
@@ -258,6 +253,8 @@ def _inner_behaviour(
 
         return ReplayBehaviour(read_trajectory(Path(plan.recording)), description)
     if plan.motion == "excite":
+        from deal_hw.motions.excitation.plan import ExcitationBehaviour
+
         excitation = find_excitation(plan, description)
         balance = PolicyBehaviour(policy(), description) if excitation.balance_s > 0 else None
         return ExcitationBehaviour(excitation, description, balance)
@@ -277,6 +274,8 @@ def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationP
     Raises:
         ConfigurationError: The file is no plan, is for another robot, or has another length than the run.
     """
+    from deal_hw.motions.excitation.plan import FAMILIES, ExcitationDesign, make_plan, read_plan
+
     if plan.excite in FAMILIES:
         balance_s = min(plan.rich.balance_s, 0.5 * plan.seconds) if plan.policy else 0.0
         design = ExcitationDesign(

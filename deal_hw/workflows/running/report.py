@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deal_hw import errors
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.loop.timing import LoopTimingReport
-from deal_hw.data.recording.excitation import Excitation
+from deal_hw.control.process.channel import Outcome
 from deal_hw.documentation import page
-from deal_hw.motions.scores.balance import FALLEN_RAD, BalanceResult
-from deal_hw.motions.scores.replay_error import ReplayError
-from deal_hw.motions.scores.velocity_error import VelocityError
 from deal_hw.workflows.say import html_table, text_table
+
+if TYPE_CHECKING:
+    from deal_hw.control.loop.timing import LoopTimingReport
+    from deal_hw.data.recording.excitation import Excitation
+    from deal_hw.motions.scores.balance import BalanceResult
+    from deal_hw.motions.scores.replay_error import ReplayError
+    from deal_hw.motions.scores.velocity_error import VelocityError
 
 _HEAD = ("episode", "outcome", "reason", "states", "clipped cycles", "recording")
 _EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
@@ -103,6 +105,8 @@ class EpisodeReport:
                 f"{self.walk.yaw_rad_s:.2f} rad/s over {self.walk.seconds:.0f} s of walking"
             )
         if self.balance is not None:
+            from deal_hw.motions.scores.balance import FALLEN_RAD
+
             lines.append(
                 f"  pole upright (within {FALLEN_RAD} rad) for {self.balance.upright_s:.1f} of "
                 f"{self.balance.duration_s:.1f} s; mean |angle| {self.balance.angle_error_rad:.3f} rad, "

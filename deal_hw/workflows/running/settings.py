@@ -1,4 +1,4 @@
-"""Options of collect, deploy and replay: the connection to the robot, and options of robots with legs."""
+"""Options of collect, deploy and replay: the connection, robots with legs, and simulated robots."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
 from deal_hw.motions.posture import PostureConfig
-from deal_hw.ranges import Checked, option
+from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.ranges import Checked, Range, option
 from deal_hw.robots import default_transport, driver_description
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import FROM_PYTHON, File, given, refuse
+from deal_hw.workflows.options import FROM_PYTHON, File, Ratio, Seed, given, refuse
+from deal_hw.workflows.robot_kinds import NO_DRIVER
 from deal_hw.workflows.say import Say, silent
 
 
@@ -134,10 +137,41 @@ class Go2RunOptions(RunOptions):
     """The connection to the robot, beyond the port."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions(Checked):
+    """Hidden truth of a simulated robot; noise and step of its sensors are those of robot.yaml."""
+
+    simulated: bool = False
+    """Record a simulation of the robot of a robot.yaml, with hidden parameters, faster than real time. Needs
+    no robot and no --port."""
+
+    truth_seed: Seed = 0
+    """Simulated: seed of the hidden parameters and the noise."""
+
+    truth_ratio: Annotated[float, Ratio] = 1.5
+    """Simulated: hidden parameters lie within this factor of the MJCF's."""
+
+    truth_latency: Annotated[float, Range(0, LONGEST_LATENCY_S, "s")] = 0.005
+    """Simulated: delay from a command to its effect [s]."""
+
+    reveal_to: File | None = None
+    """Simulated: write the hidden truth to this JSON file."""
+
+
 def legs_of(options: RunOptions) -> StandOptions | None:
     """Return the options of a robot with legs; None for a robot without."""
     legs: StandOptions | None = getattr(options, "legs", None)
     return legs
+
+
+def require_simulation(robot: str, options: SimulationOptions) -> None:
+    """Check that the simulation of a user's robot is asked for: the robot itself has no driver.
+
+    Raises:
+        ConfigurationError: It is not.
+    """
+    if not options.simulated:
+        raise ConfigurationError(f"{robot}: {NO_DRIVER}")
 
 
 def refuse_unrecorded(options: RunOptions, record: bool) -> None:

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import signal
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.safety import Safety
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.record import CycleRecord
-from deal_hw.errors import ConfigurationError, MissingExtraError
-from deal_hw.parameters import LONGEST_LATENCY_S
-from deal_hw.ranges import Checked, Range
+from deal_hw.errors import MissingExtraError
 from deal_hw.version import __version__
-from deal_hw.workflows.options import File, Ratio, Seed
 from deal_hw.workflows.robot import default_space, user_robot
-from deal_hw.workflows.robot_kinds import NO_DRIVER
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.settings import SimulationOptions
 from deal_hw.workflows.running.supervised import InterruptedRunError, play_episodes
 from deal_hw.workflows.running.view import RunView
 
@@ -31,37 +28,6 @@ if TYPE_CHECKING:
     from deal_hw.sim.robots.simulated import SimulatedRobot
 
 _START_NS = 1_000_000_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulationOptions(Checked):
-    """Hidden truth of a simulated robot; noise and step of its sensors are those of robot.yaml."""
-
-    simulated: bool = False
-    """Record a simulation of the robot of a robot.yaml, with hidden parameters, faster than real time. Needs
-    no robot and no --port."""
-
-    truth_seed: Seed = 0
-    """Simulated: seed of the hidden parameters and the noise."""
-
-    truth_ratio: Annotated[float, Ratio] = 1.5
-    """Simulated: hidden parameters lie within this factor of the MJCF's."""
-
-    truth_latency: Annotated[float, Range(0, LONGEST_LATENCY_S, "s")] = 0.005
-    """Simulated: delay from a command to its effect [s]."""
-
-    reveal_to: File | None = None
-    """Simulated: write the hidden truth to this JSON file."""
-
-
-def require_simulation(robot: str, options: SimulationOptions) -> None:
-    """Check that the simulation of a user's robot is asked for: the robot itself has no driver.
-
-    Raises:
-        ConfigurationError: It is not.
-    """
-    if not options.simulated:
-        raise ConfigurationError(f"{robot}: {NO_DRIVER}")
 
 
 def run_simulated(

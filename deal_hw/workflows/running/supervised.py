@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING
 
 from deal_hw import errors
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.loop.control_loop import Outcome
-from deal_hw.control.process.channel import Beat
+from deal_hw.control.process.channel import Beat, Outcome
 from deal_hw.description import RobotDescription
 from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
-from deal_hw.robots import make_robot
+from deal_hw.robots.connect import make_robot
 from deal_hw.workflows.options import File
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun
-from deal_hw.workflows.running.keyboard import check_terminal
 from deal_hw.workflows.running.plan import RunPlan, check_plan
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.sleep_lock import ASLEEP, awake
@@ -124,6 +122,8 @@ def run_episodes(
         raise errors.ConfigurationError(f"--episodes {episodes}: give at least 1")
     plan = dataclasses.replace(plan, port=port)
     if plan.velocity == "keyboard":
+        from deal_hw.workflows.running.keyboard import check_terminal
+
         check_terminal()
     robot = make_robot(
         plan.robot,
