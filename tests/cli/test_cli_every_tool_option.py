@@ -143,6 +143,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "seeds": ("7",),
     "space": ("k11",),
     "start": ("start.safetensors",),
+    "start_std": ("shoulder.velocity", "0.1"),
     "steps": ("1000",),
     "task": ("ant",),
     "track_to": ("track.csv",),

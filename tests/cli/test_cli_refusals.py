@@ -293,7 +293,7 @@ ENTRIES: Lines = [
     ("{kind: dof_damping, elements: elbow, group: some}", "unknown group 'some'; known: each, together"),
 ]
 COLUMNS: Lines = [
-    ("gyro: {column: gyro, unit: rpm}", "unknown unit of a gyroscope 'rpm'; known: rad, deg"),
+    ("gyro: {column: gyro, unit: rpm}", "unknown unit of gyro 'rpm'; known: rad, deg"),
     ("gyro: gyro", "gyro has shape (300, 2); it has 3 columns, x y z"),
     ("orientation: quat", "orientation has shape (300, 3); a quaternion has 4 columns"),
     ("orientation: short", "orientation has 299 rows, time has 300"),
