@@ -54,6 +54,10 @@ USUAL_TRANSITIONS = 200
 TRANSITIONS = {"go2": 250, "allegro": 600}
 """Robots with another number there. A demonstration of 5 s (12 s) has as many, at 50 Hz."""
 
+DRAWN_TICKS = 25
+"""Control periods of a rollout from a drawn start state. Longer ones show slow effects, shorter ones diverge
+less from the recording. Half a second at 50 Hz is a choice; it was not tuned."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitnessSettings:
@@ -63,8 +67,6 @@ class FitnessSettings:
         window_ticks: Window length of `trajectory` in control periods.
         ticks: Most transitions of a rollout (`critic`, `energy`, `mmd`); None for the robot's own number in
             `TRANSITIONS`.
-        rollout_ticks: Control periods of a rollout from a drawn start state. Longer ones show slow effects,
-            shorter ones diverge less from the recording.
         replay: Roll out with the recorded commands, not with the policy in closed loop (Algorithm 1, line 3).
         difference: Score (s, a, s' - s) instead of the paper's (s, a, s'). The information is the same. But s
             and s' differ by only a hundredth of their range, which a first layer hardly sees.
@@ -80,7 +82,6 @@ class FitnessSettings:
 
     window_ticks: int = 10
     ticks: int | None = None
-    rollout_ticks: int = 25
     replay: bool = False
     difference: bool = False
     standardise: bool = True
@@ -88,7 +89,7 @@ class FitnessSettings:
     replay_generations: int | None = 1
 
     def __post_init__(self) -> None:
-        for name in ("window_ticks", "ticks", "rollout_ticks"):
+        for name in ("window_ticks", "ticks"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {value}")
@@ -215,7 +216,7 @@ class RolloutView:
             self._parts = [
                 (index, ticks)
                 for index in every
-                for ticks in drawn_ticks(problem, index, most, settings.rollout_ticks, rng, **past)
+                for ticks in drawn_ticks(problem, index, most, DRAWN_TICKS, rng, **past)
             ]
         shown = self._shown()
         self._columns = np.flatnonzero(np.concatenate([shown, np.ones(problem.commands, dtype=bool), shown]))
