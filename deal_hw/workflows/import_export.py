@@ -108,12 +108,14 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     printed: dict[str, str] = {}
     kinds = None if facts is None else kinds_of(facts)
     tables = [table for path in foreign for table in load_tables(path, columns, joints, say, printed, kinds)]
+    policy = None
     if facts is not None:
         if config.policy is not None:
             from deal_hw.policies.onnx_runtime import OnnxPolicy
             from deal_hw.workflows.calibration.policy_commands import with_commands_of
 
-            tables = with_commands_of(OnnxPolicy(config.policy), tables, facts, say)
+            policy = OnnxPolicy(config.policy)
+            tables = with_commands_of(policy, tables, facts, say)
         tables = at_rest_without_commands(tables, facts, say)
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
     if episodes:
@@ -173,8 +175,8 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
 
         with Dataset.create_or_open(config.out, values, say) as dataset:
             store_robot(robot, config.out)
-            if config.policy is not None:
-                dataset.keep_policy(config.policy, digest_of_file(config.policy))
+            if policy is not None:
+                dataset.keep_policy(policy.path, policy.digest)
     noted = [{"plausibility": problems, "source": source} for source in sources]
     return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
 

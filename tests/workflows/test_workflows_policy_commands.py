@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,14 @@ pytestmark = pytest.mark.real_time
 
 STATES_A_TICK = 4
 """State samples of the cart-pole in one of its control periods."""
+BRIEF: dict[str, Any] = {
+    "method": "moments-unaligned",
+    "free": ("cart.frictionloss", "cart.servo_stiffness"),
+    "population": 8,
+    "generations": 2,
+    "threads": 1,
+}
+"""A search that only shows that it runs."""
 
 
 @pytest.fixture(scope="module")
@@ -207,11 +216,7 @@ def test_states_alone_are_compared_as_distributions(
         DESCRIPTION.mjcf,
         [states_file(table, tmp_path)],
         policy=policy.path,
-        method="moments-unaligned",
-        free=("cart.frictionloss", "cart.servo_stiffness"),
-        population=8,
-        generations=2,
-        threads=1,
+        **BRIEF,
         say=printed.append,
     )
     assert any("no commands, so they are those of" in line for line in printed)
@@ -289,11 +294,7 @@ def test_a_dataset_of_states_alone_keeps_its_policy(own: Path, policy: OnnxPolic
     printed: list[str] = []
     found = deal_hw.calibrate(
         dataset=dataset,
-        method="moments-unaligned",
-        free=("cart.frictionloss", "cart.servo_stiffness"),
-        population=8,
-        generations=2,
-        threads=1,
+        **BRIEF,
         say=printed.append,
     )
     assert found.result.provenance["compares"] == "distributions"

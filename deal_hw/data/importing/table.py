@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import POSITION_UNITS, TIME_UNITS, ColumnMap, JointColumns, Vector
@@ -64,6 +63,8 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
     for name, values in of_base.items():
         if values is not None and len(values) != time_s.size:
             raise DatasetError(f"{channels.path}: {name} has {len(values)} rows, time has {time_s.size}")
+    if speed is not None and columns.base_velocity is not None and columns.base_velocity.frame == "base":
+        speed = _in_world(channels, speed, orientation)
     kept = np.asarray(~np.isnan(position).all(axis=1))
     sent = ~np.isnan(target).all(axis=1) if target.size else np.zeros(command_s.size, dtype=bool)
     if not kept.any():
@@ -85,7 +86,7 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
         orientation=None if orientation is None else orientation[kept],
         gyro=None if gyro is None else gyro[kept],
         base_position=None if place is None else place[kept],
-        base_velocity=_in_world(channels, columns.base_velocity, speed, orientation, kept),
+        base_velocity=None if speed is None else speed[kept],
         source={
             "file": channels.path.name,
             "part": channels.part,
@@ -285,25 +286,16 @@ def _triple(channels: Channels, name: str, vector: Vector | None) -> FloatArray 
     return POSITION_UNITS[vector.unit] * values
 
 
-def _in_world(
-    channels: Channels,
-    vector: Vector | None,
-    velocity: FloatArray | None,
-    orientation: FloatArray | None,
-    kept: npt.NDArray[np.bool_],
-) -> FloatArray | None:
-    """Return the kept rows of a base's velocity with the world's axes, (T, 3), or None."""
-    if vector is None or velocity is None or vector.frame == "world":
-        return None if velocity is None else velocity[kept]
+def _in_world(channels: Channels, velocity: FloatArray, orientation: FloatArray | None) -> FloatArray:
+    """Return a base's velocity, (T, 3), which has the base's axes, with those of the world."""
     if orientation is None:
         raise DatasetError(
             f"{channels.path}: base_velocity has the base's axes, and there is no orientation to turn them; "
             "name it in the column map"
         )
-    w, axis, v = orientation[kept, :1], orientation[kept, 1:], velocity[kept]
-    # v + 2 w (u x v) + 2 u x (u x v), with the quaternion (w, u) of the base in the world.
-    turned = np.cross(axis, v)
-    return np.asarray(v + 2.0 * (w * turned + np.cross(axis, turned)))
+    from deal_hw.sim.legged.velocity_filter import rotated
+
+    return rotated(orientation, velocity)
 
 
 TURN = 2 * np.pi

@@ -62,8 +62,6 @@ def imported_policy(
         InsufficientDataError: The episodes were imported with different policies.
         PolicyError: The file cannot be run.
     """
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-
     digests = sorted({str(run.get("import", {}).get(NOTED_POLICY, "")) for run in runs.values()})
     if len(digests) > 1:
         raise InsufficientDataError(
@@ -71,24 +69,9 @@ def imported_policy(
             "without one; name episodes of one policy (--episodes, --holdout)"
         )
     (noted,) = digests
-    if given is not None:
-        policy = OnnxPolicy(given)
-        if noted and not policy.digest.startswith(noted):
-            raise ConfigurationError(
-                f"{given} is not the policy with which the recordings were imported: its SHA-256 begins "
-                f"with {policy.digest[:16]}, that one's with {noted}; leave --policy out, or name the right "
-                "file"
-            )
-        return policy
-    if not noted:
+    if given is None and not noted:
         return None
-    kept = dataset.policy_path(noted)
-    if not kept.is_file():
-        raise ConfigurationError(
-            f"{dataset.folder} has no copy of the policy that moved the robot (its SHA-256 begins with "
-            f"{noted}); name its file: --policy FILE"
-        )
-    return OnnxPolicy(kept)
+    return _opened(dataset, noted, given, "with which the recordings were imported")
 
 
 def recorded_policy(
@@ -110,7 +93,6 @@ def recorded_policy(
     """
     from deal_hw.motions.velocity import FixedVelocity, make_source
     from deal_hw.policies.demonstration import PopulationDemonstration
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
 
     for index, run in runs.items():
         _refuse_other_motion(index, run)
@@ -129,8 +111,28 @@ def recorded_policy(
             f"the requested velocity of the recordings changes (it is {wish!r}), but the simulators take "
             "one fixed velocity; record with --velocity X,Y,YAW"
         )
+    policy = _opened(dataset, digest, given, "that moved the robot")
+    ahead, left, turn = source.reach()[0]
+    return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))
+
+
+def _opened(dataset: Dataset, digest: str, given: Path | None, which: str) -> OnnxPolicy:
+    """Return the policy of a file, by default of the copy in a dataset, whose recordings note its digest.
+
+    Args:
+        dataset: The dataset.
+        digest: Beginning of the SHA-256 that the recordings note; "" for none.
+        given: The file that was named.
+        which: Which policy the recordings note, for the message.
+
+    Raises:
+        ConfigurationError: The file is another policy, or the dataset has no copy of it.
+        PolicyError: The file cannot be run.
+    """
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
     file = given or dataset.policy_path(digest)
-    if not file.is_file():
+    if given is None and not file.is_file():
         raise ConfigurationError(
             f"{dataset.folder} has no copy of the policy that moved the robot (its SHA-256 begins with "
             f"{digest or 'unknown'}); name its file: --policy FILE"
@@ -138,11 +140,10 @@ def recorded_policy(
     policy = OnnxPolicy(file)
     if digest and not policy.digest.startswith(digest):
         raise ConfigurationError(
-            f"{file} is not the policy that moved the robot: its SHA-256 begins with {policy.digest[:16]}, "
-            f"that of the recordings' policy with {digest}; leave --policy out, or name the right file"
+            f"{file} is not the policy {which}: its SHA-256 begins with {policy.digest[:16]}, that of the "
+            f"recordings' policy with {digest}; leave --policy out, or name the right file"
         )
-    ahead, left, turn = source.reach()[0]
-    return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))
+    return policy
 
 
 def policy_of_files(

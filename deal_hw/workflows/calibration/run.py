@@ -333,7 +333,8 @@ def calibrate_episodes(
         policy=policy,
     )
     check_delays(problem)
-    if policy is not None and search_of(method) in CLOSED_LOOP_METHODS:
+    in_loop = policy is not None and search_of(method) in CLOSED_LOOP_METHODS
+    if in_loop:
         from deal_hw.workflows.calibration.starts import chosen_starts
 
         problem.start_std = chosen_starts(problem, starts, start_std or {}, say)
@@ -365,7 +366,7 @@ def calibrate_episodes(
 
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
     provenance = result.provenance
-    if problem.policy is not None and search_of(method) in CLOSED_LOOP_METHODS:
+    if in_loop:
         provenance = {
             **provenance,
             "start_states": "recorded" if problem.start_std is None else "drawn",
