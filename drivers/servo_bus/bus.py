@@ -26,6 +26,8 @@ _STATUS_BYTES = 11
 """A status packet without data: header 4, id, length 2, instruction, error, CRC 2."""
 _PING_BYTES = _STATUS_BYTES + 3
 _ALERT = 0x80
+_STUFFING_BYTES = 16
+"""Additional bytes that a group's answer has time for."""
 
 
 class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
@@ -201,6 +203,9 @@ class Bus(ServoBus):
     def answer_bytes(servos: int, size: int, fast: bool) -> int:
         """Return the number of bytes of a group's answer; ``fast`` is a Fast Sync Read."""
         return 8 + servos * (size + 4) if fast else servos * (size + _STATUS_BYTES)
+
+    def _wire_bytes(self, servos: int, size: int, fast: bool) -> int:
+        return self.answer_bytes(servos, size, fast) + _STUFFING_BYTES
 
     def _collect(self, wanted: WantedAnswer) -> dict[int, bytes] | None:
         if not self._whole(wanted):

@@ -18,8 +18,6 @@ from deal_hw.transport import Message, Transport
 BITS_PER_BYTE: Final = 10
 """On the wire: start bit, 8 data bits, stop bit."""
 _QUEUE: Final = 4096
-_SPARE_BYTES: Final = 16
-"""Stuffing bytes that a group's answer may have, for its time on the wire."""
 
 Writes: TypeAlias = Sequence[tuple[int, Mapping[int, bytes]]]
 """Sync writes: an address, and the bytes that each servo gets there."""
@@ -202,10 +200,10 @@ class ServoBus(abc.ABC):
             self._forget()
         self._put_writes(writes)
         self._put_group_read(servos, address, size, fast)
+        within_ns = self._port.answer_ns(self._wire_bytes(len(servos), size, fast))
         now_ns = self._clock.now_ns()
         self._port.flush()
-        length = self.answer_bytes(len(servos), size, fast) + _SPARE_BYTES
-        self._wanted.append(WantedAnswer(tuple(servos), size, fast, now_ns + self._port.answer_ns(length)))
+        self._wanted.append(WantedAnswer(tuple(servos), size, fast, now_ns + within_ns))
         return now_ns
 
     def take(self, deadline_ns: int) -> dict[int, bytes] | None:
@@ -246,6 +244,10 @@ class ServoBus(abc.ABC):
     @abc.abstractmethod
     def _put_group_read(self, servos: Sequence[int], address: int, size: int, fast: bool) -> None:
         """Write the request for the same registers of servos to the port."""
+
+    @abc.abstractmethod
+    def _wire_bytes(self, servos: int, size: int, fast: bool) -> int:
+        """Return the bytes that a group's answer waits for, before its request is sent."""
 
     @abc.abstractmethod
     def _collect(self, wanted: WantedAnswer) -> dict[int, bytes] | None:
