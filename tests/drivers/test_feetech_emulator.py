@@ -314,18 +314,31 @@ def test_the_eeproms_lock(rig: Rig, lock: int, kept: int) -> None:
 
 
 def test_a_restart_is_silent_and_forgets_ram(rig: Rig) -> None:
-    """0.8 s without an answer; then torque off, goal 0 and the torque limit of the EEPROM."""
+    """0.8 s without an answer; then torque off, no goal and the torque limit of the EEPROM."""
     rig.command(r.LOCK, 0)
     rig.command(r.MAX_TORQUE, 500)
     assert rig.servo.torque_limit == 1000
     rig.command(r.TORQUE_ENABLE, 1)
     rig.command(r.GOAL_POSITION, 3000)
+    rig.servo.sense(1500)
     rig.servo.reboot(rig.clock.now_ns())
     with pytest.raises(TransportTimeoutError):
         rig.bus.read(1, r.ID)
     rig.wait(BOOT_NS / 1e9)
     block = rig.blocks()[1]
-    assert (block.torque_mode, block.goal_position, block.torque_limit) == (TorqueMode.OFF, 0, 500)
+    assert (block.torque_mode, block.goal_position, block.torque_limit) == (TorqueMode.OFF, 1500, 500)
+
+
+def test_a_goal_is_the_present_position_until_one_is_written(rig: Rig) -> None:
+    """A hand turns the servo: with torque it stays there. An old goal is not forgotten with the torque."""
+    rig.servo.sense(1000)
+    rig.command(r.TORQUE_ENABLE, 1)
+    rig.servo.sense(990)
+    assert rig.servo.goal == rig.number(r.GOAL_POSITION) == 1000
+    rig.command(r.TORQUE_ENABLE, 0)
+    rig.servo.sense(3000)
+    rig.command(r.TORQUE_ENABLE, 1)
+    assert rig.servo.goal == 1000
 
 
 def test_a_new_id_and_response_level(rig: Rig) -> None:

@@ -74,7 +74,7 @@ class FeetechBus(ServoBus):
         return Answer(int.from_bytes(model, "little"), 100 * data[0] + data[1])
 
     def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
-        """Return all servos that answer a broadcast ping within a time [s].
+        """Return all servos that answer a broadcast ping within a time [s]; LeRobot waits 0.8 s.
 
         Then each is asked for its model and firmware. A servo whose answers stay corrupt, as those of two
         servos with one id, is left out; :attr:`errors` counts its answers.

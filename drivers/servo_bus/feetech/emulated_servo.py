@@ -3,8 +3,9 @@
 What no source says, and so is assumed here:
 
 - A value out of its range and a write to a read-only register change nothing; the confirmation is the same.
-- After a restart the goal is 0, and with torque the servo turns there. What a real servo does with the goal
-  that it has at switching on is unknown; write the present position as goal first.
+- After a restart the goal is the present position until a host writes one: LeRobot switches the torque on
+  without a goal, and its users' arms stay where they are. Feetech's table says 0. A goal written before
+  stays, and with torque the servo turns there: write the present position as goal first.
 - In one-turn mode (Phase, bit 4 is 0) the position wraps around from 4095 to 0, after the homing offset.
 - An overload or over-current ends when a host switches the torque off, or writes a goal on the other side of
   the present position, and with Reset and restart.
@@ -52,6 +53,7 @@ class StsServo:
 
     def __init__(self, servo: int, baud_rate: int, *, model: int = r.STS3215) -> None:
         self.present = True
+        self._has_goal = False
         self._table = bytearray(sts3215.TABLE_BYTES)
         self._registered: tuple[int, bytes] | None = None
         self._silent_until_ns = 0
@@ -77,6 +79,7 @@ class StsServo:
     def put(self, register: Register, number: int) -> None:
         """Set a register, without the rules for hosts; in the EEPROM until the next restart, as with Lock."""
         data = r.encode(register, number)
+        self._has_goal |= register == r.GOAL_POSITION
         self._table[register.address : register.address + register.size] = data
 
     def keep(self, register: Register, number: int) -> None:
@@ -273,7 +276,10 @@ class StsServo:
         position = self._shaft - self._base - self.get(r.HOMING_OFFSET)
         if not self._table[r.PHASE.address] & r.MULTI_TURN:
             position %= r.TICKS
-        _WORD.pack_into(self._table, r.PRESENT_POSITION.address, _magnitude(position, _POSITION_SIGN))
+        shown = _magnitude(position, _POSITION_SIGN)
+        _WORD.pack_into(self._table, r.PRESENT_POSITION.address, shown)
+        if not self._has_goal and not self._table[r.TORQUE_ENABLE.address]:
+            _WORD.pack_into(self._table, r.GOAL_POSITION.address, shown)
 
     def _limited_goal(self) -> int:
         goal, low, high = self.get(r.GOAL_POSITION), self.get(r.MIN_POSITION), self.get(r.MAX_POSITION)
@@ -321,7 +327,7 @@ class StsServo:
         for register, value in sts3215.RAM.items():
             self.put(register, value)
         self.put(r.TORQUE_LIMIT, self.get(r.MAX_TORQUE))
-        self._registered = None
+        self._registered, self._has_goal = None, False
         self._forced = 0
         self._overload_ns = self._current_ns = None
         self.forget_turns()
@@ -366,6 +372,8 @@ class StsServo:
 
     def _follow(self, changed: list[Register]) -> None:
         """Do what follows from a change of registers."""
+        switched_on = r.TORQUE_ENABLE in changed and self.torque_mode is not r.TorqueMode.OFF
+        self._has_goal |= r.GOAL_POSITION in changed or switched_on
         self._show_position()
         self.put(r.TARGET_POSITION, self._limited_goal())
         if r.TORQUE_ENABLE in changed and self.torque_mode is r.TorqueMode.OFF:

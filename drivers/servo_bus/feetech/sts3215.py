@@ -60,8 +60,6 @@ EEPROM: Final[dict[Register, int]] = {
 RAM: Final[dict[Register, int]] = {
     r.TORQUE_ENABLE: r.TorqueMode.OFF,
     r.ACCELERATION: 0,
-    # Feetech's table. So the servo would turn to 0 if a host switched the torque on without a goal.
-    r.GOAL_POSITION: 0,
     r.GOAL_TIME: 0,
     r.GOAL_SPEED: 3400,  # 68 units of Max Speed Limit.
     r.LOCK: r.LOCKED,
@@ -74,7 +72,7 @@ RAM: Final[dict[Register, int]] = {
     r.MAX_ACCELERATION: 254,
     r.ACCELERATION_MULTIPLIER: 1,
 }
-"""Values after a restart; Torque Limit is Max Torque Limit."""
+"""Values after a restart; Torque Limit is Max Torque Limit, the goal is the present position."""
 
 _BYTE, _GAIN = (0, 254), (0, 254)
 RANGES: Final[dict[Register, tuple[int, int]]] = {
