@@ -12,13 +12,7 @@ from deal_hw.drivers.servo_bus.feetech import registers as r
 from deal_hw.drivers.servo_bus.feetech.bus import FeetechBus
 from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
 from deal_hw.drivers.servo_bus.feetech.emulated_servo import BOOT_NS, StsServo
-from deal_hw.drivers.servo_bus.feetech.packets import (
-    BROADCAST,
-    Fault,
-    Instruction,
-    encode,
-    status,
-)
+from deal_hw.drivers.servo_bus.feetech.packets import BROADCAST, Fault, Instruction, encode, status
 from deal_hw.drivers.servo_bus.feetech.registers import BLOCK_ADDRESS, BLOCK_BYTES, Block, TorqueMode
 from deal_hw.drivers.servo_bus.interface import Answer
 from deal_hw.drivers.servo_bus.registers import Register
@@ -251,24 +245,19 @@ def test_random_requests_do_not_upset_the_servos() -> None:
 
 def test_factory_values(rig: Rig) -> None:
     """Of Feetech's table; torque off, EEPROM locked."""
+    zeros = (r.BAUD_RATE, r.MIN_POSITION, r.HOMING_OFFSET, r.OPERATING_MODE, r.TORQUE_ENABLE, r.GOAL_POSITION)
     expected = {
+        **dict.fromkeys(zeros, 0),
+        **dict.fromkeys((r.ID, r.RESPONSE_LEVEL, r.LOCK), 1),
+        **dict.fromkeys((r.MAX_TORQUE, r.TORQUE_LIMIT), 1000),
         r.MODEL_NUMBER: 777,
-        r.ID: 1,
-        r.BAUD_RATE: 0,
-        r.RESPONSE_LEVEL: 1,
-        r.MIN_POSITION: 0,
         r.MAX_POSITION: 4095,
         r.MAX_TEMPERATURE: 70,
-        r.MAX_TORQUE: 1000,
         r.P_GAIN: 32,
         r.PROTECTION_CURRENT: 511,
         r.PROTECTIVE_TORQUE: 20,
         r.PROTECTION_TIME: 200,
         r.OVERLOAD_TORQUE: 80,
-        r.TORQUE_ENABLE: 0,
-        r.GOAL_POSITION: 0,
-        r.TORQUE_LIMIT: 1000,
-        r.LOCK: 1,
     }
     assert {register: rig.number(register) for register in expected} == expected
     assert StsServo(4, 500_000, model=2825).get(r.MODEL_NUMBER) == 2825

@@ -4,6 +4,9 @@ On one wire there may be an adapter that returns our own requests. Such an echo 
 frame with all bytes of the present request is discarded, and so is a frame of the broadcast id, which no
 servo has. An answer never looks like a request, except when two bytes are read: with a sensor fault (the
 error byte 2 equals the instruction Read) and just the request's two parameters as data. That answer is lost.
+
+The checksum has 8 bits. One of some hundred corrupt answers passes for a sound one, so a user has to expect
+an impossible value now and then.
 """
 
 from __future__ import annotations
