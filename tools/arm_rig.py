@@ -58,10 +58,10 @@ def arm_file(folder: Path, bus: str, **section: Any) -> RobotFile:
     mjcf = folder / "arm.xml"
     mjcf.write_text(MJCF, encoding="utf-8")
     own = derive_robot(mjcf, name="two joints", control_rate_hz=50.0).file
-    gains = {"p_gain": 400 if bus == "dynamixel" else 32}
+    gain = 400 if bus == "dynamixel" else 32
     servos = (
-        ServoEntry(joint="shoulder", id=1, zero=2048, direction=-1, **gains),
-        ServoEntry(joint="elbow", id=2, zero=2000, **gains),
+        ServoEntry(joint="shoulder", id=1, zero=2048, direction=-1, p_gain=gain),
+        ServoEntry(joint="elbow", id=2, zero=2000, p_gain=gain),
     )
     values = {"bus": bus, "servos": servos, "passive": "damping" if bus == "feetech" else "off", **section}
     file = dataclasses.replace(

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.servo_arm.families import Gains, Sample
+from deal_hw.drivers.servo_arm.families import LoopGains, ServoSample
 from deal_hw.errors import SafetyError
 from deal_hw.sim.robots.hardware_section import MOST_GAIN, TICKS, HardwareSection, ServoEntry
 from deal_hw.types import FloatArray, JointCommand
@@ -27,12 +27,12 @@ class Registers:
 
     Attributes:
         goals: Positions [ticks].
-        gains: Gains of the position loops.
+        gains: LoopGains of the position loops.
         shares: Effort limits, as shares of the description's.
     """
 
     goals: Mapping[int, int]
-    gains: Mapping[int, Gains]
+    gains: Mapping[int, LoopGains]
     shares: Mapping[int, float]
 
 
@@ -47,7 +47,7 @@ class CommandCodec:
     def __init__(self, description: RobotDescription, hardware: HardwareSection) -> None:
         by_joint = {servo.joint: servo for servo in hardware.servos}
         self._description = description
-        self._nominal = {one.id: Gains(one.p_gain, one.i_gain, one.d_gain) for one in hardware.servos}
+        self._nominal = {one.id: LoopGains(one.p_gain, one.i_gain, one.d_gain) for one in hardware.servos}
         self._most_gain = MOST_GAIN[hardware.bus]
         self.joints: tuple[ServoEntry, ...] = tuple(by_joint[name] for name in description.joint_names)
         """The servos in the order of the joints."""
@@ -64,17 +64,17 @@ class CommandCodec:
             servo.id: clipped(servo.ticks(float(at))) for servo, at in zip(self.joints, position, strict=True)
         }
 
-    def positions(self, samples: Mapping[int, Sample]) -> FloatArray:
+    def positions(self, samples: Mapping[int, ServoSample]) -> FloatArray:
         """Return the joints' positions, (J,) [rad]."""
         return np.array(
             [servo.direction * (samples[servo.id].ticks - servo.zero) * RAD for servo in self.joints]
         )
 
-    def velocities(self, samples: Mapping[int, Sample]) -> FloatArray:
+    def velocities(self, samples: Mapping[int, ServoSample]) -> FloatArray:
         """Return the joints' velocities, (J,) [rad/s]."""
         return np.array([servo.direction * samples[servo.id].ticks_s * RAD for servo in self.joints])
 
-    def efforts(self, samples: Mapping[int, Sample]) -> FloatArray:
+    def efforts(self, samples: Mapping[int, ServoSample]) -> FloatArray:
         """Return the joints' efforts as the motors' duty has them, (J,) [N·m]."""
         limit = dict(zip((servo.id for servo in self._actuated), self._effort, strict=True))
         return np.array(
@@ -93,7 +93,7 @@ class CommandCodec:
         for a, servo in enumerate(self._actuated):
             goals[servo.id] = clipped(servo.ticks(float(command.position_target[a])))
             nominal = self._nominal[servo.id]
-            gains[servo.id] = Gains(
+            gains[servo.id] = LoopGains(
                 self._gain(nominal.p, command.stiffness[a], d.stiffness[a]),
                 nominal.i,
                 self._gain(nominal.d, command.damping[a], d.damping[a]),

@@ -6,7 +6,7 @@ import abc
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, TypeAlias
 
-from deal_hw.drivers.servo_arm.families import OFF, ON, Dynamixel, Feetech, Gains
+from deal_hw.drivers.servo_arm.families import OFF, ON, Dynamixel, Feetech, LoopGains
 from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus import xl330
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
@@ -36,8 +36,8 @@ class EmulatedJoint(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def gains(self) -> Gains:
-        """Gains of its position loop."""
+    def gains(self) -> LoopGains:
+        """LoopGains of its position loop."""
 
     @property
     @abc.abstractmethod
@@ -91,10 +91,10 @@ class DynamixelJoint(EmulatedJoint):
         return ON if self.servo.get(r.TORQUE_ENABLE) else OFF
 
     @property
-    def gains(self) -> Gains:
-        """Gains of its position loop."""
+    def gains(self) -> LoopGains:
+        """LoopGains of its position loop."""
         block = self.servo.block
-        return Gains(block.p_gain, block.i_gain, block.d_gain)
+        return LoopGains(block.p_gain, block.i_gain, block.d_gain)
 
     @property
     def share(self) -> float:
@@ -143,9 +143,9 @@ class StsJoint(EmulatedJoint):
         return self.servo.torque_mode
 
     @property
-    def gains(self) -> Gains:
-        """Gains of its position loop."""
-        return Gains(self.servo.p_gain, self.servo.i_gain, self.servo.d_gain)
+    def gains(self) -> LoopGains:
+        """LoopGains of its position loop."""
+        return LoopGains(self.servo.p_gain, self.servo.i_gain, self.servo.d_gain)
 
     @property
     def share(self) -> float:

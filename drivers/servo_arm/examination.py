@@ -40,7 +40,7 @@ class ArmInfo:
     servos: str
 
 
-class Examination:
+class ArmExamination:
     """The checks.
 
     Args:

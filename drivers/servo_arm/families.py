@@ -23,7 +23,7 @@ OFF, ON, DAMPING = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True)
-class Gains:
+class LoopGains:
     """Registers of a servo's position loop."""
 
     p: int
@@ -32,7 +32,7 @@ class Gains:
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class ServoSample:
     """One servo's registers at one time.
 
     Attributes:
@@ -78,7 +78,7 @@ class Family(abc.ABC):
         """Return a bus over an open byte stream."""
 
     @abc.abstractmethod
-    def sample(self, servo: int, data: bytes) -> Sample:
+    def sample(self, servo: int, data: bytes) -> ServoSample:
         """Return what the bytes of a servo's :attr:`block` say."""
 
     @abc.abstractmethod
@@ -110,7 +110,7 @@ class Family(abc.ABC):
         """Return what is written before the torque comes on, beside gains and goals."""
 
     @abc.abstractmethod
-    def gains(self, gains: Mapping[int, Gains]) -> Writes:
+    def gains(self, gains: Mapping[int, LoopGains]) -> Writes:
         """Return the writes of gains."""
 
     @abc.abstractmethod
@@ -161,13 +161,13 @@ class Dynamixel(Family):
 
         return Bus(transport, clock, baud_rate, answer_s)
 
-    def sample(self, servo: int, data: bytes) -> Sample:
+    def sample(self, servo: int, data: bytes) -> ServoSample:
         """Return what the bytes of a servo's :attr:`block` say."""
         block = r.Block.unpack(data)
         at = r.PRESENT_PWM.address - r.BLOCK_ADDRESS
         (pwm,) = struct.unpack_from("<h", data, at)
         fault = r.explain_hardware_error(block.hardware_error) if block.hardware_error else ""
-        return Sample(
+        return ServoSample(
             ticks=block.present_position,
             ticks_s=block.present_velocity * r.RAD_S_PER_COUNT * r.PULSES / (2 * math.pi),
             duty=pwm / self._MOST_PWM,
@@ -213,7 +213,7 @@ class Dynamixel(Family):
             (r.PROFILE_ACCELERATION.address, nothing),
         ]
 
-    def gains(self, gains: Mapping[int, Gains]) -> Writes:
+    def gains(self, gains: Mapping[int, LoopGains]) -> Writes:
         """Return the writes of gains."""
         packed = {servo: struct.pack("<3H", one.d, one.i, one.p) for servo, one in gains.items()}
         return [(r.POSITION_D_GAIN.address, packed)]
@@ -266,10 +266,10 @@ class Feetech(Family):
         """Return a bus over an open byte stream."""
         return FeetechBus(transport, clock, baud_rate, answer_s)
 
-    def sample(self, servo: int, data: bytes) -> Sample:
+    def sample(self, servo: int, data: bytes) -> ServoSample:
         """Return what the bytes of a servo's :attr:`block` say."""
         block = f.StsBlock.unpack(data)
-        return Sample(
+        return ServoSample(
             ticks=block.position,
             ticks_s=block.speed * self._ticks_s.get(servo, 1.0),
             duty=block.load * f.LOAD_UNIT,
@@ -314,7 +314,7 @@ class Feetech(Family):
             (f.GOAL_TIME.address, dict.fromkeys(servos, bytes(4))),
         ]
 
-    def gains(self, gains: Mapping[int, Gains]) -> Writes:
+    def gains(self, gains: Mapping[int, LoopGains]) -> Writes:
         """Return the writes of gains: P, D and I lie in this order."""
         return [(f.P_GAIN.address, {servo: bytes((one.p, one.d, one.i)) for servo, one in gains.items()})]
 

@@ -11,8 +11,8 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.commands import RAD, CommandCodec, Registers, clipped
-from deal_hw.drivers.servo_arm.examination import ArmInfo, Examination
-from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, Sample
+from deal_hw.drivers.servo_arm.examination import ArmExamination, ArmInfo
+from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, ServoSample
 from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Writes
 from deal_hw.drivers.servo_bus.polling import Poller
 from deal_hw.drivers.servo_bus.samples import SampleGrid
@@ -110,7 +110,7 @@ class ServoArm(Robot):
         self._alive_ns = self._misses = self._turn = 0
         self._asked: tuple[int, ...] = ()
         self._absent = dict.fromkeys(self._ids, 0)
-        self._newest: dict[int, Sample] = {}
+        self._newest: dict[int, ServoSample] = {}
         self._newest_ns = self._unsound = 0
         self._doubted = False
         self._homed = self._homing = self._armed = self._anchored = self._watchdog = False
@@ -127,7 +127,9 @@ class ServoArm(Robot):
             )
         self._transport.open()
         try:
-            examination = Examination(self._bus, self._family, self._hardware, self.description, self._where)
+            examination = ArmExamination(
+                self._bus, self._family, self._hardware, self.description, self._where
+            )
             self.info = examination.run()
             self._forget()
         except BaseException:
@@ -256,7 +258,7 @@ class ServoArm(Robot):
                 )
             self._clock.sleep_until_ns(self._poller.asked_ns + self._period_ns)
 
-    def _clear_faults(self, end_ns: int) -> dict[int, Sample]:
+    def _clear_faults(self, end_ns: int) -> dict[int, ServoSample]:
         """Clear a fault if the servos report none now; return their samples."""
         samples = self._samples(end_ns)
         self._fault, self._watchdog = "", False
@@ -266,7 +268,7 @@ class ServoArm(Robot):
         self._grid.begin()
         return samples
 
-    def _samples(self, end_ns: int) -> dict[int, Sample]:
+    def _samples(self, end_ns: int) -> dict[int, ServoSample]:
         """Return a sample of every servo, now.
 
         Raises:
@@ -356,7 +358,7 @@ class ServoArm(Robot):
         else:
             self._unsound += 1
 
-    def _sound(self, samples: Mapping[int, Sample]) -> bool:
+    def _sound(self, samples: Mapping[int, ServoSample]) -> bool:
         """Return whether a sample follows from the one before it; if not, the next one is taken as it is.
 
         A check of 8 bits lets one of some hundred corrupt answers pass. One of these must neither trip a run
@@ -397,7 +399,7 @@ class ServoArm(Robot):
     def _latch(self, fault: str) -> None:
         self._fault = self._fault or fault
 
-    def _receive(self, samples: Mapping[int, Sample]) -> None:
+    def _receive(self, samples: Mapping[int, ServoSample]) -> None:
         self._judge(samples)
         byte_us = BITS_PER_BYTE * 1e6 / self._hardware.baud_rate
         answer_us = self._bus.answer_bytes(1, self._family.block[1], False) * byte_us
@@ -427,7 +429,7 @@ class ServoArm(Robot):
             )
         )
 
-    def _judge(self, samples: Mapping[int, Sample]) -> None:
+    def _judge(self, samples: Mapping[int, ServoSample]) -> None:
         """Latch a servo's reported error, or lost torque."""
         for servo in self._servos:
             sample = samples[servo.id]
@@ -440,7 +442,7 @@ class ServoArm(Robot):
                     "uses the bus. Check the supply, end other programs, then start again"
                 )
 
-    def _follow(self, samples: Mapping[int, Sample], device_ns: int) -> None:
+    def _follow(self, samples: Mapping[int, ServoSample], device_ns: int) -> None:
         """Find the command that the servos follow."""
         asked = [sent for sent in self._sent if sent.sent_ns <= self._poller.asked_ns]
         if not asked:
@@ -459,7 +461,7 @@ class ServoArm(Robot):
         while self._sent[0] is not found:
             self._sent.popleft()
 
-    def _status(self, samples: Mapping[int, Sample]) -> Status:
+    def _status(self, samples: Mapping[int, ServoSample]) -> Status:
         flags = {
             Status.ARMED: all(sample.torque == ON for sample in samples.values()),
             Status.HOMED: self._homed,

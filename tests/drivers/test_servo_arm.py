@@ -11,7 +11,7 @@ import pytest
 from arm_rig import BUSES, Rig
 
 from deal_hw.control.safety.passive import make_passive
-from deal_hw.drivers.servo_arm.families import OFF, Sample
+from deal_hw.drivers.servo_arm.families import OFF, ServoSample
 from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.transports.listen_only import listen_only
@@ -113,7 +113,7 @@ def test_moving_joints_are_reported_at_one_time(rig: Rig, bus: str) -> None:
     Its turn comes 83 bytes later (Dynamixel: 72 and 11 around), or 37 (Feetech: 31 and 6), of 10 us each.
     """
     rig.robot.connect()
-    sample = Sample(ticks=2048, ticks_s=4096.0, duty=0.0, goal=2048, torque=OFF, fault="")
+    sample = ServoSample(ticks=2048, ticks_s=4096.0, duty=0.0, goal=2048, torque=OFF, fault="")
     shoulder = dataclasses.replace(sample, ticks_s=-4096.0)
     rig.robot._receive({1: shoulder, 2: dataclasses.replace(sample, ticks=2000)})
     (state,) = rig.robot._states
@@ -169,13 +169,14 @@ def test_a_blocked_joint_ends_homing_passive(rig: Rig, bus: str) -> None:
     """A joint that does not move is named, and the arm is passive."""
     rig.armed()
     rig.run(60, target=0.8)
-    advance = rig.device._batch.advance
+    batch: Any = rig.device._batch
+    advance = batch.advance
 
     def blocked(setpoint: Any, *args: Any) -> Any:
         rig.device._batch.set_state(np.array([[0.8, 0.8]]), np.zeros((1, 2)))
         return advance(setpoint, *args)
 
-    rig.device._batch.advance = blocked  # type: ignore[method-assign]
+    batch.advance = blocked
     with pytest.raises(TransportTimeoutError, match=r"still 0\.\d+ rad from the start pose"):
         rig.robot.home(3.0)
     rig.advance(0.05)
@@ -293,7 +294,7 @@ def test_one_misread_sample_is_a_miss(rig: Rig, change: dict[str, Any]) -> None:
     rig.run(5)
     sample, spoil = robot._family.sample, [2]
 
-    def misread(servo: int, data: bytes) -> Sample:
+    def misread(servo: int, data: bytes) -> ServoSample:
         found = sample(servo, data)
         if servo == 2 and spoil[0]:
             spoil[0] -= 1
