@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
-from deal_hw.workflows.kinds import InputKind, sub_verbs
-from deal_hw.workflows.robot import CheckRobotSettings, NewRobotSettings, RobotCheck, check_robot, new_robot
-
-
-@dataclass(frozen=True, kw_only=True)
-class New(NewRobotSettings):
-    """Write a robot.yaml from an MJCF: joints, units, gains, ranges, effort limits."""
-
-    model: tyro.conf.Positional[Path]
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
+from deal_hw.workflows.robot import (
+    NEW_ROBOT,
+    CheckRobotSettings,
+    NewFromLeRobotSettings,
+    NewRobotSettings,
+    RobotCheck,
+    check_robot,
+    new_robot,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,13 +27,25 @@ class Check(CheckRobotSettings):
     robot: tyro.conf.Positional[Path]
 
 
-KINDS = sub_verbs(
-    new=InputKind(New, example="new robot.xml"),
-    check=InputKind(Check, example="check robot.yaml"),
-)
+def _table() -> Mapping[str, InputKind]:
+    new = {_word(name): kind for name, kind in NEW_ROBOT.table().items()}
+    return {**new, "check": InputKind(Check, example="check robot.yaml")}
 
 
-def robot(config: New | Check) -> int | RobotCheck:
+def _find(arguments: Arguments) -> str:
+    if arguments.first != "new":
+        return "" if arguments.first is None else str(arguments.first)
+    return _word(NEW_ROBOT.find(arguments))
+
+
+def _word(source: str) -> str:
+    return f"new-{source}" if source else "new"
+
+
+KINDS = Kinds(noun="sub-verb", table=_table, find=_find)
+
+
+def robot(config: NewRobotSettings | NewFromLeRobotSettings | Check) -> int | RobotCheck:
     """Run the verb.
 
     Returns:
@@ -46,4 +60,9 @@ def robot(config: New | Check) -> int | RobotCheck:
         return found
     path = new_robot(**vars(config))
     print(f"written: {path}; check its rates and limits, then: deal-hw robot check {path}")
+    if isinstance(config, NewFromLeRobotSettings):
+        print(
+            "Its zeros hold while the servos keep the homing offsets of this calibration; its directions are "
+            "LeRobot's: move one joint at a time at first."
+        )
     return 0

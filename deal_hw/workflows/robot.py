@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
@@ -26,18 +26,20 @@ from deal_hw.robots import (
     robot_entry,
 )
 from deal_hw.robots.file_robot import machine_of, robot_yaml
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.say import html_table
 
 if TYPE_CHECKING:
+    from deal_hw.sim.robots.robot_file import RobotFile
     from deal_hw.sim.robots.user_robot import UserRobot
 
 _HEAD = ("", "what", "found", "do")
 
 
 @dataclass(frozen=True, kw_only=True)
-class NewRobotSettings(Checked):
-    """Settings of :func:`new_robot`."""
+class _NewSettings(Checked):
+    """What every robot.yaml begins with: an MJCF."""
 
     model: File = field(kw_only=False)
     """The robot's MJCF."""
@@ -54,11 +56,52 @@ class NewRobotSettings(Checked):
     state_rate: Annotated[float | None, Range(0.001, 1e5, "Hz")] = None
     """State samples per second [Hz], a whole multiple of the control rate; by default the control rate."""
 
+    several_trees: bool = False
+    """Accept driven joints in several trees of bodies, such as two arms, as one robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewRobotSettings(_NewSettings):
+    """Write a robot.yaml from an MJCF: joints, units, gains, ranges, effort limits."""
+
     feet: tuple[str, ...] = ()
     """Sphere geoms of the feet of a robot with a floating base."""
 
-    several_trees: bool = False
-    """Accept driven joints in several trees of bodies, such as two arms, as one robot."""
+
+@dataclass(frozen=True, kw_only=True)
+class NewFromLeRobotSettings(_NewSettings):
+    """Write a robot.yaml from an MJCF and LeRobot's calibration of its Feetech servos."""
+
+    lerobot: File
+    """LeRobot's calibration file of this arm (JSON). It gives the section `hardware`: ids, zeros, ranges."""
+
+    joint_names: tuple[str, ...] = ()
+    """MOTOR=JOINT for each motor whose name is not that of its joint in the MJCF."""
+
+    zero: Literal["middle", "2048"] = "middle"
+    """Where the MJCF's 0 is. middle: the middle of the calibrated range is the middle of the MJCF's range;
+    2048: the pose in which the servos show 2048, where LeRobot homed the arm."""
+
+
+def _source(arguments: Arguments) -> str:
+    """Return the kind of what a robot.yaml is made from."""
+    return next((name for name in ("lerobot",) if name in arguments.options), "")
+
+
+NEW_ROBOT = Kinds(
+    noun="source",
+    argument="model",
+    table=lambda: {
+        "": InputKind(NewRobotSettings, example="new robot.xml"),
+        "lerobot": InputKind(
+            NewFromLeRobotSettings,
+            usage="new --lerobot",
+            example="new arm.xml --lerobot calibration.json",
+        ),
+    },
+    find=_source,
+)
+"""The kinds of :func:`new_robot`: an MJCF alone, or with what knows its servos."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,18 +142,19 @@ class RobotCheck:
         return [(f.severity.value, f.code, f.seen, f.do) for f in self.findings]
 
 
-@from_settings(NewRobotSettings)
-def new_robot(settings: NewRobotSettings) -> Path:
+@from_settings(NEW_ROBOT)
+def new_robot(settings: NewRobotSettings | NewFromLeRobotSettings) -> Path:
     """Write a robot.yaml from an MJCF, as ``deal-hw robot new``.
 
-    :class:`NewRobotSettings` describes the arguments: ``new_robot("robot.xml", control_rate=100.0)``.
+    :class:`NewRobotSettings` describes the arguments: ``new_robot("robot.xml", control_rate=100.0)``. With
+    ``lerobot`` (:class:`NewFromLeRobotSettings`) it has the arm's servos.
 
     Returns:
         The file.
 
     Raises:
-        ConfigurationError: The MJCF cannot be used, the name is that of a robot of deal-hw, or the file
-            exists.
+        ConfigurationError: The MJCF cannot be used, the name is that of a robot of deal-hw, the file exists,
+            or the servos are not those of this arm.
     """
     user_robot = _sim()
     from deal_hw.sim.robots.robot_file import FILE_NAME, write_robot_file
@@ -124,14 +168,26 @@ def new_robot(settings: NewRobotSettings) -> Path:
         name=settings.name,
         control_rate_hz=settings.control_rate,
         state_rate_hz=settings.state_rate,
-        feet=settings.feet,
+        feet=settings.feet if isinstance(settings, NewRobotSettings) else (),
         several_trees=settings.several_trees,
         mjcf_entry=os.path.relpath(model, out.parent),
     )
     _check_name(robot.file.name, "--name")
+    file = _with_servos(robot.file, settings)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(out, write_robot_file(robot.file).encode())
+    write_bytes(out, write_robot_file(file).encode())
     return out
+
+
+def _with_servos(file: RobotFile, settings: NewRobotSettings | NewFromLeRobotSettings) -> RobotFile:
+    """Return the robot with the servos that a source knows."""
+    if isinstance(settings, NewRobotSettings):
+        return file
+    from deal_hw.workflows.servos import lerobot
+
+    names = lerobot.parse_names(settings.joint_names)
+    motors = lerobot.read_calibration(Path(settings.lerobot))
+    return lerobot.with_calibration(file, motors, names, settings.zero, str(settings.lerobot))
 
 
 @from_settings(CheckRobotSettings)
