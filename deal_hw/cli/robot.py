@@ -3,66 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-
-import tyro
 
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
-from deal_hw.workflows.robot import (
-    NEW_ROBOT,
+from deal_hw.workflows.own_robot.check import (
+    CHECK_ROBOT,
+    CheckBusSettings,
     CheckRobotSettings,
-    NewFromLeRobotSettings,
-    NewRobotSettings,
     RobotCheck,
     check_robot,
+)
+from deal_hw.workflows.own_robot.new import (
+    NEW_ROBOT,
+    NewFromBusSettings,
+    NewFromLeRobotSettings,
+    NewRobotSettings,
     new_robot,
 )
 
-
-@dataclass(frozen=True, kw_only=True)
-class Check(CheckRobotSettings):
-    """Compare a robot.yaml with its MJCF, list what is missing, and simulate a second of holding."""
-
-    robot: tyro.conf.Positional[Path]
+_VERBS = {"new": NEW_ROBOT, "check": CHECK_ROBOT}
 
 
 def _table() -> Mapping[str, InputKind]:
-    new = {_word(name): kind for name, kind in NEW_ROBOT.table().items()}
-    return {**new, "check": InputKind(Check, example="check robot.yaml")}
+    return {_word(verb, name): kind for verb, kinds in _VERBS.items() for name, kind in kinds.table().items()}
 
 
 def _find(arguments: Arguments) -> str:
-    if arguments.first != "new":
-        return "" if arguments.first is None else str(arguments.first)
-    return _word(NEW_ROBOT.find(arguments))
+    verb = "" if arguments.first is None else str(arguments.first)
+    return _word(verb, _VERBS[verb].find(arguments)) if verb in _VERBS else verb
 
 
-def _word(source: str) -> str:
-    return f"new-{source}" if source else "new"
+def _word(verb: str, kind: str) -> str:
+    return f"{verb}-{kind}" if kind else verb
 
 
 KINDS = Kinds(noun="sub-verb", table=_table, find=_find)
 
 
-def robot(config: NewRobotSettings | NewFromLeRobotSettings | Check) -> int | RobotCheck:
+def robot(
+    config: NewRobotSettings
+    | NewFromLeRobotSettings
+    | NewFromBusSettings
+    | CheckRobotSettings
+    | CheckBusSettings,
+) -> int | RobotCheck:
     """Run the verb.
 
     Returns:
         0, or the findings, whose exit code is 1 if a check failed.
 
     Raises:
-        ConfigurationError: A file cannot be used, or robot.yaml and MJCF contradict each other.
+        ConfigurationError: A file cannot be used, robot.yaml and MJCF contradict each other, or the servos
+            are not those of the arm.
+        DealHwError: The port cannot be opened, or its servos do not answer.
     """
-    if isinstance(config, Check):
-        found = check_robot(config.robot)
+    if isinstance(config, CheckRobotSettings):
+        found = check_robot(**vars(config))
         print(found.table())
         return found
     path = new_robot(**vars(config))
-    print(f"written: {path}; check its rates and limits, then: deal-hw robot check {path}")
-    if isinstance(config, NewFromLeRobotSettings):
+    check = f"deal-hw robot check {path}"
+    if isinstance(config, NewRobotSettings):
+        print(f"written: {path}; check its rates and limits, then: {check}")
+    elif isinstance(config, NewFromLeRobotSettings):
+        print(f"written: {path}; check its rates and limits")
         print(
-            "Its zeros hold while the servos keep the homing offsets of this calibration; its directions are "
-            "LeRobot's: move one joint at a time at first."
+            "Its zeros hold while the servos keep the homing offsets of this calibration. Compare them, and "
+            f"the directions, with the arm: {check} --port PORT --lerobot {config.lerobot} --by-hand"
         )
+    else:
+        print(f"written: {path}; check its rates and limits, then: {check} --port {config.port}")
     return 0

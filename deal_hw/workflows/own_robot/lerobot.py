@@ -17,7 +17,7 @@ from deal_hw.reading import read_json
 from deal_hw.schema import STRICT, refusal
 from deal_hw.sim.robots.hardware_section import MOST_SERVOS, TICKS
 from deal_hw.sim.robots.robot_file import RobotFile
-from deal_hw.workflows.servos.fitting import STS3215_RAD_S, MeasuredServo, with_servos
+from deal_hw.workflows.own_robot.fitting import STS3215_RAD_S, MeasuredServo, with_servos
 
 MOST_OFFSET: Final = 2047
 """Largest homing offset of a Feetech servo, in both directions [ticks]."""
