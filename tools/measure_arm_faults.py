@@ -136,9 +136,10 @@ TITLE = "Arm of servos: from a fault to motors without torque, or braking"
 WORDS = (
     "This page has the time from each fault to motors that no longer follow goals.",
     "`tools/measure_arm_faults.py` measured it on an emulated arm of two joints, profile `sensor`, over a",
-    "pseudo-terminal: Dynamixel servos, whose passive state is no torque, and Feetech servos, which brake. Each",
-    "repetition draws a random moment of a random phase (connecting, moving to the start pose, arming, running,",
-    "ending). Feetech servos have no watchdog: where both processes are killed, they hold their last goal.",
+    "pseudo-terminal: Dynamixel servos, whose passive state is no torque, and Feetech servos, which brake.",
+    "Each repetition draws a random moment of a random phase (connecting, moving to the start pose, arming,",
+    "running, ending). Feetech servos have no watchdog: where both processes are killed, they hold their",
+    "last goal.",
     "",
 )
 
