@@ -50,4 +50,4 @@ class Reach(gymnasium.Env[Any, Any]):
         return self._seen(), -far - 0.02 * change, False, self._left == 0, {}
 
 
-gymnasium.register("Reach-v0", entry_point=Reach)
+gymnasium.register("Reach-v0", entry_point=lambda **given: Reach(**given))
