@@ -88,6 +88,8 @@ class Rig:
         self.description = file_description(self.file, folder / "arm.xml")
         assert self.file.hardware is not None
         self.clock = VirtualClock()
+        self.phases: list[str] = []
+        self.loop: Any = None
         space = default_space(self.description)
         values = {**space.known, **{p.name: p.nominal for p in space.parameters}}
         truth = SimulatedTruth(parameters=values, latency_s=0.0, seed=0)

@@ -85,6 +85,8 @@ class ServoArm(Robot):
         family: Family,
     ) -> None:
         self.description = description  # type: ignore[misc]  # A user's robot is known at run time.
+        self._rest = tuple(servo.rest for servo in CommandCodec(description, hardware).joints)
+        self.lowers = None not in self._rest  # type: ignore[misc]
         self.watchdog_s = family.watchdog_s  # type: ignore[misc]
         self.info: ArmInfo | None = None
         self._transport, self._clock, self._hardware, self._family = transport, clock, hardware, family
@@ -193,6 +195,19 @@ class ServoArm(Robot):
         self._sent.clear()
         self._grid.begin()
 
+    def lower(self, timeout_s: float) -> None:
+        """Move all joints on straight lines to their rest positions, slowly.
+
+        Raises:
+            TransportTimeoutError: It did not arrive, or the servos fell silent.
+            SafetyError: A servo reports an error.
+        """
+        end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        rest = [at for at in self._rest if at is not None]
+        if rest:
+            self._asked = ()
+            self._move(self._codec.positions(self._samples(end_ns)), np.array(rest), end_ns)
+
     def _torque_on(self, end_ns: int) -> FloatArray:
         """Give torque at the measured positions, with the nominal gains; return these, (J,) [rad]."""
         samples = self._clear_faults(end_ns)
@@ -254,7 +269,7 @@ class ServoArm(Robot):
                 worst = int(off.argmax())
                 raise TransportTimeoutError(
                     f"{self.description.name}: joint {self._servos[worst].joint} is still {off[worst]:.2f} "
-                    "rad from the start pose: it is blocked, or its gain is too low to carry the arm"
+                    "rad from its pose: it is blocked, or its gain is too low to carry the arm"
                 )
             self._clock.sleep_until_ns(self._poller.asked_ns + self._period_ns)
 

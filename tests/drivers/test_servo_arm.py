@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from arm_rig import BUSES, Rig
 
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.process.channel import LOWERING, MAKING_PASSIVE, Outcome
 from deal_hw.control.safety.passive import make_passive
+from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.servo_arm.families import OFF, ServoSample
 from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus.feetech import registers as f
@@ -22,6 +25,7 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
+from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.testing.faults import FaultyTransport, OneBadFrame
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, Transport
@@ -177,7 +181,7 @@ def test_a_blocked_joint_ends_homing_passive(rig: Rig, bus: str) -> None:
         return advance(setpoint, *args)
 
     batch.advance = blocked
-    with pytest.raises(TransportTimeoutError, match=r"still 0\.\d+ rad from the start pose"):
+    with pytest.raises(TransportTimeoutError, match=r"still 0\.\d+ rad from its pose"):
         rig.robot.home(3.0)
     rig.advance(0.05)
     assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
@@ -361,6 +365,75 @@ def test_after_passive_no_goal_is_written(rig: Rig, bus: str) -> None:
     robot.send_command(default_command(robot, 0.5))
     rig.advance(0.01)
     assert [servo.get(GOAL[bus]) for servo in rig.servos] == before
+
+
+def lowered(tmp_path: Path, bus: str) -> Rig:
+    """Return an arm with a rest pose."""
+    servos = Rig(tmp_path, bus).file.hardware
+    assert servos is not None
+    rests = tuple(
+        dataclasses.replace(servo, rest=at) for servo, at in zip(servos.servos, (1.0, -0.5), strict=True)
+    )
+    return Rig(tmp_path, bus, servos=rests)
+
+
+def played(rig: Rig, **settings: Any) -> LoopReport:
+    """Hold the start pose for a while by the control loop."""
+    config = LoopConfig(duration_s=0.5, **settings)
+    loop = ControlLoop(
+        rig.robot,
+        HoldBehaviour(rig.description),
+        Safety(rig.description),
+        rig.clock,
+        lambda record: True,
+        config,
+        progress=lambda phase, silence_s: rig.phases.append(phase),
+    )
+    rig.loop = loop
+    return loop.run()
+
+
+def test_a_planned_end_lowers_the_arm_first(tmp_path: Path, bus: str) -> None:
+    """It moves to the rest pose, slowly, and then the motors go off."""
+    rig = lowered(tmp_path, bus)
+    report = played(rig)
+    assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True)
+    assert rig.phases.index(LOWERING) < rig.phases.index(MAKING_PASSIVE)
+    np.testing.assert_allclose(rig.true_position(), [1.0, -0.5], atol=0.15)
+    assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
+
+
+def test_a_stop_on_the_way_down_makes_it_passive_at_once(tmp_path: Path, bus: str) -> None:
+    """Ctrl-C does not wait for the rest pose."""
+    rig = lowered(tmp_path, bus)
+    goals = rig.robot._family.goals
+
+    def interrupted(ticks: Any) -> Any:
+        if rig.phases[-1:] == [LOWERING] and rig.true_position()[0] > 0.3:
+            rig.loop.request_stop("stopped by a test")
+        return goals(ticks)
+
+    rig.robot._family.goals = interrupted  # type: ignore[method-assign]
+    report = played(rig)
+    assert (report.outcome, report.reason) == (Outcome.STOPPED, "stopped by a test")
+    assert report.passive_confirmed
+    assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
+    assert rig.true_position()[0] < 0.6
+
+
+def test_an_arm_that_cannot_be_lowered_goes_off_all_the_same(tmp_path: Path, bus: str) -> None:
+    """A servo that fails on the way down is noted; the run itself is over."""
+    rig = lowered(tmp_path, bus)
+    goals = rig.robot._family.goals
+
+    def failing(ticks: Any) -> Any:
+        if rig.phases[-1:] == [LOWERING]:
+            rig.servos[0].fail(1 << 2)
+        return goals(ticks)
+
+    rig.robot._family.goals = failing  # type: ignore[method-assign]
+    report = played(rig)
+    assert report.outcome is Outcome.FINISHED and report.passive_confirmed
 
 
 # Before any motion.

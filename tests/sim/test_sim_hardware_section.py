@@ -73,6 +73,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"servos.0.i_gain": 300}, "i_gain of shoulder is 300; allowed: 0 to 254"),
     ({"servos.0.joint": "wrist"}, "servos of wrist: no such joint; joints are shoulder, elbow"),
     ({"servos.1.zero": 200}, r"elbow: its position_range is -778 to 1178 ticks.*homing offset"),
+    ({"servos.0.rest": 0.5}, "rest is missing for elbow; allowed: one for each servo, or none"),
+    ({"servos.0.rest": 0.5, "servos.1.rest": 1.6}, r"joint elbow: rest 1\.6 is outside its position_range"),
     ({"nosuch": 1}, "nosuch"),
 ]
 

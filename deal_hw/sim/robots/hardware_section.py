@@ -33,6 +33,7 @@ class ServoEntry:
         zero: Position of the servo where the joint's position is 0 [ticks].
         direction: 1 if the joint's position grows with the servo's, else -1.
         model: The servo's model, such as sts3215; "": any.
+        rest: Where the joint may go limp [rad]: a planned end moves the arm there first. None for all: none.
         p_gain: Register of the position loop's P gain at the joint's stiffness.
         d_gain: Register of its D gain at the joint's damping.
         i_gain: Register of its I gain. An integral hides friction and load from the recordings.
@@ -48,6 +49,7 @@ class ServoEntry:
     i_gain: int = 0
     direction: Literal[1, -1] = 1
     model: str = ""
+    rest: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.id <= 252:
@@ -94,6 +96,11 @@ class HardwareSection:
             if not 0 < len(given) <= MOST_SERVOS or len(set(given)) != len(given):
                 raise refusal(f"servos: {name}", given, f"1 to {MOST_SERVOS} servos, each {name} once")
         most = MOST_GAIN[self.bus]
+        without = [servo.joint for servo in self.servos if servo.rest is None]
+        if without and len(without) < len(self.servos):
+            raise refusal(
+                "rest", f"missing for {', '.join(without)}", "one for each servo, or none", quote=False
+            )
         for servo in self.servos:
             for name in ("p_gain", "i_gain", "d_gain"):
                 gain, least = getattr(servo, name), int(name == "p_gain")
@@ -153,6 +160,9 @@ def hardware_problems(
                 f"which counts 0 to {TICKS - 1}. Check zero and direction; or turn the horn, or set the "
                 "servo's homing offset, so that the range does not cross its end"
             )
+        low, high = joint.position_range
+        if servo.rest is not None and not low <= servo.rest <= high:
+            yield f"joint {joint.name}: rest {servo.rest:g} is outside its position_range {low:g} to {high:g}"
 
 
 HEAD: Final = """\
@@ -175,6 +185,7 @@ def section_lines(section: HardwareSection) -> Iterator[tuple[int, str, Any, str
         yield 6, "model", servo.model, 'such as sts3215; "": any'
         yield 6, "zero", servo.zero, "[ticks]"
         yield 6, "direction", servo.direction, "1 or -1"
+        yield 6, "rest", servo.rest, "[rad] where the joint may go limp; null for all: no rest pose"
         yield 6, "p_gain", servo.p_gain, "register, at the joint's stiffness"
         yield 6, "d_gain", servo.d_gain, "register, at the joint's damping"
         yield 6, "i_gain", servo.i_gain, "register; an integral hides friction from the recordings"
