@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
 
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.own_robot.check import (
@@ -20,11 +25,24 @@ from deal_hw.workflows.own_robot.new import (
     new_robot,
 )
 
+
+@dataclass(frozen=True, kw_only=True)
+class Check(CheckRobotSettings):
+    """Compare a robot.yaml with its MJCF, list what is missing, and simulate a second of holding."""
+
+    # Settings without options have no argument beside them that shows it to be one.
+    robot: tyro.conf.Positional[Path]
+
+
 _VERBS = {"new": NEW_ROBOT, "check": CHECK_ROBOT}
 
 
 def _table() -> Mapping[str, InputKind]:
-    return {_word(verb, name): kind for verb, kinds in _VERBS.items() for name, kind in kinds.table().items()}
+    table = {
+        _word(verb, name): kind for verb, kinds in _VERBS.items() for name, kind in kinds.table().items()
+    }
+    table["check"] = dataclasses.replace(table["check"], settings=Check)
+    return table
 
 
 def _find(arguments: Arguments) -> str:
@@ -33,7 +51,8 @@ def _find(arguments: Arguments) -> str:
 
 
 def _word(verb: str, kind: str) -> str:
-    return f"{verb}-{kind}" if kind else verb
+    # The plain verb is the kind that no option names.
+    return f"{verb}-{kind}" if _VERBS[verb].table()[kind].usage else verb
 
 
 KINDS = Kinds(noun="sub-verb", table=_table, find=_find)

@@ -52,12 +52,12 @@ CHECK_ROBOT = Kinds(
     noun="check",
     argument="robot",
     table=lambda: {
-        "": InputKind(CheckRobotSettings, example="check robot.yaml"),
+        "file": InputKind(CheckRobotSettings, example="check robot.yaml"),
         "port": InputKind(
             CheckBusSettings, usage="check --port", example="check robot.yaml --port /dev/ttyACM0"
         ),
     },
-    find=lambda arguments: "port" if "port" in arguments.options else "",
+    find=lambda arguments: "port" if "port" in arguments.options else "file",
 )
 """The kinds of :func:`check_robot`: the file alone, or with its servos."""
 

@@ -88,14 +88,14 @@ class NewFromBusSettings(_NewSettings):
 
 def _source(arguments: Arguments) -> str:
     """Return the kind of what a robot.yaml is made from."""
-    return next((name for name in ("lerobot", "bus") if name in arguments.options), "")
+    return next((name for name in ("lerobot", "bus") if name in arguments.options), "mjcf")
 
 
 NEW_ROBOT = Kinds(
     noun="source",
     argument="model",
     table=lambda: {
-        "": InputKind(NewRobotSettings, example="new robot.xml"),
+        "mjcf": InputKind(NewRobotSettings, example="new robot.xml"),
         "lerobot": InputKind(
             NewFromLeRobotSettings,
             usage="new --lerobot",
