@@ -443,7 +443,7 @@ def test_a_terminal_asks_and_takes_enter(
     person, program = pty.openpty()
     with open(program, encoding="utf-8") as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
-        terminal = dialogues.Terminal("robot new --bus")
+        terminal = dialogues.TerminalDialogue("robot new --bus")
         os.write(person, b"\nx\n\n")
         assert terminal.ask("Off?", ("y", "n")) == "n"
         assert terminal.ask("Off?", ("y", "n")) == "n"

@@ -30,7 +30,7 @@ class Dialogue(Protocol):
         ...
 
 
-class Terminal:
+class TerminalDialogue:
     """The dialogue on standard input and output.
 
     Args:
