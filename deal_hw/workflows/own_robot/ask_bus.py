@@ -121,7 +121,7 @@ def _found(file: RobotFile, survey: Survey, baud_rate: int) -> dict[int, ServoFa
 
 
 def _listed(one: ServoFacts) -> str:
-    return f"{one.id} ({one.model}, {one.volts:.1f} V, {one.celsius} degrees)"
+    return f"{one.id} ({one.model}, {one.volts:.1f} V, {one.celsius} °C)"
 
 
 def _zeros(file: RobotFile, turned: Mapping[str, Turned], hands: Hands, dialogue: Dialogue) -> dict[str, int]:

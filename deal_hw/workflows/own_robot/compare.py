@@ -131,7 +131,7 @@ def _servo(
         at = servo.direction * (sample.ticks - servo.zero) * RAD
         seen = (
             f"{facts.model}, at {sample.ticks} ticks = {at:.3f} rad, limits {facts.least} to {facts.most}, "
-            f"homing offset {facts.offset}, {facts.volts:.1f} V, {facts.celsius} degrees, "
+            f"homing offset {facts.offset}, {facts.volts:.1f} V, {facts.celsius} °C, "
             f"torque {'on' if sample.torque == ON else 'off'}"
         )
         yield Finding(code, Severity.OK, seen)
@@ -172,7 +172,7 @@ def _problems(
             "move it by hand (without torque: deal-hw stop); if it stands inside, its zero or direction in "
             "robot.yaml is wrong: --by-hand",
         )
-    elif not low <= at <= high:
+    elif not low - RAD <= at <= high + RAD:
         yield Finding(
             code,
             Severity.NOTE,
@@ -180,7 +180,7 @@ def _problems(
             "a run first moves it inside, slowly",
         )
     if facts.celsius > facts.most_celsius - _NEAR_CELSIUS:
-        seen = f"{facts.celsius} degrees; it switches off above {facts.most_celsius}"
+        seen = f"{facts.celsius} °C; it switches off above {facts.most_celsius} °C"
         yield Finding(code, Severity.WARN, seen, "let it cool")
     if not facts.volt_range[0] <= facts.volts <= facts.volt_range[1]:
         allowed = f"{facts.volt_range[0]:.1f} to {facts.volt_range[1]:.1f}"
