@@ -78,7 +78,7 @@ class ArmRig(Rig):
             TAKING_OVER: (ARMED, 0.0, 0.1),
             ARMING: (ARMED, 0.1, 0.2),
             RUNNING: (ARMED, 0.4, min(self._seconds, SECONDS) - 0.8),
-            ENDING: (ARMED, self._seconds, 0.3),
+            ENDING: (ARMED, self._seconds - 0.1, 0.15),
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
