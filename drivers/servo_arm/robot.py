@@ -404,7 +404,9 @@ class ServoArm(Robot):
                 self._absent = dict.fromkeys(self._ids, 1)
             return
         self._absent[asked[0]] += 1
-        if self._absent[asked[0]] > _MISSES:
+        # While none answers, it is the cable or the supply of all, and states grow old.
+        others = [i for i in self._ids if i != asked[0]]
+        if self._absent[asked[0]] > _MISSES and (not others or any(not self._absent[i] for i in others)):
             joint = next(servo.joint for servo in self._servos if servo.id == asked[0])
             self._latch(
                 f"servo {asked[0]} ({joint}) stopped answering: it restarted, or lost its supply or its "

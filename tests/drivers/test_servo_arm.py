@@ -282,6 +282,19 @@ def test_a_servo_that_vanishes_is_named(rig: Rig) -> None:
     assert "servo 2 (elbow) stopped answering" in robot.fault
 
 
+def test_a_cut_cable_is_no_servos_fault(rig: Rig) -> None:
+    """While no servo answers none is named: what trips the run is the age of the states."""
+    robot = rig.armed()
+    rig.run(3)
+    for servo in rig.servos:
+        servo.present = False
+    rig.run(60)
+    assert not robot.fault
+    for servo in rig.servos:
+        servo.present = True
+    assert rig.run(30)[-1].position.shape == (2,)
+
+
 def test_an_overheated_servo_is_a_fault_with_its_remedy(rig: Rig) -> None:
     """What the servo reports is said in words."""
     robot = rig.armed()

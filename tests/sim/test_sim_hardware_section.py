@@ -39,14 +39,14 @@ def test_ticks_of_an_angle(zero: int, direction: Any, ticks: int) -> None:
 
 
 def test_the_description_without_mujoco_is_that_with_it(tmp_path: Path) -> None:
-    """But for what only a driven robot has: easing in, and limits of the gains."""
+    """But for what only a driven robot has: easing in, slower targets, and limits of the gains."""
     file = arm_file(tmp_path, "feetech")
     driven = driver_description(str(tmp_path / "robot.yaml"))
     (tmp_path / "robot.yaml").write_text(
         write_robot_file(dataclasses.replace(file, hardware=None)), encoding="utf-8"
     )
     derived = read_robot(tmp_path / "robot.yaml").description()
-    same = {"stiffness", "damping", "ease_in_s"}
+    same = {"stiffness", "damping", "ease_in_s", "target_step"}
     for name in derived.to_json().keys() | driven.to_json().keys():
         one, two = getattr(driven, name), getattr(derived, name)
         if name == "limits":
@@ -57,6 +57,8 @@ def test_the_description_without_mujoco_is_that_with_it(tmp_path: Path) -> None:
         if name != "sources":
             assert one == two, name
     assert driven.limits.stiffness == (17.8, 17.8) and driven.limits.ease_in_s == 1.0
+    # 0.7 of 6 rad/s, in a fiftieth of a second.
+    assert driven.limits.target_step == pytest.approx((0.084, 0.084))
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [

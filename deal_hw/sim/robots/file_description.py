@@ -15,6 +15,9 @@ OVERSHOOT: Final = 0.25
 LEAST_AGE_S: Final = 0.1
 AGE_PERIODS: Final = 5
 """Age of states and actions that trips: this many control periods, at least LEAST_AGE_S."""
+TARGET_SHARE: Final = 0.7
+"""Targets of a driven arm move at most at this share of its velocity limit, at which a run trips: a joint
+with little damping overshoots the speed of its target by a third."""
 EASE_IN_S: Final = 1.0
 """A driven arm gets to a policy's first targets in this time [s]; SO-101 and cart-pole have the same."""
 
@@ -39,10 +42,13 @@ def limits_of(file: RobotFile, control_rate_hz: float) -> SafetyLimits:
     driven = [(joint, joint.actuator) for joint in joints if joint.actuator is not None]
     free = (math.inf,) * len(driven)
     motor, hardware = file.actuation == "motor", file.hardware is not None
+    share = TARGET_SHARE if hardware else 1.0
     age_s = max(LEAST_AGE_S, AGE_PERIODS / control_rate_hz)
     return SafetyLimits(
         target=tuple((-1.0, 1.0) if motor else _range(joint) for joint, _ in driven),
-        target_step=free if motor else tuple(free_of(j.velocity_limit) / control_rate_hz for j, _ in driven),
+        target_step=free
+        if motor
+        else tuple(share * free_of(joint.velocity_limit) / control_rate_hz for joint, _ in driven),
         target_distance=free,
         trip_position=tuple(_trip_range(joint) for joint in joints),
         trip_velocity=tuple(free_of(joint.velocity_limit) for joint in joints),
