@@ -142,6 +142,7 @@ class ArmDevice:
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the packets that they complete."""
         self.received_bytes += len(data)
+        self._sense()
         self.bus.receive(data)
 
     def advance_to(self, device_ns: int) -> bytes:
@@ -220,11 +221,16 @@ class ArmDevice:
             self._batch.set_sent(kp, kd, effort)
 
     def _sense(self) -> None:
+        """Set the registers of what the servos measure now.
+
+        A servo samples faster than a physics step: between two steps the joint moves on at its velocity.
+        """
         d = self._description
+        since_s = 1e-9 * (self._now_ns - self._tick * self._tick_ns)
         noise = d.sensor.noise if self._noisy else (0.0,) * len(d.joint_names)
         nothing = (0.0,) * len(d.joint_names)
-        position = reported(self._batch.position[0], noise, nothing, self._rng)
         velocity = self._batch.velocity[0]
+        position = reported(self._batch.position[0] + since_s * velocity, noise, nothing, self._rng)
         effort = np.zeros(len(self._servos))
         effort[self._actuated] = self._effort[0, self._dofs][self._actuated]
         limit = dict(zip(self._actuated, d.effort_limit, strict=True))
