@@ -176,7 +176,13 @@ class TrialPolicy:
         return bool(self._facts["batches"])
 
     def reset(self) -> None:
-        """Do nothing: the observation carries the past."""
+        """Clear the memory of a recurrent network; of others the observation carries the past.
+
+        Raises:
+            PolicyError: The process ended.
+        """
+        if self._spec.recurrent:
+            self._ask([])
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,).

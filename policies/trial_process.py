@@ -2,7 +2,8 @@
 
 It is started as ``python -m deal_hw.policies.trial_process FD PARENT MEMORY_BYTES SECONDS FILE``: one end of
 a socket as inherited descriptor, the parent's process id, limits, and the policy. Messages are JSON. The
-first describes the file. Then each list of observations is answered with actions and the processor time [s].
+first describes the file. Then each list of observations is answered with actions and the processor time [s];
+an empty list clears the network's memory.
 Errors are answered as ``{"error": ...}``.
 """
 
@@ -40,6 +41,10 @@ def main() -> int:
             )
             while True:
                 observations = np.array(json.loads(connection.recv_bytes()), dtype=np.float32)
+                if not observations.size:
+                    policy.reset()
+                    _send(connection, {"actions": [], "seconds": 0.0})
+                    continue
                 begun = time.process_time()
                 actions = policy.act_batch(observations)
                 took = time.process_time() - begun
