@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from deal_hw.workflows.emulate import emulate as emulate
     from deal_hw.workflows.inspect import Inspection as Inspection
     from deal_hw.workflows.inspect import inspect as inspect
+    from deal_hw.workflows.policy import PolicyReport as PolicyReport
+    from deal_hw.workflows.policy import check_policy as check_policy
+    from deal_hw.workflows.policy import import_policy as import_policy
     from deal_hw.workflows.replay import replay as replay
     from deal_hw.workflows.robot import RobotCheck as RobotCheck
     from deal_hw.workflows.robot import check_robot as check_robot
@@ -54,6 +57,7 @@ _EXPORTS = {
     "workflows.emulate": ("emulate", "EmulatedRobot"),
     "workflows.design_excitation": ("design_excitation",),
     "workflows.inspect": ("inspect", "Inspection"),
+    "workflows.policy": ("import_policy", "check_policy", "PolicyReport"),
     "workflows.replay": ("replay",),
     "workflows.robot": ("check_robot", "new_robot", "RobotCheck"),
     "workflows.running.report": ("RunReport",),

@@ -54,7 +54,9 @@ reports, and the rotation vector that turns it to the target orientation [rad]."
 BASE_SIZE = 6
 
 VERDICT: Final = "calibration_verdict"
-"""Key in a policy's training record: the colour of its calibration's verdict."""
+"""Key in a policy's training record: the colour of its calibration's verdict, or of its import's."""
+IMPORTED: Final = "imported"
+"""Key in a policy's training record: how another trainer's policy was imported."""
 MAX_DELAY: Final = 100
 """Most control periods that an observation may look back: 2 s at 50 Hz."""
 MAX_TERMS: Final = 4096

@@ -181,8 +181,12 @@ def parse_yaml(text: str, tags: Mapping[str, Callable[[Any], Any]] | None = None
     if len(text) > YAML_BYTES:
         raise ConfigurationError(f"{len(text)} characters of YAML; {YAML_BYTES} are allowed")
     for tag, construct in (tags or {}).items():
-        Loader.add_constructor(tag, lambda loader, node, made=construct: made(node))
+        Loader.add_constructor(tag, _constructor(construct))
     return yaml.load(text, Loader)
+
+
+def _constructor(construct: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    return lambda loader, node: construct(node)
 
 
 def _weigh(node: Any, weights: dict[int, float]) -> float:

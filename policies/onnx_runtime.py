@@ -60,7 +60,7 @@ class OnnxPolicy:
                 f"{self.path} was changed after it was checked: its SHA-256 begins {self.digest[:16]}, "
                 f"the checked file's {digest[:16]}; start again"
             )
-        self._session = _open(self.path, content)
+        self._session = open_session(self.path, content)
         try:
             self._spec = _read_spec(self.path, self._session)
             self._input, self._output = _check_shapes(self.path, self._session, self._spec)
@@ -169,7 +169,12 @@ def _open_at_once(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)
 
 
-def _open(path: Path, content: bytes) -> onnxruntime.InferenceSession:
+def open_session(path: Path, content: bytes) -> onnxruntime.InferenceSession:
+    """Return what runs the network of a file's bytes, with one thread and no other file.
+
+    Raises:
+        PolicyError: It is no ONNX, or cannot be run.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

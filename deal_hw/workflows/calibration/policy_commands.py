@@ -154,8 +154,8 @@ def _refuse_unseen(table: Table, spec: PolicySpec) -> None:
         )
     if spec.recurrent:
         raise ConfigurationError(
-            f"--policy: the network of the policy for {spec.robot!r} has a memory of its own, which recordings "
-            "do not hold; record its commands, or leave --policy out"
+            f"--policy: the network of the policy for {spec.robot!r} has a memory of its own, which "
+            "recordings do not hold; record its commands, or leave --policy out"
         )
     if spec.observes_base and (table.base_position is None or table.orientation is None):
         raise ConfigurationError(
