@@ -71,7 +71,7 @@ class TriedPolicy(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Walk:
+class WalkAtCommand:
     """How robots did at one command.
 
     Attributes:
@@ -98,8 +98,8 @@ class WalkingReport:
         clipped: Share of the time in which the safety filter changed a target.
     """
 
-    walks: tuple[Walk, ...]
-    standing: tuple[Walk, ...]
+    walks: tuple[WalkAtCommand, ...]
+    standing: tuple[WalkAtCommand, ...]
     clipped: float
 
     @property
@@ -194,7 +194,7 @@ class _Run:
         self._ticks = round(SECONDS * description.control_rate_hz)
         self.clipped = 0.0
 
-    def walks(self, policy: TriedPolicy | None) -> tuple[Walk, ...]:
+    def walks(self, policy: TriedPolicy | None) -> tuple[WalkAtCommand, ...]:
         """Return how the robots do with a policy; without one they hold their default pose."""
         rng = np.random.default_rng(SEED)
         loop, description, count = self._loop, self._description, self._count
@@ -284,7 +284,7 @@ class _Run:
             }
         )
 
-    def _judged(self, lasted: FloatArray, up: BoolArray, velocity: FloatArray) -> tuple[Walk, ...]:
+    def _judged(self, lasted: FloatArray, up: BoolArray, velocity: FloatArray) -> tuple[WalkAtCommand, ...]:
         found = []
         for i, command in enumerate(self._commands):
             mine = slice(i * ROBOTS, (i + 1) * ROBOTS)
@@ -295,7 +295,7 @@ class _Run:
                 shares = np.where(up[mine], 1.0 - error / size, 0.0)
             mean = velocity[mine][up[mine]].mean(axis=0) if up[mine].any() else np.full(len(AXES), np.nan)
             found.append(
-                Walk(
+                WalkAtCommand(
                     command=command,
                     velocity=(float(mean[0]), float(mean[1]), float(mean[2])),
                     up=float(lasted[mine].mean()),

@@ -54,6 +54,7 @@ API_NAMES = {
         "RobotCheck",
     ),
     "Train and inspect": ("train", "Training", "inspect", "Inspection"),
+    "Policies of others": ("import_policy", "check_policy", "PolicyReport"),
 }
 """Pages of the API with names of ``deal_hw`` itself."""
 

@@ -21,7 +21,7 @@ from deal_hw.workflows.say import Say
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(ImportPolicySettings):
+class PolicyImport(ImportPolicySettings):
     """Make a policy of mjlab, unitree_rl_lab or unitree_rl_gym one that `deal-hw deploy` runs.
 
     The file says joint order, poses, scales, gains, history and command ranges; what it does not say is asked
@@ -34,14 +34,14 @@ class Import(ImportPolicySettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(CheckPolicySettings):
+class PolicyCheck(CheckPolicySettings):
     """Try a policy on states of its robot and, if it walks, in the simulator; exit code 1 if it fails."""
 
     policy: tyro.conf.Positional[Path]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show:
+class PolicyShow:
     """Show a policy's joints, gains, observation, rate and commands."""
 
     policy: tyro.conf.Positional[Path]
@@ -51,16 +51,16 @@ class Show:
 KINDS = sub_verbs(
     **{
         "import": InputKind(
-            Import,
+            PolicyImport,
             example="import exported/policy.onnx --config params/deploy.yaml --robot go2 --out walk.onnx",
         ),
-        "check": InputKind(Check, example="check walk.onnx"),
-        "show": InputKind(Show, example="show walk.onnx"),
+        "check": InputKind(PolicyCheck, example="check walk.onnx"),
+        "show": InputKind(PolicyShow, example="show walk.onnx"),
     }
 )
 
 
-def policy(config: Import | Check | Show) -> int | PolicyReport:
+def policy(config: PolicyImport | PolicyCheck | PolicyShow) -> int | PolicyReport:
     """Run the verb.
 
     Returns:
@@ -70,11 +70,11 @@ def policy(config: Import | Check | Show) -> int | PolicyReport:
         PolicyError: The policy cannot be used.
         ConfigurationError: A side file or an option is wrong.
     """
-    if isinstance(config, Show):
+    if isinstance(config, PolicyShow):
         print(policy_text(read_policy(config.policy)))
         return 0
     say: Say = print
-    if isinstance(config, Check):
+    if isinstance(config, PolicyCheck):
         report = check_policy(config.policy, say=say)
         _print_faults(report)
         return report

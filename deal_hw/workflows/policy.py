@@ -24,7 +24,7 @@ from deal_hw.workflows.say import Say, html_table, silent
 if TYPE_CHECKING:
     from deal_hw.policies.importing.manifest import ForeignPolicy
     from deal_hw.policies.importing.network import ForeignNetwork
-    from deal_hw.policies.importing.sources import Source
+    from deal_hw.policies.importing.sources import PolicyFiles
     from deal_hw.policies.importing.supplement import Supplement
     from deal_hw.policies.walking_trial import WalkingReport
 
@@ -277,11 +277,13 @@ def _answers(settings: ImportPolicySettings, motors: tuple[str, ...]) -> Supplem
         for entry in dataclasses.fields(settings)
         if entry.name in own
     }
-    return Supplement(**{**given, "motors": motors})
+    # The robot's own order of motors is no answer of the operator's.
+    known = set() if settings.motors else {"motors"}
+    return Supplement(**{**given, "motors": motors, "used": known})
 
 
 def _record(
-    policy: ForeignPolicy, source: Source, network: ForeignNetwork, answers: Supplement
+    policy: ForeignPolicy, source: PolicyFiles, network: ForeignNetwork, answers: Supplement
 ) -> dict[str, Any]:
     """Return what the file notes about its import: names and digests, no places."""
     given = {

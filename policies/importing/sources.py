@@ -19,7 +19,7 @@ _SIDE_FILES: Final = ("params/deploy.yaml", "deploy.yaml")
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class PolicyFiles:
     """The files of an exported policy.
 
     Attributes:
@@ -31,7 +31,7 @@ class Source:
     config: Path | None
 
 
-def find_source(path: Path, config: Path | None = None) -> Source:
+def find_source(path: Path, config: Path | None = None) -> PolicyFiles:
     """Return the files of an exported policy.
 
     Args:
@@ -70,10 +70,12 @@ def find_source(path: Path, config: Path | None = None) -> Source:
         (network.parent, network.parent.parent) if network.parent.name == "exported" else (network.parent,)
     )
     sides = [place / name for place in places for name in _SIDE_FILES]
-    return Source(network, config or next((file for file in sides if file.is_file()), None))
+    return PolicyFiles(network, config or next((file for file in sides if file.is_file()), None))
 
 
-def describe(source: Source, metadata: Mapping[str, str], answers: Supplement, robot: str) -> ForeignPolicy:
+def describe(
+    source: PolicyFiles, metadata: Mapping[str, str], answers: Supplement, robot: str
+) -> ForeignPolicy:
     """Return the policy that a side file or the network's own metadata describe.
 
     Args:

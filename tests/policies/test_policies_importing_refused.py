@@ -22,7 +22,7 @@ from deal_hw.errors import ConfigurationError, DealHwError, PolicyError, PolicyM
 from deal_hw.policies.importing import mjlab, unitree_rl_gym, unitree_rl_lab
 from deal_hw.policies.importing.manifest import ForeignPolicy, adapter_of, spec_of
 from deal_hw.policies.importing.network import ForeignNetwork
-from deal_hw.policies.importing.sources import Source, describe, find_source
+from deal_hw.policies.importing.sources import PolicyFiles, describe, find_source
 from deal_hw.policies.importing.supplement import Supplement, parse_history, parse_range, parse_values
 
 LAB = Foreign().deploy_yaml()
@@ -183,13 +183,13 @@ def test_other_formats_are_named(tmp_path: Path, values: Any, said: str) -> None
     """Those that are known but not imported, too."""
     config = foreign_policy.write_yaml(tmp_path / "c.yaml", values)
     with pytest.raises(ConfigurationError, match=said):
-        describe(Source(tmp_path / "p.onnx", config), {}, Supplement(motors=WIRE_JOINTS), "go2")
+        describe(PolicyFiles(tmp_path / "p.onnx", config), {}, Supplement(motors=WIRE_JOINTS), "go2")
 
 
 def test_side_file_and_metadata_must_agree(tmp_path: Path) -> None:
     """A network with the side file of another policy is found by its own metadata."""
     config = foreign_policy.write_yaml(tmp_path / "deploy.yaml", LAB)
-    source = Source(tmp_path / "p.onnx", config)
+    source = PolicyFiles(tmp_path / "p.onnx", config)
 
     def answers() -> Supplement:
         return Supplement(motors=WIRE_JOINTS)
@@ -203,7 +203,7 @@ def test_side_file_and_metadata_must_agree(tmp_path: Path) -> None:
         with pytest.raises(ConfigurationError, match=f"{name} of the network's own metadata is"):
             describe(source, {**METADATA, name: value}, answers(), "go2")
     with pytest.raises(ConfigurationError, match=r"does not say what it observes.*--config FILE"):
-        describe(Source(tmp_path / "p.onnx", None), {}, answers(), "go2")
+        describe(PolicyFiles(tmp_path / "p.onnx", None), {}, answers(), "go2")
 
 
 def test_options_that_the_file_answers_are_refused(tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_options_that_the_file_answers_are_refused(tmp_path: Path) -> None:
     config = foreign_policy.write_yaml(tmp_path / "deploy.yaml", LAB)
     answers = Supplement(motors=WIRE_JOINTS, clock_at_rest="runs", control_rate=50.0, history="1")
     with pytest.raises(ConfigurationError, match=r"--control-rate, --history: .* says that itself"):
-        describe(Source(tmp_path / "p.onnx", config), {}, answers, "go2")
+        describe(PolicyFiles(tmp_path / "p.onnx", config), {}, answers, "go2")
 
 
 def test_the_robots_joints_are_compared() -> None:
