@@ -111,7 +111,7 @@ def test_a_wrong_deploy_yaml_names_the_value(place: str, value: Any, said: str) 
 
 def test_what_is_not_measured_is_refused_with_what_to_do() -> None:
     """In all formats."""
-    term = {"params": {}, "clip": None, "scale": [2.0] * 3, "history_length": 1}
+    term: dict[str, Any] = {"params": {}, "clip": None, "scale": [2.0] * 3, "history_length": 1}
     values = {**LAB, "observations": {"base_lin_vel": term, **LAB["observations"]}}
     said = "'base_lin_vel', the base's linear velocity, which no sensor of 'go2' measures; train it without"
     with pytest.raises(PolicyMismatchError, match=said):

@@ -66,7 +66,7 @@ class Wrong:
     def act_batch(self, observations: Observation) -> FloatArray:
         """Act."""
         asked = (observations * self._into).astype(np.float32)
-        return SHIPPED.act_batch(asked)[:, self._order] * self._out
+        return np.asarray(SHIPPED.act_batch(asked)[:, self._order] * self._out)
 
 
 def exchanged(one: str, other: str) -> dict[str, str]:
