@@ -29,6 +29,9 @@ class Robot(abc.ABC):
     homes_by_motor: ClassVar[bool] = True
     """Whether ``home`` moves the motors by this driver's commands; a run must then end passive."""
 
+    lowers: ClassVar[bool] = False
+    """Whether :meth:`lower` brings it to a pose in which it may go limp."""
+
     notice: ClassVar[str] = ""
     """A note to the operator before a run of an unusual device; "": none."""
 
@@ -98,6 +101,16 @@ class Robot(abc.ABC):
 
         Raises:
             SafetyError: Another program or the robot's own controller has it; the text names it.
+        """
+
+    def lower(self, timeout_s: float) -> None:  # noqa: B027
+        """Bring the robot to a pose in which it may go limp, at a planned end, before ``passive``.
+
+        Does nothing by default. It is not called after a trip or a stop: then the robot is passive at once.
+
+        Raises:
+            TransportTimeoutError: It does not arrive in time.
+            SafetyError: The robot reports an error on the way.
         """
 
     def hand_back(self, timeout_s: float) -> None:  # noqa: B027

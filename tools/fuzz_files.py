@@ -24,7 +24,7 @@ from fuzz.kind import FileKind, Kind
 from fuzz.run import make_input, run
 from measuring import parser
 
-GROUPS = ("recordings", "wire", "cartpole_wires", "calibration")
+GROUPS = ("recordings", "wire", "cartpole_wires", "feetech_wires", "calibration")
 
 
 def kinds() -> dict[str, Kind]:

@@ -26,6 +26,7 @@ from typing import Any
 import tyro
 from fakes.go2 import FakeGo2
 from fuzz.cartpole_wires import blocks, read_answer
+from fuzz.feetech_wires import answers, read_answers, read_requests, requests
 from fuzz.wire import low_commands
 from measuring import Rows
 from rich.console import Console
@@ -125,6 +126,13 @@ def _answer(*, fast: bool) -> Callable[[bytes], list[bytes]]:
     return contents
 
 
+def _feetech_answers(data: bytes) -> list[bytes]:
+    try:
+        return [b"".join(read_answers(data).values())]
+    except (FrameError, TransportTimeoutError):
+        return []
+
+
 CODECS = {
     "cart-pole, serial": Codec(
         frames=[
@@ -146,6 +154,8 @@ CODECS = {
     ),
     "Dynamixel, fast answers": Codec(frames=[blocks(fast=True)], contents=_answer(fast=True), bits=16),
     "Dynamixel, plain answers": Codec(frames=[blocks(fast=False)], contents=_answer(fast=False), bits=16),
+    "Feetech, requests": Codec(frames=requests(), contents=read_requests, bits=8),
+    "Feetech, answers": Codec(frames=[answers()], contents=_feetech_answers, bits=8),
     "Go2, LowCmd": Codec(frames=low_commands(), contents=_checked(decode_low_command, "LowCmd"), bits=32),
     "Go2, LowState": Codec(
         frames=[encode_low_state(FakeGo2().state())], contents=_checked(decode_low_state, "LowState"), bits=32

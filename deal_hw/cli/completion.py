@@ -84,7 +84,9 @@ def completion(shell: str, verbs: Mapping[str, Verb]) -> str:
         table = (config if isinstance(config, Kinds) else one_kind(config)).table()
         found = {word: list(options_of(kind.settings).values()) for word, kind in table.items()}
         first = [one for one in found.get("", ()) if one.positional and one.choices][:1]
-        words = [*filter(None, found), *(choice for one in first for choice in one.choices)]
+        # A kind that a word and an option name together is found behind that word.
+        own = [word for word, kind in table.items() if word and not kind.compound]
+        words = [*own, *(choice for one in first for choice in one.choices)]
         if any(one.positional and one.name == "robot" for one in found.get("", ())):
             words = words or list(driven_robots())
         kinds.append(f'    {name}) kinds="{" ".join(words)}" ;;')

@@ -1,6 +1,7 @@
 """The one table of robots: built-in ones and those of installed plug-ins; `connect` reaches them."""
 
 from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
+from deal_hw.robots.file_robot import has_hardware, no_driver
 from deal_hw.robots.registry import (
     balanced,
     default_transport,
@@ -9,6 +10,7 @@ from deal_hw.robots.registry import (
     driver_description,
     emulated_robots,
     has_task,
+    is_file,
     is_known,
     parameter_spaces,
     plug_ins,
@@ -36,8 +38,11 @@ __all__ = [
     "driven_robots",
     "driver_description",
     "emulated_robots",
+    "has_hardware",
     "has_task",
+    "is_file",
     "is_known",
+    "no_driver",
     "parameter_spaces",
     "plug_ins",
     "recorded_description",

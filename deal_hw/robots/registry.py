@@ -17,6 +17,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robots import built_in
 from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
+from deal_hw.robots.file_robot import file_entry, is_robot_file, machine_of, no_driver
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
@@ -187,22 +188,30 @@ def is_known(name: str) -> bool:
 
 
 def robot_entry(name: str) -> RobotEntry:
-    """Return a robot's entry.
+    """Return a robot's entry: from the table, or made of a robot.yaml.
+
+    Args:
+        name: Its name; or the path of a robot.yaml, or of a dataset with one.
 
     Raises:
         UnknownNameError: There is no such robot.
-        ConfigurationError: It is a plug-in's that cannot be used.
+        ConfigurationError: It is a plug-in's that cannot be used, or a robot.yaml that cannot be read.
     """
-    return robots().named(name)
+    return file_entry(name) if is_file(name) else robots().named(name)
 
 
 def driven_entry(name: str) -> RobotEntry:
-    """Return the entry of a robot with a driver.
+    """Return the entry of a robot with a driver; the name as in :func:`robot_entry`.
 
     Raises:
         UnknownNameError: There is no such robot.
         ConfigurationError: It has a description, but no driver; or it is a plug-in's that cannot be used.
     """
+    if is_file(name):
+        entry = file_entry(name)
+        if not entry.driven:
+            raise ConfigurationError(no_driver(name))
+        return entry
     found = robots().find(name)
     if found is None:
         raise UnknownNameError("robot", name, driven_robots())
@@ -350,5 +359,13 @@ def trained_robots() -> tuple[str, ...]:
     return tuple(sorted(entry.name for entry in robots().entries() if entry.task))
 
 
+def is_file(name: str) -> bool:
+    """Return whether a name is the path of a robot.yaml or a dataset, and none of the table."""
+    return not is_known(name) and is_robot_file(name)
+
+
 def _machine(name: str) -> str:
+    if is_file(name):
+        # The file may be gone: a run's note keeps its path.
+        return machine_of(name)
     return (robot_entry(name).machine if is_known(name) else "") or name

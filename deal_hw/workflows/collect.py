@@ -12,6 +12,7 @@ from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.motions.excitation.level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import FROM_PYTHON, File, RunSeconds, Seed, from_settings, given, refuse
+from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
@@ -117,9 +118,9 @@ COLLECT = robot_kinds(
     {"cartpole": CollectCartpoleSettings, "go2": CollectGo2Settings},
     plain=CollectSettings,
     legged=CollectLeggedSettings,
-    file=CollectSimulatedSettings,
+    simulated=CollectSimulatedSettings,
     example="--port {port} --out runs/first",
-    file_example="--simulated --out runs/first",
+    simulated_example="--simulated --out runs/first",
 )
 """The kinds of :func:`collect`."""
 
@@ -161,7 +162,7 @@ def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> Ru
         policy=str(policy or ""),
         seconds=seconds,
         seed=config.seed,
-        rich=config.rich,
+        rich=config.rich if policy or not is_user_robot(config.robot) else without_balance(config.rich),
         excitation_level=config.excitation_level,
         excite=excite,
     )
@@ -188,7 +189,7 @@ def _rehearse(config: CollectSimulatedSettings, view: RunView) -> RunReport:
         motion="excite" if excite else config.motion,
         seconds=seconds,
         seed=config.seed,
-        rich=dataclasses.replace(config.rich, balance_s=0.0, segments=()),
+        rich=without_balance(config.rich),
         excitation_level=config.excitation_level,
         excite=excite,
     )
@@ -202,6 +203,11 @@ def _rehearse(config: CollectSimulatedSettings, view: RunView) -> RunReport:
         view=view,
         attempts=config.attempts,
     )
+
+
+def without_balance(config: RichConfig) -> RichConfig:
+    """Return the settings of random set-points alone, for a robot that stands without a policy."""
+    return dataclasses.replace(config, balance_s=0.0, segments=())
 
 
 def _refuse_ignored(config: CollectSettings | CollectSimulatedSettings) -> None:

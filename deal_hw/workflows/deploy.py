@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from deal_hw.documentation import page
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import File, RunSeconds, Seed, from_settings
+from deal_hw.workflows.robot import name_of
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
@@ -85,7 +85,6 @@ DEPLOY = robot_kinds(
     {"cartpole": DeployCartpoleSettings, "go2": DeployGo2Settings},
     plain=DeploySettings,
     legged=DeployLeggedSettings,
-    no_file=f"; {page('how-to/add.md')} shows how to write one",
     example="--port {port} --policy runs/first/policies/policy.onnx",
 )
 """The kinds of :func:`deploy`."""
@@ -127,7 +126,11 @@ def run(config: DeploySettings, view: RunView) -> RunReport:
         plan,
         port=config.port,
         dataset=recording_folder(
-            config.out, config.dataset, "deploy", config.robot, record=config.record and not config.dry_run
+            config.out,
+            config.dataset,
+            "deploy",
+            name_of(config.robot),
+            record=config.record and not config.dry_run,
         ),
         episodes=config.episodes,
         purpose="deploy",

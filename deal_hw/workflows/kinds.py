@@ -33,6 +33,11 @@ class InputKind:
     usage: str = ""
     example: str | None = None
 
+    @property
+    def compound(self) -> bool:
+        """Whether a word and an option name it together, as in ``robot.yaml --simulated``."""
+        return " " in self.usage and not self.usage.startswith("-")
+
 
 @dataclass(frozen=True, slots=True)
 class Arguments:
@@ -86,7 +91,8 @@ class Kinds:
         if name in table:
             return name, table[name]
         if not name:
-            raise MissingKindError(f"name the {self.noun}: {', '.join(table)}")
+            words = ", ".join(kind.usage if kind.compound else word for word, kind in table.items())
+            raise MissingKindError(f"name the {self.noun}: {words}")
         raise UnknownNameError(self.noun, name, table)
 
     def settings(self, *values: Any, **named: Any) -> Any:

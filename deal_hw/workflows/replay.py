@@ -17,7 +17,7 @@ from deal_hw.robots import driver_description
 from deal_hw.types import Trajectory
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds, field_names
 from deal_hw.workflows.options import File, from_settings, refuse
-from deal_hw.workflows.robot import carries_robot, user_robot
+from deal_hw.workflows.robot import carries_robot, name_of, user_robot
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
@@ -90,9 +90,9 @@ _ROBOTS = robot_kinds(
     {"cartpole": ReplayCartpoleSettings, "go2": ReplayGo2Settings},
     plain=ReplaySettings,
     legged=ReplayLeggedSettings,
-    file=ReplaySimulatedSettings,
+    simulated=ReplaySimulatedSettings,
     example="--port {port}",
-    file_example="--simulated",
+    simulated_example="--simulated",
 )
 
 
@@ -190,7 +190,7 @@ def run(config: ReplaySettings | ReplaySimulatedSettings, view: RunView) -> RunR
     return run_episodes(
         plan,
         port=config.port,
-        dataset=recording_folder(config.out, config.dataset, "replay", robot, record=config.record),
+        dataset=recording_folder(config.out, config.dataset, "replay", name_of(robot), record=config.record),
         episodes=1,
         purpose="replay",
         view=view,

@@ -16,7 +16,16 @@ from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.findings import Finding, Severity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Checked, Range
-from deal_hw.robots import API_VERSION, RobotEntry, is_known, recorded_description, robot_entry
+from deal_hw.robots import (
+    API_VERSION,
+    RobotEntry,
+    driver_description,
+    is_file,
+    is_known,
+    recorded_description,
+    robot_entry,
+)
+from deal_hw.robots.file_robot import machine_of, robot_yaml
 from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.say import html_table
 
@@ -155,10 +164,7 @@ def is_ours(name: str) -> bool:
 
 def is_user_robot(robot: str) -> bool:
     """Return whether a verb's robot is a file or a folder, and not the name of a robot of deal-hw."""
-    if not robot or is_ours(robot):
-        # An empty path would be the present folder.
-        return False
-    return Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir()
+    return is_file(robot)
 
 
 def user_robot(robot: str) -> UserRobot:
@@ -196,6 +202,16 @@ def entry_of(robot: str) -> RobotEntry:
     )
 
 
+def name_of(robot: str) -> str:
+    """Return the name that a robot's recordings carry: its own, where a robot.yaml describes it."""
+    return driver_description(robot).name if is_user_robot(robot) else robot
+
+
+def named(robot: str) -> str:
+    """Return a robot's name for other processes: that of the table, or the whole path of its robot.yaml."""
+    return machine_of(robot) if is_user_robot(robot) else robot
+
+
 def described(robot: str) -> RobotDescription:
     """Return the description of a robot of deal-hw by its name, of a robot.yaml, or of a dataset's robot.
 
@@ -221,14 +237,24 @@ def _described_by_file(robot: str) -> RobotDescription:
     return load_robot(Path(robot)).description()
 
 
+def keep_robot(robot: str, dataset: Path) -> None:
+    """Copy a user's robot into a dataset, so that its recordings can be calibrated anywhere.
+
+    Raises:
+        MissingExtraError: MuJoCo is not installed, which finds the files of the MJCF.
+        DatasetError: The dataset holds another robot, or cannot be written.
+    """
+    found = _sim().read_robot(robot_yaml(robot))
+    from deal_hw.sim.robots.dataset_robot import store_robot
+
+    store_robot(found, dataset)
+
+
 def default_space(description: RobotDescription) -> ParameterSpace:
     """Return the default parameters of a user's robot: friction, damping, armature and gains of the MJCF."""
-    from deal_hw.sim.engine.compiling import compile_mjcf
-    from deal_hw.sim.parameters.template import template
-    from deal_hw.sim.parameters.yaml_space import parse_space
+    from deal_hw.sim.robots import simulated
 
-    model = compile_mjcf(description.mjcf)
-    return parse_space(template(model), model, "the default parameters (see --write-parameters)")
+    return simulated.default_space(description)
 
 
 def carries_robot(dataset: File | None) -> bool:

@@ -6,13 +6,16 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
-from deal_hw.errors import ConfigurationError, DealHwError
-from deal_hw.robots import driven_robots, driver_description, robot_entry
+from deal_hw.errors import DealHwError
+from deal_hw.robots import driven_robots, driver_description, has_hardware, robot_entry
+from deal_hw.robots.file_robot import robot_yaml
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.robot import is_user_robot
 
 FILE = "robot.yaml"
 """The kind of a robot.yaml, and of a dataset that carries its robot."""
+SIMULATED = "simulated"
+"""The kind of the same in simulation."""
 
 
 PORTS: Final[Mapping[str, str]] = MappingProxyType(
@@ -20,34 +23,27 @@ PORTS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Ports in examples, by transport."""
 
-NO_DRIVER = (
-    "deal-hw has no driver for this robot; record its simulation with --simulated, or import recordings of "
-    "it: deal-hw data import"
-)
-
 
 def robot_kinds(
     own: Mapping[str, type[Any]],
     *,
     plain: type[Any],
     legged: type[Any],
-    file: type[Any] | None = None,
-    no_file: str = "",
+    simulated: type[Any] | None = None,
     nothing: type[Any] | None = None,
     example: str,
-    file_example: str = "",
+    simulated_example: str = "",
 ) -> Kinds:
     """Return the kinds of a verb whose first argument is a robot.
 
     Args:
         own: Robots with settings of their own -> the settings; those of a machine hold for all its robots.
-        plain: Settings of another robot, such as one of a plug-in.
+        plain: Settings of another robot, such as one of a plug-in or of a robot.yaml with hardware.
         legged: Those of another robot with legs.
-        file: Those of a robot.yaml; None where the verb takes none.
-        no_file: What such a robot is told then, behind "deal-hw has no driver for this robot".
+        simulated: Those of a robot.yaml in simulation; None where the verb does not simulate.
         nothing: Settings without a robot; None where the verb needs one.
         example: Options in the example of a robot; ``{port}`` becomes a port of its usual wire.
-        file_example: Options in the example of a robot.yaml.
+        simulated_example: Options in the example of a simulation.
     """
 
     def table() -> Mapping[str, InputKind]:
@@ -57,31 +53,40 @@ def robot_kinds(
             settings = own.get(name) or own.get(robot_entry(name).machine)
             settings = settings or (legged if has_legs(name) else plain)
             found[name] = InputKind(settings, example=f"{name} {example.format(port=usual_port(name))}")
-        return found if file is None else {**found, FILE: InputKind(file, example=f"{FILE} {file_example}")}
+        found[FILE] = InputKind(plain, example=f"{FILE} {example.format(port=PORTS['serial'])}")
+        if simulated is not None:
+            usage, shown = f"{FILE} --simulated", f"{FILE} {simulated_example}"
+            found[SIMULATED] = InputKind(simulated, usage=usage, example=shown)
+        return found
 
     def find(arguments: Arguments) -> str:
-        if file is not None and "port" in arguments.options and is_user_robot(str(arguments.first or "")):
-            raise ConfigurationError(f"{arguments.first}: {NO_DRIVER}")
-        return robot_kind("" if arguments.first is None else str(arguments.first), file is not None, no_file)
+        name = "" if arguments.first is None else str(arguments.first)
+        return robot_kind(name, arguments.options, simulated is not None)
 
     return Kinds(noun="robot", argument="robot", table=table, find=find)
 
 
-def robot_kind(name: str, files: bool, no_file: str = "") -> str:
+def robot_kind(name: str, options: Mapping[str, Any], simulates: bool) -> str:
     """Return the kind of a robot.
 
     Args:
         name: The robot: a name, a robot.yaml, or a dataset; empty if none is given.
-        files: Whether the verb takes a robot.yaml.
-        no_file: See :func:`robot_kinds`.
+        options: What was given beside it.
+        simulates: Whether the verb may simulate a robot.yaml.
 
     Raises:
         UnknownNameError: There is no such robot.
-        ConfigurationError: It has a description, but no driver; or it is a file that the verb does not take.
+        ConfigurationError: It has a description, but no driver.
     """
     if is_user_robot(name):
-        if not files:
-            raise ConfigurationError(f"{name}: deal-hw has no driver for this robot{no_file}")
+        if simulates and ("simulated" in options or "simulation" in options):
+            return SIMULATED
+        if not robot_yaml(name).is_file() or has_hardware(name):
+            return FILE
+        if simulates and "port" not in options:
+            return SIMULATED
+        # Why it cannot be driven, or what is wrong with the file.
+        driver_description(name)
         return FILE
     if name and name not in driven_robots():
         driver_description(name)

@@ -9,15 +9,15 @@ gets them when the last packet is complete.
 from __future__ import annotations
 
 import contextlib
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, TypeAlias
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
 
 from deal_hw.clock import Clock
+from deal_hw.drivers.servo_bus.interface import Answer, Port, ServoBus, WantedAnswer, Writes
 from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.drivers.servo_bus.sdk import COMM_SUCCESS, PacketHandler, Protocol2PacketHandler
-from deal_hw.errors import FrameError, ProtocolError, TransportTimeoutError
-from deal_hw.transport import Message, Transport
+from deal_hw.errors import DealHwError, FrameError, ProtocolError, TransportTimeoutError
+from deal_hw.transport import Transport
 
 HEADER: Final = b"\xff\xff\xfd\x00"
 _BROADCAST: Final = 0xFE
@@ -25,9 +25,9 @@ _SYNC_READ, _FAST_SYNC_READ, _STATUS = 0x82, 0x8A, 0x55
 _STATUS_BYTES = 11
 """A status packet without data: header 4, id, length 2, instruction, error, CRC 2."""
 _PING_BYTES = _STATUS_BYTES + 3
-_BITS_PER_BYTE = 10
-_QUEUE = 4096
 _ALERT = 0x80
+_STUFFING_BYTES = 16
+"""Additional bytes that a group's answer has time for."""
 
 
 class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
@@ -44,39 +44,14 @@ class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
         return [*whole[:5], *(len(body) + 2).to_bytes(2, "little"), *body, *whole[-2:]]
 
 
-Writes: TypeAlias = Sequence[tuple[int, Mapping[int, bytes]]]
-"""Sync writes: an address, and the bytes that each servo gets there."""
-
-
-class Answer(NamedTuple):
-    """A servo's answer to a ping."""
-
-    model: int
-    firmware: int
-
-
-class _Wanted(NamedTuple):
-    """A requested answer: servos, bytes of each, whether in one packet, deadline [ns]."""
-
-    ids: tuple[int, ...]
-    size: int
-    fast: bool
-    until_ns: int
-
-
-class _Port:
+class _Port(Port):
     """The port interface of the SDK's packet handler."""
 
     is_using = property(lambda self: False, lambda self, value: None)
     """The SDK's lock stays taken after a read that raises; this bus has one user."""
 
     def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
-        self.baud_rate, self.answer_s = baud_rate, answer_s
-        self.wire: deque[Message] = deque(maxlen=_QUEUE)
-        self.buffer = bytearray()
-        self.written = bytearray()
-        self.received_bytes = self.stamp_ns = 0
-        self._transport, self._clock = transport, clock
+        super().__init__(transport, clock, baud_rate, answer_s)
         self._deadline_ns = 0
 
     # The names below are the SDK's.
@@ -90,7 +65,7 @@ class _Port:
 
     def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
         """Keep a packet until :meth:`flush`."""
-        self.written += bytes(packet)
+        self.write(bytes(packet))
         return len(packet)
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
@@ -116,41 +91,9 @@ class _Port:
         """Return whether the time is over and all received bytes are read."""
         return not self.buffer and self._clock.now_ns() >= self._deadline_ns
 
-    # Methods that the bus adds.
-
-    def answer_ns(self, length: int) -> int:
-        """Return how long an answer of that many bytes may take [ns]."""
-        return round((length * _BITS_PER_BYTE / self.baud_rate + self.answer_s) * 1e9)
-
     def expire(self) -> None:
         """Stop waiting; the SDK then reads the buffer."""
         self._deadline_ns = 0
-
-    def flush(self) -> None:
-        """Send the written packets as one message."""
-        if self.written:
-            data, self.written = bytes(self.written), bytearray()
-            message = Message("tx", data, self._clock.now_ns())
-            self._transport.send(Message("", data, message.stamp_ns))
-            self.wire.append(message)
-
-    def receive(self, deadline_ns: int) -> bool:
-        """Wait for bytes; return whether any arrived."""
-        try:
-            message = self._transport.receive(max(0, deadline_ns - self._clock.now_ns()) / 1e9)
-        except TransportTimeoutError:
-            return False
-        self.buffer += message.payload
-        self.received_bytes += len(message.payload)
-        self.stamp_ns = message.stamp_ns
-        self.wire.append(Message("rx", message.payload, message.stamp_ns))
-        return True
-
-    def drop(self) -> None:
-        """Discard bytes that arrived too late for the previous answer."""
-        while self.receive(0):
-            pass
-        self.buffer.clear()
 
 
 @contextlib.contextmanager
@@ -162,12 +105,8 @@ def _short_is_corrupt(servo: int) -> Iterator[None]:
         raise FrameError(f"servo {servo}: a short answer") from error
 
 
-class Bus:
-    """Reads and writes servos' registers.
-
-    Attributes:
-        errors: Corrupt or missing answers so far.
-        received_bytes: Received bytes so far, valid or not.
+class Bus(ServoBus):
+    """Reads and writes the registers of Dynamixel servos.
 
     Args:
         transport: A byte stream, open.
@@ -176,27 +115,11 @@ class Bus:
         answer_s: Additional time for an answer [s].
     """
 
+    _port: _Port
+
     def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
-        self.errors = 0
-        self._clock = clock
-        self._port = _Port(transport, clock, baud_rate, answer_s)
+        super().__init__(_Port(transport, clock, baud_rate, answer_s), clock)
         self._sdk: Any = _Packets()
-        self._wanted: deque[_Wanted] = deque()
-
-    @property
-    def received_bytes(self) -> int:
-        """Received bytes so far, valid or not."""
-        return self._port.received_bytes
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the newest bytes [ns]."""
-        return self._port.stamp_ns
-
-    @property
-    def wire(self) -> deque[Message]:
-        """Messages sent and received; the newest few thousand."""
-        return self._port.wire
 
     def ping(self, servo: int) -> Answer:
         """Return model and firmware of a servo.
@@ -267,90 +190,38 @@ class Bus:
                 f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {text}"
             )
 
-    def post(self, writes: Writes) -> int:
-        """Write registers in one message without waiting; return the send time [ns].
-
-        Args:
-            writes: Sync writes, in order: an address, and the bytes of each servo.
-        """
-        self._write(writes)
-        now_ns = self._clock.now_ns()
-        self._port.flush()
-        return now_ns
-
-    def _write(self, writes: Writes) -> None:
+    def _put_writes(self, writes: Writes) -> None:
         for address, values in writes:
             size = len(next(iter(values.values())))
             params = [byte for servo, data in values.items() for byte in (servo, *data)]
             self._sdk.syncWriteTxOnly(self._port, address, size, params, len(params))
 
-    def ask(
-        self,
-        servos: Sequence[int],
-        address: int,
-        size: int,
-        *,
-        fast: bool,
-        writes: Writes = (),
-        behind: bool = False,
-    ) -> int:
-        """Request the same registers of servos in one message; return the send time [ns].
-
-        Args:
-            servos: Their ids.
-            address: The first register.
-            size: Number of bytes of each.
-            fast: Whether they answer in one packet (Fast Sync Read) or each in its own.
-            writes: Sync writes before it in the same message, as in :meth:`post`.
-            behind: Wait for this answer after the one before it; otherwise that one is forgotten.
-        """
-        if not behind:
-            self._port.drop()
-            self._wanted.clear()
-        self._write(writes)
+    def _put_group_read(self, servos: Sequence[int], address: int, size: int, fast: bool) -> None:
         self._sdk.syncReadTx(self._port, address, size, list(servos), len(servos), fast)
-        now_ns = self._clock.now_ns()
-        self._port.flush()
-        until_ns = now_ns + self._port.answer_ns(self.answer_bytes(len(servos), size, fast) + 16)
-        self._wanted.append(_Wanted(tuple(servos), size, fast, until_ns))
-        return now_ns
 
     @staticmethod
     def answer_bytes(servos: int, size: int, fast: bool) -> int:
-        """Return the number of bytes of a group's answer."""
+        """Return the number of bytes of a group's answer; ``fast`` is a Fast Sync Read."""
         return 8 + servos * (size + 4) if fast else servos * (size + _STATUS_BYTES)
 
-    def take(self, deadline_ns: int) -> dict[int, bytes] | None:
-        """Return the registers of the oldest question by id, waiting for them until a deadline at most.
+    def _wire_bytes(self, servos: int, size: int, fast: bool) -> int:
+        return self.answer_bytes(servos, size, fast) + _STUFFING_BYTES
 
-        Returns:
-            None if no complete answer arrived until the deadline, but may still arrive.
-
-        Raises:
-            TransportTimeoutError: The servos are silent.
-            FrameError: The answer is corrupt.
-        """
-        wanted = self._wanted[0]
-        while not self._whole(wanted):
-            if self._clock.now_ns() >= wanted.until_ns:
-                self.errors += 1
-                self._wanted.popleft()
-                if self._port.buffer:
-                    raise FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
-                raise TransportTimeoutError(f"servos {wanted.ids} do not answer")
-            if not self._port.receive(min(deadline_ns, wanted.until_ns)) and (
-                self._clock.now_ns() >= deadline_ns
-            ):
-                return None
+    def _collect(self, wanted: WantedAnswer) -> dict[int, bytes] | None:
+        if not self._whole(wanted):
+            return None
         self._port.expire()
-        self._wanted.popleft()
         try:
             return self._fast_answer(wanted) if wanted.fast else self._answers(wanted)
         except (IndexError, FrameError) as error:
-            self.errors += 1
             raise FrameError(f"the answer of servos {wanted.ids} is corrupt") from error
 
-    def _whole(self, answer: _Wanted) -> bool:
+    def _incomplete(self, wanted: WantedAnswer) -> DealHwError:
+        if self._port.buffer:
+            return FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
+        return TransportTimeoutError(f"servos {wanted.ids} do not answer")
+
+    def _whole(self, answer: WantedAnswer) -> bool:
         """Return whether the buffer contains all requested packets; the SDK checks their content."""
         at, wanted = 0, 1 if answer.fast else len(answer.ids)
         while wanted:
@@ -363,7 +234,7 @@ class Bus:
             wanted -= 1
         return True
 
-    def _fast_answer(self, wanted: _Wanted) -> dict[int, bytes]:
+    def _fast_answer(self, wanted: WantedAnswer) -> dict[int, bytes]:
         packet, result = self._sdk.rxPacket(self._port, True)
         if result != COMM_SUCCESS or packet[4] != _BROADCAST or packet[7] != _STATUS:
             raise FrameError("no sound packet")
@@ -378,7 +249,7 @@ class Bus:
             found[servo] = bytes(packet[at + 2 : at + 2 + wanted.size])
         return _sized(found, wanted.size)
 
-    def _answers(self, wanted: _Wanted) -> dict[int, bytes]:
+    def _answers(self, wanted: WantedAnswer) -> dict[int, bytes]:
         found = {}
         for servo in wanted.ids:
             packet, result = self._sdk.rxPacket(self._port, False)

@@ -45,39 +45,39 @@ class TickClock:
 
 
 class SampleGrid:
-    """Numbers samples on a regular grid of the servo's time.
+    """Numbers samples on a regular grid of time, in whole units such as milliseconds.
 
-    A host that polls is early or late by some tenths of a millisecond, and ticks are whole milliseconds. The
-    calibration needs samples at regular times. So the driver extrapolates each sample to the nearest point of
-    the grid with its measured velocity, over the time that :meth:`place` returns.
+    A host that polls is early or late by some tenths of a millisecond. The calibration needs samples at
+    regular times. So the driver extrapolates each sample to the nearest point of the grid with its measured
+    velocity, over the time that :meth:`place` returns.
 
     Args:
-        period_ms: Period of the grid [ms].
+        period: Period of the grid, in the unit of all times.
     """
 
-    def __init__(self, period_ms: int) -> None:
-        self._period_ms = period_ms
-        self._point_ms: int | None = None
+    def __init__(self, period: int) -> None:
+        self._period = period
+        self._point: int | None = None
         self.number = -1
         """Number of the newest sample."""
 
     def begin(self) -> None:
         """Begin a new grid at the next sample; the numbers continue."""
-        self._point_ms = None
+        self._point = None
 
-    def place(self, time_ms: int) -> int | None:
-        """Return the time from a sample to its grid point [ms]; None if that point already has a sample.
+    def place(self, time: int) -> int | None:
+        """Return the time from a sample to its grid point; None if that point already has a sample.
 
         Args:
-            time_ms: Servo time of the sample [ms].
+            time: Time of the sample.
         """
-        if self._point_ms is None:
-            self._point_ms = time_ms
+        if self._point is None:
+            self._point = time
             self.number += 1
             return 0
-        steps = round((time_ms - self._point_ms) / self._period_ms)
+        steps = round((time - self._point) / self._period)
         if steps < 1:
             return None
-        self._point_ms += steps * self._period_ms
+        self._point += steps * self._period
         self.number += steps
-        return self._point_ms - time_ms
+        return self._point - time

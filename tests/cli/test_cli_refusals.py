@@ -263,9 +263,9 @@ REVIEWED: Lines = [
     ),
     (
         "doctor mine.yaml",
-        "mine.yaml: deal-hw has no driver for this robot, so there is no connection to check",
+        "`deal-hw doctor robot.yaml` needs --port",
     ),
-    ("emulate mine.yaml", "`deal-hw collect robot.yaml --simulated` records its simulation"),
+    ("emulate mine.yaml", "mine.yaml cannot be read: there is no such file"),
     ("train mine.yaml --udr", "no training environment for this robot; name your own by --env module:ENV_ID"),
 ]
 """What a review found to be accepted in silence, or refused without a hint."""
@@ -416,7 +416,7 @@ def mistyped() -> Iterator[tuple[str, str]]:
             continue
         for word, kind in config.table().items():
             # Some kinds are found from another option or from a file; their tests are with their verbs.
-            if word.endswith(".yaml") or config.choose(Arguments(word, {}))[0] != word:
+            if ".yaml" in (kind.usage or word) or config.choose(Arguments(word, {}))[0] != word:
                 continue
             by_option = kind.usage.startswith("--")
             stated = kind.usage.split()[0].removeprefix("--") if by_option else config.argument

@@ -60,7 +60,7 @@ ROOMS = {
         {"design"},
         {"pipeline", "report"},
     ),
-    "drivers": ({"command_echo", "servo_bus", "transports"}, {"cartpole", "go2"}),
+    "drivers": ({"command_echo", "servo_bus", "transports"}, {"cartpole", "go2", "servo_arm"}),
     "drivers.cartpole": (
         {"description"},
         {"wire", "plant"},

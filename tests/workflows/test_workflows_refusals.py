@@ -46,7 +46,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("collect", CARTPOLE, "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
     ("collect", {**COLLECT, "dataset": "d"}, "give --out RUN or --dataset DIR, not both"),
     ("collect", COLLECT, "no-port"),
-    ("collect", {"robot": "r.yaml", "out": "out"}, "deal-hw has no driver for this robot"),
+    ("collect", {"robot": "r.yaml", "port": "p", "out": "out"}, "r.yaml cannot be read: there is no such"),
     ("new_robot", {"model": "m.xml"}, "model m.xml does not exist"),
     ("new_robot", {"model": "m.xml", "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 0.001 to"),
     ("check_robot", {"robot": "r.yaml"}, "r.yaml cannot be read: there is no such file"),

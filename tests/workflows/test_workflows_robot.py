@@ -219,7 +219,7 @@ REFUSED: list[tuple[str, str]] = [
     ),
     (
         "collect {made}/robot.yaml --out r",
-        "deal-hw has no driver for this robot; record its",
+        "or record its simulation with --simulated",
     ),
     (
         "collect {made}/robot.yaml --simulated --out r --excite chirp",
@@ -227,17 +227,17 @@ REFUSED: list[tuple[str, str]] = [
     ),
     (
         "collect cartpole --simulated --out r",
-        "--simulated: `deal-hw collect cartpole` has no such option; `collect robot.yaml` has it",
+        "--simulated: `deal-hw collect cartpole` has no such option; `collect robot.yaml --simulated` has it",
     ),
     ("collect nosuch --out r", "unknown robot 'nosuch'; known: "),
     ("collect cartpole --out r", "`deal-hw collect cartpole` needs --port; --port is: The robot's port"),
     (
         "replay {made}/run/dataset/episodes/000000.mcap --port p",
-        "deal-hw has no driver for this robot; record its simulation with --simulated",
+        "deal-hw has no driver for this robot",
     ),
     (
         "deploy {made}/robot.yaml --port p",
-        "docs/how-to/add.md shows how to write one",
+        "write the section `hardware` into its robot.yaml",
     ),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]

@@ -19,6 +19,7 @@ from deal_hw.control.process.channel import (
     CONNECTING,
     HANDING_BACK,
     HOMING,
+    LOWERING,
     MAKING_PASSIVE,
     RUNNING,
     Outcome,
@@ -26,7 +27,7 @@ from deal_hw.control.process.channel import (
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
-from deal_hw.errors import ConfigurationError, TransportError, TransportTimeoutError
+from deal_hw.errors import ConfigurationError, DealHwError, TransportError, TransportTimeoutError
 from deal_hw.motions.behaviours import Behaviour
 from deal_hw.motions.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.robot import Robot
@@ -36,6 +37,8 @@ from deal_hw.types import Event, JointCommand, RobotState
 
 HOME_TIMEOUT_S: Final = 20.0
 """Longest homing [s]."""
+LOWER_TIMEOUT_S: Final = 20.0
+"""Longest way to the rest pose at a planned end [s]."""
 ARM_TIMEOUT_S: Final = 1.0
 """Longest wait until the robot reports that its motors follow commands [s]."""
 STATE_TIMEOUT_S: Final = 1.0
@@ -228,6 +231,8 @@ class ControlLoop:
                 self._raise_on_stop = False
             running = self._commanding
             outcome, reason = self._cycles()
+            if outcome is Outcome.FINISHED:
+                self._lower()
         except (OperatorStop, KeyboardInterrupt):
             outcome, reason = Outcome.STOPPED, self._stop_reason or "stopped by the operator"
         except Exception as err:
@@ -457,6 +462,22 @@ class ControlLoop:
             self._config.passive,
             progress=lambda text, silence_s: self._progress(f"{MAKING_PASSIVE}: {text}", silence_s),
         )
+
+    def _lower(self) -> None:
+        """Bring a robot that can to a pose in which it may go limp; a stop ends this at once."""
+        if not self._robot.lowers or self._config.dry_run:
+            return
+        self._progress(LOWERING, LOWER_TIMEOUT_S + 2.0)
+        try:
+            self._raise_on_stop = True
+            if self._stop_reason:
+                raise OperatorStop(self._stop_reason)
+            self._robot.lower(LOWER_TIMEOUT_S)
+            self.note("lowered", "the robot is where it may go limp")
+        except DealHwError as err:
+            self.note("warning", f"the robot was not lowered before its motors went off: {err}")
+        finally:
+            self._raise_on_stop = False
 
     def _hand_back(self) -> None:
         if not self._config.hand_back or self._config.dry_run or not self._connected:

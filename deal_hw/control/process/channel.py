@@ -24,13 +24,14 @@ _MOST_REFUSED = 50
 """After this many successive refusals (one second at 50 Hz) the recorder is considered dead, and the run
 ends."""
 _MOST_WORD = 256
-STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, MAKING_PASSIVE, HANDING_BACK = (
+STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, LOWERING, MAKING_PASSIVE, HANDING_BACK = (
     "starting",
     "loading",
     "connecting",
     "homing",
     "arming",
     "running",
+    "moving to the rest pose",
     "making passive",
     "handing back",
 )

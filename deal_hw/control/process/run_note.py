@@ -18,6 +18,8 @@ from typing import Any
 from typing_extensions import Self
 
 _NAME = "deal-hw-run:"
+_LONGEST_NAME = 50
+"""The system takes 249 bytes; a robot may be the path of a file."""
 
 
 class RunNote:
@@ -50,7 +52,7 @@ class RunNote:
         os.ftruncate(self._fd, len(text))
 
     def __enter__(self) -> Self:
-        self._fd = os.memfd_create(_NAME + self._robot)
+        self._fd = os.memfd_create(_NAME + Path(self._robot).name[:_LONGEST_NAME])
         self.say_passive(True)
         return self
 

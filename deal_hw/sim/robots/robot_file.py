@@ -17,6 +17,13 @@ import yaml
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import NAMES, read_yaml, reading
 from deal_hw.schema import FINITE, from_values, refusal
+from deal_hw.sim.robots.hardware_section import (
+    HEAD,
+    HardwareJoint,
+    HardwareSection,
+    hardware_problems,
+    section_lines,
+)
 
 FILE_NAME: Final = "robot.yaml"
 ADVICE: Final = "`deal-hw robot new robot.xml` writes one"
@@ -103,6 +110,8 @@ class RobotFile:
         control_rate_hz: Commands per second.
         state_rate_hz: State samples per second; a whole multiple of ``control_rate_hz``.
         joints: The joints, in the order that every array follows.
+        physics_step: The MJCF's timestep [s], so that the robot is driven without MuJoCo; None: not noted.
+        hardware: The bus and the servos by which it is driven; None: it is not.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -116,6 +125,8 @@ class RobotFile:
     joints: tuple[JointEntry, ...]
     floating_base: str | None = None
     feet: tuple[str, ...] = ()
+    physics_step: float | None = None
+    hardware: HardwareSection | None = None
 
     def __post_init__(self) -> None:
         if not 0 < len(self.name) <= _LONGEST_NAME or not self.name.isprintable() or "/" in self.name:
@@ -139,6 +150,21 @@ class RobotFile:
             raise ConfigurationError(
                 "no joint has an actuator; write `actuator: {...}` for those that take commands"
             )
+        if self.physics_step is not None and not 1e-6 <= self.physics_step <= 1:
+            raise refusal("physics_step", self.physics_step, "the MJCF's timestep, 1e-6 to 1 s, or null")
+        self._check_hardware()
+
+    def _check_hardware(self) -> None:
+        if self.hardware is None:
+            return
+        joints = [
+            HardwareJoint(j.name, j.actuator is not None, j.unit, j.position_range, j.velocity_limit)
+            for j in self.joints
+        ]
+        floating = self.floating_base is not None
+        problems = hardware_problems(self.hardware, joints, actuation=self.actuation, floating=floating)
+        if found := list(problems):
+            raise ConfigurationError(f"hardware: {'; '.join(found)}")
 
 
 def read_robot_file(path: Path) -> RobotFile:
@@ -186,11 +212,20 @@ def write_robot_file(robot: RobotFile) -> str:
         _line("feet", list(robot.feet), "sphere geoms of the feet of a robot whose base floats"),
         _line("control_rate_hz", robot.control_rate_hz, "commands a second [Hz]"),
         _line("state_rate_hz", robot.state_rate_hz, "states a second, a multiple of control_rate_hz [Hz]"),
+        _line(
+            "physics_step",
+            robot.physics_step,
+            "the MJCF's timestep [s]; with it no MuJoCo is needed to drive",
+        ),
         _JOINT_HEAD,
         "joints:\n",
     ]
     for joint in robot.joints:
         lines += _joint_lines(joint)
+    if robot.hardware is not None:
+        lines += [HEAD, "hardware:\n"]
+        for indent, name, value, comment in section_lines(robot.hardware):
+            lines.append("  servos:\n" if name == "servos" else _line(name, value, comment, indent))
     return "".join(lines)
 
 

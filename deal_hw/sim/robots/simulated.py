@@ -10,13 +10,17 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, ConfigurationError, TransportTimeoutError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
 from deal_hw.schema import plain
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import reported
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.parameters.template import template
+from deal_hw.sim.parameters.yaml_space import parse_space
 from deal_hw.transport import Message
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
@@ -42,6 +46,12 @@ class SimulatedTruth:
         """Return plain JSON values."""
         values: dict[str, Any] = plain(self)
         return values
+
+
+def default_space(description: RobotDescription) -> ParameterSpace:
+    """Return the default parameters of a user's robot: friction, damping, armature and gains of the MJCF."""
+    model = compile_mjcf(description.mjcf)
+    return parse_space(template(model), model, "the default parameters (see --write-parameters)")
 
 
 def draw_truth(space: ParameterSpace, seed: int, range_ratio: float, latency_s: float) -> SimulatedTruth:

@@ -12,18 +12,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
+from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.mjcf.describe import WINDOW_TICKS, Sampling, describe, sampling
 from deal_hw.sim.mjcf.joint_facts import joint_facts
 from deal_hw.sim.parameters.fields import element_names
+from deal_hw.sim.robots.file_description import file_description, free_of, limits_of, sensor_of
 from deal_hw.sim.robots.robot_file import ActuatorEntry, JointEntry, RobotFile, read_robot_file
 
-OVERSHOOT = 0.25
-"""Share of the range by which a measured position may exceed it before a run trips."""
-LEAST_AGE_S, AGE_PERIODS = 0.1, 5
-"""Age of states and actions that trips [s], and the same in control periods; the larger one counts."""
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
@@ -60,6 +57,9 @@ class UserRobot:
         Args:
             rates: Rates of recordings, if they differ from the robot's own.
         """
+        if self.file.hardware is not None and rates is None:
+            # As the driver has it, so that recordings and simulation have one description.
+            return file_description(self.file, self.mjcf)
         rates = rates or self.rates
         joints = self.file.joints
         driven = [(joint, joint.actuator) for joint in joints if joint.actuator is not None]
@@ -69,13 +69,9 @@ class UserRobot:
             base,
             name=self.file.name,
             default_position=tuple(joint.default_position for joint in joints),
-            effort_limit=tuple(_free(actuator.effort_limit) for _, actuator in driven),
-            limits=_limits(joints, base, control_hz),
-            sensor=SensorModel(
-                noise=tuple(joint.sensor_noise for joint in joints),
-                resolution=tuple(joint.sensor_resolution for joint in joints),
-                velocity_window_s=0.0,
-            ),
+            effort_limit=tuple(free_of(actuator.effort_limit) for _, actuator in driven),
+            limits=limits_of(self.file, control_hz),
+            sensor=sensor_of(self.file),
             feet=self.file.feet,
             sources={name: "robot.yaml" for name in ("limits", "sensor", "default_position", "effort_limit")}
             | {name: "the MJCF" for name in ("joint_names", "stiffness", "damping")},
@@ -169,6 +165,7 @@ def derive_robot(
         feet=tuple(feet),
         control_rate_hz=control_rate_hz,
         state_rate_hz=state_rate_hz or control_rate_hz,
+        physics_step=float(model.opt.timestep),
         joints=tuple(joints),
     )
     robot = UserRobot(file=file, mjcf=mjcf, model=model)
@@ -215,6 +212,11 @@ def contradictions(robot: UserRobot) -> Iterator[str]:
         if foot not in spheres:
             known = ", ".join(spheres) or "none has a name"
             yield f"foot {foot!r} is no sphere geom of the MJCF; its spheres: {known}"
+    step_s = float(model.opt.timestep)
+    if file.physics_step is None and file.hardware is not None:
+        yield f"physics_step is missing; write {step_s!r}, the MJCF's timestep"
+    if file.physics_step is not None and not math.isclose(file.physics_step, step_s, rel_tol=1e-9):
+        yield f"physics_step is {file.physics_step:g}, the MJCF's timestep {step_s:g}; write {step_s!r}"
     if 1.0 / file.state_rate_hz < float(model.opt.timestep) * (1 - 1e-6):
         yield (
             f"state_rate_hz {file.state_rate_hz:g} is faster than the MJCF's timestep of "
@@ -241,7 +243,7 @@ def _of_joints(robot: UserRobot, base: RobotDescription, limits: Any) -> Iterato
         ):
             if not math.isclose(given, own, rel_tol=1e-6, abs_tol=1e-12):
                 yield _differs(name, joint.name, given, own)
-        given, own = _free(joint.actuator.effort_limit), base.effort_limit[a]
+        given, own = free_of(joint.actuator.effort_limit), base.effort_limit[a]
         if given != own and not math.isclose(given, own, rel_tol=1e-6) and math.isfinite(own):
             yield _differs("effort_limit", joint.name, given, own)
 
@@ -266,35 +268,6 @@ def _check_one_tree(mjcf: Path, model: Any) -> None:
             f"model {mjcf} holds {len(roots)} robots: {trees}. Name an MJCF with one of them; or, where they "
             "are one robot, such as two arms, add --several-trees"
         )
-
-
-def _limits(joints: Sequence[JointEntry], base: RobotDescription, control_hz: float) -> SafetyLimits:
-    driven = [joint for joint in joints if joint.actuator is not None]
-    free = (math.inf,) * len(driven)
-    motor = base.actuation == "motor"
-    return dataclasses.replace(
-        base.limits,
-        target=tuple(
-            (-1.0, 1.0) if motor else joint.position_range or (-math.inf, math.inf) for joint in driven
-        ),
-        target_step=free if motor else tuple(_free(joint.velocity_limit) / control_hz for joint in driven),
-        trip_position=tuple(_trip_range(joint.position_range) for joint in joints),
-        trip_velocity=tuple(_free(joint.velocity_limit) for joint in joints),
-        effort=tuple(_free(joint.actuator.effort_limit) for joint in driven if joint.actuator is not None),
-        state_age_s=max(LEAST_AGE_S, AGE_PERIODS / control_hz),
-        action_age_s=max(LEAST_AGE_S, AGE_PERIODS / control_hz),
-    )
-
-
-def _trip_range(allowed: tuple[float, float] | None) -> tuple[float, float]:
-    if allowed is None:
-        return -math.inf, math.inf
-    slack = OVERSHOOT * (allowed[1] - allowed[0])
-    return allowed[0] - slack, allowed[1] + slack
-
-
-def _free(limit: float | None) -> float:
-    return math.inf if limit is None else limit
 
 
 def _finite(limit: float) -> float | None:

@@ -107,7 +107,6 @@ DOCTOR = robot_kinds(
     plain=DoctorRobotSettings,
     legged=DoctorRobotSettings,
     nothing=DoctorSettings,
-    no_file=", so there is no connection to check; `deal-hw robot check robot.yaml` checks its description",
     example="--port {port}",
 )
 """The kinds of :func:`doctor`."""

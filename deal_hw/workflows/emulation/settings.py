@@ -10,11 +10,13 @@ from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
-from deal_hw.robots import emulated_robots, robot_entry
+from deal_hw.robots import driven_entry, emulated_robots, has_hardware, robot_entry
+from deal_hw.robots.file_robot import robot_yaml
 from deal_hw.transport import NetworkOptions, WireOptions
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Share, given, refuse
 from deal_hw.workflows.robot import is_user_robot
+from deal_hw.workflows.robot_kinds import FILE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,9 +212,9 @@ class EmulatePlugInSettings(PseudoTerminalSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        entry = robot_entry(self.robot)
-        name = self.transport or entry.emulated_on[0]
-        if entry.wire(name).emulator_port:
+        entry = None if is_user_robot(self.robot) else robot_entry(self.robot)
+        name = self.transport or ("serial" if entry is None else entry.emulated_on[0])
+        if entry is not None and entry.wire(name).emulator_port:
             refuse(
                 given(self, EmulatePlugInSettings, ["link", "vanish_after_s", "return_after_s"]),
                 f"the emulator of {self.robot!r} on {name} listens at --port, it has no pseudo-terminal",
@@ -246,19 +248,20 @@ _SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettin
 
 
 def _table() -> dict[str, InputKind]:
-    return {
+    found = {
         name: InputKind(_SETTINGS.get(name, EmulatePlugInSettings), example=f"{name} --seed 0")
         for name in emulated_robots()
     }
+    what = "Emulate the robot of a robot.yaml: its servos' bytes on a port of its own, with hidden physics."
+    return {**found, FILE: InputKind(EmulatePlugInSettings, what, example=f"{FILE} --seed 0")}
 
 
 def _find(arguments: Arguments) -> str:
     name = "cartpole" if arguments.first is None else str(arguments.first)
     if is_user_robot(name):
-        raise ConfigurationError(
-            f"{name}: deal-hw has no driver for this robot, so there is nothing to emulate; "
-            "`deal-hw collect robot.yaml --simulated` records its simulation"
-        )
+        if robot_yaml(name).is_file() and not has_hardware(name):
+            driven_entry(name)
+        return FILE
     return name
 
 

@@ -76,7 +76,7 @@ class EpisodeRun:
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
         self._path = store.next_episode_path() if store is not None else None
         self._metadata = {
-            "robot": plan.robot,
+            "robot": robot.description.name,
             "description_digest": robot.description.digest(),
             "purpose": purpose,
             "task": task,

@@ -10,10 +10,10 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.ranges import Checked, Range, option
-from deal_hw.robots import default_transport, driver_description
+from deal_hw.robots import default_transport, driver_description, no_driver
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import FROM_PYTHON, File, Ratio, Seed, given, refuse
-from deal_hw.workflows.robot_kinds import NO_DRIVER
+from deal_hw.workflows.robot import named
 from deal_hw.workflows.say import Say, silent
 
 
@@ -171,7 +171,7 @@ def require_simulation(robot: str, options: SimulationOptions) -> None:
         ConfigurationError: It is not.
     """
     if not options.simulated:
-        raise ConfigurationError(f"{robot}: {NO_DRIVER}")
+        raise ConfigurationError(no_driver(robot))
 
 
 def refuse_unrecorded(options: RunOptions, record: bool) -> None:
@@ -203,7 +203,7 @@ def plan_options(
     """
     description = driver_description(robot)
     options = {
-        "robot": robot,
+        "robot": named(robot),
         "transport": link.transport or default_transport(robot),
         "record_wire": link.record_wire,
         "robot_settings": _settings(link, legs),

@@ -17,6 +17,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
 from deal_hw.robots.connect import make_robot
 from deal_hw.workflows.options import File
+from deal_hw.workflows.robot import is_user_robot, keep_robot
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
 from deal_hw.workflows.running.episode import EpisodeRun
 from deal_hw.workflows.running.plan import RunPlan, check_plan
@@ -150,7 +151,7 @@ def run_episodes(
     if robot.notice:
         view.note(robot.notice)
     elif holds_last_command:
-        view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot, stopped_by=robot.stopped_by))
+        view.note(HOLDS_LAST_COMMAND.format(robot=robot.description.name, stopped_by=robot.stopped_by))
     # The supervisor connects to the robot itself, so that a wrong port is reported before a process starts.
     # Then it only keeps the port open, until the control process is dead.
     with (
@@ -159,7 +160,7 @@ def run_episodes(
         noted(plan) as note,
         awake(before_sleep, view.note) if holds_last_command else contextlib.nullcontext(),
         connected(robot),
-        _open_dataset(dataset, robot.description, view.warn) as store,
+        _open_dataset(dataset, plan.robot, robot.description, view.warn) as store,
     ):
         if store is not None and plan.policy_digest:
             store.keep_policy(Path(plan.policy), plan.policy_digest)
@@ -169,7 +170,9 @@ def run_episodes(
             current.append(run)
             if sleeping.is_set():
                 run.stop(ASLEEP)
-            with view.progress(f"{purpose} {plan.robot} {number + 1}/{episodes}", plan.total_s) as show:
+            with view.progress(
+                f"{purpose} {robot.description.name} {number + 1}/{episodes}", plan.total_s
+            ) as show:
                 reports.append(run.run(_both(show, on_beat)))
             view.ended(reports[-1])
             if run.signal:
@@ -245,11 +248,15 @@ def _to_repeat(
 
 
 @contextlib.contextmanager
-def _open_dataset(folder: Path | None, description: RobotDescription, say: Say) -> Iterator[Dataset | None]:
+def _open_dataset(
+    folder: Path | None, robot: str, description: RobotDescription, say: Say
+) -> Iterator[Dataset | None]:
     if folder is None:
         yield None
         return
     from deal_hw.data.recording.dataset import Dataset
 
     with Dataset.create_or_open(folder, description, say) as store:
+        if is_user_robot(robot):
+            keep_robot(robot, folder)
         yield store

@@ -11,7 +11,8 @@ from deal_hw.documentation import page
 from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
 from deal_hw.drivers.cartpole.dynamixel.examine import model_name
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.servo_bus.bus import Answer, Bus
+from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.interface import Answer
 from deal_hw.drivers.servo_bus.registers import (
     BAUD_RATES,
     HARDWARE_ERROR,

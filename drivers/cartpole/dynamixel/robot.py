@@ -17,6 +17,7 @@ from deal_hw.drivers.cartpole.dynamixel.homing import Homing
 from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.polling import Poller
 from deal_hw.drivers.servo_bus.registers import (
     PROFILE_ONGOING,
     RAD_S_PER_COUNT,
@@ -34,12 +35,7 @@ from deal_hw.types import JointCommand, RobotState, Status
 _QUEUE = 4096
 _MISSES = 3
 """Samples in a row without answer before the servos are asked one by one, and before one counts as absent."""
-_MARGIN = 1.25
-"""Time reserved for an answer, as a multiple of its usual time."""
-_SLACK_NS = 500_000
-"""The last request of a control period is sent this much earlier, because periods may begin late."""
 _COMMANDS = 64
-_FIRST_ROUND_TRIP_NS = 2_000_000
 _CLEAR_NS = 500_000_000
 _AT_STOP_M = 0.001
 
@@ -63,12 +59,11 @@ class _Sent(NamedTuple):
 class DynamixelCartpole(Robot):
     """A cart-pole on two X-series servos.
 
-    Servos send only answers, so :meth:`read_state` requests a state ``state_rate_hz`` times a second. The
-    last request is timed so that its answer arrives when the caller's time is over. So request, answer and
-    command do not collide on the half-duplex wire, and the policy gets a fresh state. A state needs both
-    servos. Every sample holds the belt servo's goals: a command counts as in force once the servo shows it.
-    The command's message also requests the servo's clock. This computer's own time stamps contain delays of
-    its scheduler and of the adapter. A calibration would read these as motion.
+    Servos send only answers, so :meth:`read_state` requests a state ``state_rate_hz`` times a second, timed
+    as :class:`Poller` says. A state needs both servos. Every sample holds the belt servo's goals: a command
+    counts as in force once the servo shows it. The command's message also requests the servo's clock. This
+    computer's own time stamps contain delays of its scheduler and of the adapter. A calibration would read
+    these as motion.
 
     There are two watchdogs. The belt servo's own (Bus Watchdog) stops it when this computer falls silent. The
     driver switches the torque off when states are read but no commands are sent.
@@ -101,6 +96,7 @@ class DynamixelCartpole(Robot):
         self._turns = dict.fromkeys(self._servos, 0)
         self._bus = Bus(transport, clock, settings.baud_rate, settings.answer_s)
         self.servos = Servos(self._bus, clock, settings)
+        self._poller = Poller(clock, self._period_ns)
         self._forget()
 
     def _forget(self) -> None:
@@ -112,8 +108,8 @@ class DynamixelCartpole(Robot):
         self._in_force: tuple[int, int] | None = None
         self._written: Goal | None = None
         self._sequence = self._missed_command = -1
-        self._next_ns = self._asked_ns = self._alive_ns = 0
-        self._round_trip_ns = self._needed_ns = _FIRST_ROUND_TRIP_NS
+        self._alive_ns = 0
+        self._poller.restart()
         self._asked: tuple[int, ...] = ()
         self._stamping = False
         self._pair_misses = 0
@@ -226,8 +222,8 @@ class DynamixelCartpole(Robot):
                 self._take(deadline_ns)
             elif self._stamping:
                 self._take_stamp(deadline_ns)
-            elif max(self._clock.now_ns(), self._next_ns) + self._needed_ns <= deadline_ns:
-                self._clock.sleep_until_ns(self._next_ns)
+            elif self._poller.fits(deadline_ns):
+                self._clock.sleep_until_ns(self._poller.next_ns)
                 self._ask()
             else:
                 self._clock.sleep_until_ns(deadline_ns)
@@ -240,11 +236,8 @@ class DynamixelCartpole(Robot):
         return self._states.popleft()
 
     def _anchor(self, deadline_ns: int) -> None:
-        """Time the requests so that the last one of each control period is answered in time."""
         self._anchored = True
-        self._needed_ns = self._round_trip_ns
-        left_ns = deadline_ns - self._needed_ns - _SLACK_NS - self._clock.now_ns()
-        self._next_ns = self._clock.now_ns() + max(left_ns, 0) % self._period_ns
+        self._poller.anchor(deadline_ns)
         self._grid.begin()
 
     def _ask(self) -> None:
@@ -258,9 +251,7 @@ class DynamixelCartpole(Robot):
         if self._pair_misses >= _MISSES:
             self._asked = (min(self._servos, key=lambda servo: self._turns[servo]),)
             self._turns[self._asked[0]] += 1
-        self._asked_ns = self.servos.ask(self._asked)
-        late = max(0, now_ns - self._next_ns) // self._period_ns
-        self._next_ns += (1 + late) * self._period_ns
+        self._poller.asked(now_ns, self.servos.ask(self._asked))
 
     def _take_stamp(self, deadline_ns: int) -> None:
         """Receive the belt servo's clock at its newest command."""
@@ -285,8 +276,7 @@ class DynamixelCartpole(Robot):
         if blocks is None:
             return
         asked, self._asked = self._asked, ()
-        round_trip_ns = self._clock.now_ns() - self._asked_ns
-        self._round_trip_ns += round((_MARGIN * round_trip_ns - self._round_trip_ns) / 8)
+        self._poller.answered()
         for servo in asked:
             self._misses[servo] = 0
         if len(asked) == 2 or not any(self._misses.values()):
@@ -315,7 +305,9 @@ class DynamixelCartpole(Robot):
         self._fault = self._fault or fault
 
     def _receive(self, blocks: Mapping[int, Block]) -> None:
-        times = {servo: self._ticks[servo].read(b.tick_ms, self._asked_ns) for servo, b in blocks.items()}
+        times = {
+            servo: self._ticks[servo].read(b.tick_ms, self._poller.asked_ns) for servo, b in blocks.items()
+        }
         self._judge(blocks)
         cart, time_ms = blocks[self._servos[0]], times[self._servos[0]]
         shift_ms = self._grid.place(time_ms)
@@ -373,7 +365,7 @@ class DynamixelCartpole(Robot):
     def _follow(self, cart: Block, sampled_ns: int, device_ns: int) -> None:
         """Find the command that the belt servo follows, and its reception time on the servo's clock."""
         goal = self.settings.read_goal(cart)
-        asked = [sent for sent in self._sent if sent.sent_ns <= self._asked_ns]
+        asked = [sent for sent in self._sent if sent.sent_ns <= self._poller.asked_ns]
         if not asked:
             return
         found = next((sent for sent in reversed(asked) if sent.goal == goal), None)
@@ -385,7 +377,7 @@ class DynamixelCartpole(Robot):
             return
         received_ns = found.received_ns
         if received_ns < 0:
-            received_ns = min(sampled_ns - (self._asked_ns - found.sent_ns), device_ns)
+            received_ns = min(sampled_ns - (self._poller.asked_ns - found.sent_ns), device_ns)
         if received_ns > device_ns:
             # The sample was moved back to its point on the grid, before the command arrived.
             return
@@ -432,7 +424,8 @@ class DynamixelCartpole(Robot):
         self._states.clear()
         self._armed, self._stopped = False, True
         if self._asked or self._stamping:
-            self._asked, self._next_ns = (), self._clock.now_ns() + self._round_trip_ns
+            self._asked = ()
+            self._poller.withdraw()
         self._stamping = False
         self.servos.torque_off()
 

@@ -1,0 +1,110 @@
+"""Robots of users: what a robot.yaml, or the one inside a dataset, turns into.
+
+With a section ``hardware`` it is a robot with a driver and an emulator, as the built-in ones. Nothing here
+needs MuJoCo.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from deal_hw.data.files import dataset_of
+from deal_hw.description import RobotDescription
+from deal_hw.documentation import page
+from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.robots.entry import API_VERSION, RobotEntry, WireEntry, load
+from deal_hw.sim.robots.file_description import file_description
+from deal_hw.sim.robots.robot_file import RobotFile, read_robot_file
+
+WIRE = "serial"
+"""The wire of a servo bus: an adapter on a serial port."""
+
+
+def is_robot_file(robot: str) -> bool:
+    """Return whether a verb's robot is written as a file or a folder, and not as a name."""
+    # An empty path would be the present folder.
+    return bool(robot) and (Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir())
+
+
+def robot_yaml(robot: str) -> Path:
+    """Return a robot's robot.yaml: the named file, or the one inside a dataset."""
+    path = Path(robot)
+    return dataset_of(path) / "robot" / "robot.yaml" if path.is_dir() else path
+
+
+def machine_of(robot: str) -> str:
+    """Return one name for all spellings of a robot's file."""
+    return str(robot_yaml(robot).resolve())
+
+
+def has_hardware(robot: str) -> bool:
+    """Return whether a robot.yaml names its bus; False for one that cannot be read, which its reader says."""
+    try:
+        return read_robot_file(robot_yaml(robot)).hardware is not None
+    except DealHwError:
+        return False
+
+
+def file_entry(robot: str) -> RobotEntry:
+    """Return the entry of a robot of a user.
+
+    Raises:
+        ConfigurationError: Its robot.yaml cannot be read.
+    """
+    path = robot_yaml(robot)
+    file = read_robot_file(path)
+    return RobotEntry(
+        name=robot,
+        api_version=API_VERSION,
+        wires=(_wire(path, file),) if file.hardware is not None else (),
+        recorded=lambda: driven_description(path, file),
+        machine=machine_of(robot),
+    )
+
+
+def driven_description(path: Path, file: RobotFile) -> RobotDescription:
+    """Return the description of a robot with hardware.
+
+    Raises:
+        ConfigurationError: Its MJCF does not exist, or robot.yaml lacks the MJCF's timestep.
+    """
+    mjcf = path.parent / file.mjcf
+    if not mjcf.is_file():
+        raise ConfigurationError(
+            f"{path}: its model {file.mjcf} does not exist ({mjcf}); write its path at `mjcf`, relative to "
+            "robot.yaml"
+        )
+    return file_description(file, mjcf)
+
+
+def no_driver(robot: str) -> str:
+    """Return what to do with a robot.yaml that names no hardware."""
+    how = page("how-to/servo-arm.md")
+    return (
+        f"{robot}: deal-hw has no driver for this robot. If its servos are on a bus, write the section "
+        f"`hardware` into its robot.yaml ({how}); or record its simulation with --simulated, or import "
+        "recordings of it: deal-hw data import"
+    )
+
+
+def _wire(path: Path, file: RobotFile) -> WireEntry:
+    return WireEntry(
+        name=WIRE,
+        transport=WIRE,
+        driver=_of_file("deal_hw.drivers.servo_arm.connect:servo_arm", path, file),
+        opens_port=True,
+        emulator=_of_file("deal_hw.robots.file_emulator:emulate_arm", path, file),
+    )
+
+
+def _of_file(reference: str, path: Path, file: RobotFile) -> Callable[[], Any]:
+    """Return a reference to a function that also gets the robot's file and its description."""
+
+    def made() -> Any:
+        function = load(reference, f"robot {file.name!r}")
+        return functools.partial(function, file, driven_description(path, file))
+
+    return made

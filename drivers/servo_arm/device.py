@@ -1,0 +1,211 @@
+"""An emulated arm: servos' bytes in and out, and the joints that they drive."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
+from deal_hw.drivers.servo_arm.families import DAMPING, ON
+from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
+from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import reported
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.robots.hardware_section import TICKS, HardwareSection
+from deal_hw.sim.robots.simulated import SimulatedTruth
+from deal_hw.types import FloatArray
+
+BRAKE: Final = 0.55
+"""Damping of a motor whose terminals are joined [N·m·s/rad]: kt²/R of an STS3215 in BAM's identification."""
+_RAD: Final = 2 * math.pi / TICKS
+
+
+class ArmDevice:
+    """An arm in device time, for a pseudo-terminal or a virtual wire.
+
+    Each tick is one physics step: the servos' registers give set-points, gains and torque, then the joints
+    move, then the registers show what the servos measure. Goals act after the truth's latency.
+
+    Attributes:
+        joints: The servos, in the order of the joints.
+        bus: Their side of the wire.
+        received_bytes: Number of bytes from the host.
+
+    Args:
+        hardware: The servos' zeros, directions and gains.
+        robot: The model.
+        space: The parameters of the truth.
+        truth: Hidden values.
+        joints: The emulated servos, in the order of the joints.
+        bus: Their bus.
+        noisy: Whether positions have the noise of the robot's description.
+    """
+
+    def __init__(
+        self,
+        hardware: HardwareSection,
+        robot: RobotModel,
+        space: ParameterSpace,
+        truth: SimulatedTruth,
+        joints: Sequence[EmulatedJoint],
+        bus: EmulatedBus | StsBus,
+        *,
+        noisy: bool = True,
+    ) -> None:
+        self.joints, self.bus, self.received_bytes = tuple(joints), bus, 0
+        d = robot.description
+        by_joint = {servo.joint: servo for servo in hardware.servos}
+        self._servos = [by_joint[name] for name in d.joint_names]
+        self._description, self._noisy = d, noisy
+        self._direction = np.array([servo.direction for servo in self._servos])
+        self._actuated = np.array(d.actuated_index)
+        self._batch = ServoBatch(robot, space, 1, threads=1)
+        self._batch.set_parameters(np.array([[truth.parameters[name] for name in space.names]]))
+        self._effort = self._batch.batch.bind("qfrc_actuator")
+        self._dofs = list(robot.qvel)
+        self._rng = np.random.default_rng((truth.seed, 2))
+        self._tick_ns = round(1e9 / d.device_rate_hz)
+        self._latency = math.ceil(truth.latency_s * d.device_rate_hz - 1e-6)
+        self._coming: deque[tuple[int, FloatArray]] = deque()
+        self._tick = self._now_ns = 0
+        self._held: dict[int, float] = {}
+        self._sent: tuple[float, ...] = ()
+        home = np.array(d.default_position)
+        self._batch.set_state(home[None], np.zeros((1, len(home))))
+        self._setpoint = home.copy()
+        self._wanted = home.copy()
+        self._sense()
+        for joint in self.joints:
+            joint.begin()
+
+    @property
+    def true_position(self) -> FloatArray:
+        """True positions of the joints, (J,) [rad]; never on the wire."""
+        return np.array(self._batch.position[0])
+
+    @property
+    def device_ns(self) -> int:
+        """Device time of the next tick or answer [ns]."""
+        tick_ns, reply_ns = self._tick * self._tick_ns, self.bus.next_ns
+        return tick_ns if reply_ns is None else min(tick_ns, max(reply_ns, self._now_ns))
+
+    @property
+    def armed(self) -> bool:
+        """Whether all motors follow their goals."""
+        return all(joint.torque == ON for joint in self.joints)
+
+    @property
+    def mode(self) -> str:
+        """State of the motors, one word."""
+        if self.watchdog:
+            return "stopped"
+        states = {joint.torque for joint in self.joints}
+        if states == {ON}:
+            return "armed"
+        return "braking" if states == {DAMPING} else "partly" if ON in states else "idle"
+
+    @property
+    def watchdog(self) -> bool:
+        """Whether a servo's watchdog has stopped it."""
+        return any(joint.stopped for joint in self.joints)
+
+    @property
+    def trouble(self) -> str:
+        """Current fault; "" for none."""
+        return ""
+
+    @property
+    def frame_errors(self) -> int:
+        """Corrupt packets received so far."""
+        return self.bus.errors
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host and handle the packets that they complete."""
+        self.received_bytes += len(data)
+        self.bus.receive(data)
+
+    def advance_to(self, device_ns: int) -> bytes:
+        """Run all ticks and answers up to and including a time [ns]; return the bytes sent meanwhile."""
+        out = bytearray()
+        while self.device_ns <= device_ns:
+            out += self.tick()
+        self._advance_clock(device_ns)
+        return bytes(out)
+
+    def tick(self) -> bytes:
+        """Run the next tick or answer; return the bytes sent."""
+        self._advance_clock(self.device_ns)
+        reply_ns = self.bus.next_ns
+        if reply_ns is not None and reply_ns <= self._now_ns < (self._tick + 1) * self._tick_ns:
+            return self.bus.take_reply()
+        self._step()
+        return b""
+
+    def _advance_clock(self, now_ns: int) -> None:
+        self.bus.now_ns = self._now_ns = max(self._now_ns, now_ns)
+
+    def _step(self) -> None:
+        now_ns = self._tick * self._tick_ns
+        for joint in self.joints:
+            joint.tick(now_ns, now_ns - self.bus.alive_ns)
+        self._follow()
+        self._command()
+        self._batch.advance(self._setpoint[None, None, self._actuated])
+        self._tick += 1
+        self._sense()
+
+    def _follow(self) -> None:
+        """Take the servos' goals, which act after the latency."""
+        goals = np.array([joint.goal for joint in self.joints])
+        zeros = np.array([servo.zero for servo in self._servos])
+        wanted = self._direction * (goals - zeros) * _RAD
+        if not np.array_equal(wanted, self._wanted):
+            self._wanted = wanted
+            self._coming.append((self._tick + self._latency, wanted))
+        while self._coming and self._coming[0][0] <= self._tick:
+            self._setpoint = self._coming.popleft()[1].copy()
+
+    def _command(self) -> None:
+        """Set gains and limits as the servos' registers say."""
+        d = self._description
+        kp, kd, effort = np.array(d.stiffness), np.array(d.damping), np.array(d.effort_limit)
+        position = self._batch.position[0]
+        for a, j in enumerate(self._actuated):
+            joint, servo = self.joints[j], self._servos[j]
+            if joint.torque != ON:
+                kp[a], kd[a] = 0.0, BRAKE if joint.torque == DAMPING else 0.0
+                # With torque again, the set-point begins where the joint is.
+                self._held.pop(int(j), None)
+                continue
+            kp[a] *= joint.gains.p / servo.p_gain
+            kd[a] *= joint.gains.d / servo.d_gain if servo.d_gain else 1.0
+            effort[a] *= joint.share
+            if joint.stopped:
+                self._setpoint[j] = self._held.setdefault(int(j), float(position[j]))
+            else:
+                self._held.pop(int(j), None)
+        sent = (*kp, *kd, *effort)
+        if sent != self._sent:
+            self._sent = sent
+            self._batch.set_sent(kp, kd, effort)
+
+    def _sense(self) -> None:
+        d = self._description
+        noise = d.sensor.noise if self._noisy else (0.0,) * len(d.joint_names)
+        nothing = (0.0,) * len(d.joint_names)
+        position = reported(self._batch.position[0], noise, nothing, self._rng)
+        velocity = self._batch.velocity[0]
+        effort = np.zeros(len(self._servos))
+        effort[self._actuated] = self._effort[0, self._dofs][self._actuated]
+        limit = dict(zip(self._actuated, d.effort_limit, strict=True))
+        for j, (joint, servo) in enumerate(zip(self.joints, self._servos, strict=True)):
+            most = limit.get(j, math.inf)
+            duty = servo.direction * effort[j] / most if math.isfinite(most) and joint.torque == ON else 0.0
+            ticks = servo.zero + servo.direction * round(float(position[j]) / _RAD)
+            joint.sense(ticks, servo.direction * float(velocity[j]) / _RAD, min(max(duty, -1.0), 1.0))

@@ -1,0 +1,567 @@
+"""An arm whose joints are servos on one bus: reads and commands all of them together."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.servo_arm.commands import RAD, CommandCodec, Registers, clipped
+from deal_hw.drivers.servo_arm.examination import ArmExamination, ArmInfo
+from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, ServoSample
+from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Writes
+from deal_hw.drivers.servo_bus.polling import Poller
+from deal_hw.drivers.servo_bus.samples import SampleGrid
+from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
+from deal_hw.robot import Robot
+from deal_hw.sim.robots.hardware_section import HardwareSection
+from deal_hw.transport import Message, Transport
+from deal_hw.types import FloatArray, JointCommand, RobotState, Status
+
+_QUEUE: Final = 4096
+_COMMANDS: Final = 64
+_MISSES: Final = 3
+"""Samples in a row without an answer before servos are asked one by one, and before one counts as absent."""
+_HOMING_RAD_S: Final = 0.5
+"""Fastest joint on the way to the start pose [rad/s]: a person beside the arm can step back."""
+_ARRIVED_RAD: Final = 0.2
+"""Homing ends this near to the start pose: proportional control sags under gravity [rad]."""
+_SETTLED_RAD_S: Final = 0.1
+_REACH: Final = 3.0
+"""A joint that moved further than at this multiple of its velocity limit was misread, the first time."""
+_JUMP_TICKS: Final = 30
+"""And by more than this: an encoder's noise is a few ticks."""
+_PATIENCE_NS: Final = 200_000_000
+"""For one sample on the way to the start pose [ns]."""
+_MOST_FAILURES: Final = 5
+"""Failed requests in a row that raise; with 5 % corrupt answers this happens once in 10**6."""
+
+
+class _Sent(NamedTuple):
+    """A sent command, with the goals by which the servos show that they follow it."""
+
+    sequence: int
+    sent_ns: int
+    goals: Mapping[int, int]
+
+
+class ServoArm(Robot):
+    """An arm of servos.
+
+    Servos send only answers, so :meth:`read_state` requests a state ``state_rate_hz`` times a second, timed
+    as :class:`Poller` says. A state needs all servos. They have no common clock: times are this computer's,
+    and each servo's position is moved from its turn on the wire to the state's time by its velocity. Every
+    sample holds the servos' goals: a command counts as in force once all show it.
+
+    Zeros and directions are those of robot.yaml; the servos' own are not changed. The command's stiffness and
+    damping scale the gains that belong to those of the description. The reported effort is the motor's duty
+    times the effort limit, which is right for a motor that stands still.
+
+    Connecting changes nothing on the servos: an arm that a killed run left stiff stays up.
+
+    Attributes:
+        info: What the servos report; None before ``connect``.
+
+    Args:
+        transport: A byte stream at the bus' baud rate.
+        clock: The clock of the transport's stamps.
+        description: The robot.
+        hardware: Its servos.
+        family: Their kind.
+    """
+
+    stopped_by = "the servos' supply switch"
+
+    def __init__(
+        self,
+        transport: Transport,
+        clock: Clock,
+        description: RobotDescription,
+        hardware: HardwareSection,
+        family: Family,
+    ) -> None:
+        self.description = description  # type: ignore[misc]  # A user's robot is known at run time.
+        self._rest = tuple(servo.rest for servo in CommandCodec(description, hardware).joints)
+        self.lowers = None not in self._rest  # type: ignore[misc]
+        self.watchdog_s = family.watchdog_s  # type: ignore[misc]
+        self.info: ArmInfo | None = None
+        self._transport, self._clock, self._hardware, self._family = transport, clock, hardware, family
+        self._codec = CommandCodec(description, hardware)
+        self._servos = self._codec.joints
+        self._ids = tuple(servo.id for servo in self._servos)
+        self._period_ns = round(1e9 / description.state_rate_hz)
+        self._bus = family.bus(transport, clock, hardware.baud_rate, hardware.answer_ms * 1e-3)
+        self._poller = Poller(clock, self._period_ns)
+        fastest = max((v for v in description.limits.trip_velocity if np.isfinite(v)), default=np.inf)
+        self._reach = _REACH * fastest / RAD
+        self._forget()
+
+    def _forget(self) -> None:
+        self._poller.restart()
+        self._grid = SampleGrid(round(self._period_ns / 1e3))
+        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
+        self._sent: deque[_Sent] = deque(maxlen=_COMMANDS)
+        self._in_force: _Sent | None = None
+        self._written: Registers | None = None
+        self._sequence = self._missed_command = -1
+        self._begin_ns = self._clock.now_ns()
+        self._alive_ns = self._misses = self._turn = 0
+        self._asked: tuple[int, ...] = ()
+        self._absent = dict.fromkeys(self._ids, 0)
+        self._newest: dict[int, ServoSample] = {}
+        self._newest_ns = self._unsound = 0
+        self._doubted = False
+        self._homed = self._homing = self._armed = self._anchored = self._watchdog = False
+        self._fault = ""
+        self._lost_commands, self._errors_before = 0, self._bus.errors
+
+    def connect(self) -> None:
+        """Open the transport, find all servos, and check their models and settings; nothing is changed."""
+        if self.info is not None:
+            return
+        if not self._transport.can_send:
+            raise ConfigurationError(
+                "servos answer only to requests, but a dry run sends nothing; leave --dry-run out"
+            )
+        self._transport.open()
+        try:
+            examination = ArmExamination(
+                self._bus, self._family, self._hardware, self.description, self._where
+            )
+            self.info = examination.run()
+            self._forget()
+        except BaseException:
+            self._transport.close()
+            raise
+
+    @property
+    def _where(self) -> str:
+        return str(getattr(self._transport, "port", type(self._transport).__name__))
+
+    def disconnect(self) -> None:
+        """Close the transport."""
+        self._transport.close()
+        self.info = None
+
+    def reopen(self) -> None:
+        """Open the port again where it vanished."""
+        self._transport.reopen()
+        self._asked = ()
+
+    # Motion to the start pose, and torque.
+
+    def home(self, timeout_s: float) -> None:
+        """Give torque where the arm is, and move all joints on straight lines to the start pose, slowly.
+
+        Raises:
+            TransportTimeoutError: It did not arrive, or the servos fell silent.
+            SafetyError: A joint is outside its range, or a servo reports an error.
+        """
+        end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        self._homed, self._homing = False, True
+        try:
+            start = self._torque_on(end_ns)
+            self._move(start, np.array(self.description.default_position), end_ns)
+            self._homed = True
+        finally:
+            self._homing = False
+            if not self._homed:
+                self.passive()
+
+    def arm(self, timeout_s: float) -> None:
+        """Give torque where the arm is, if it has none; the watchdogs start.
+
+        Raises:
+            SafetyError: It was never homed, or a servo reports an error.
+        """
+        if not self._homed:
+            raise SafetyError(
+                f"{self.description.name}: the arm was not brought to its start pose; call home() first"
+            )
+        end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        if any(sample.torque != ON for sample in self._samples(end_ns).values()):
+            self._torque_on(end_ns)
+        self._states.clear()
+        self._asked = ()
+        while Status.ARMED not in (state := self.read_state(self._left_s(end_ns))).status:
+            continue
+        self._bus.post(self._family.alive(self._ids, True))
+        self._states.append(state)
+        self._armed, self._anchored, self._alive_ns = True, False, self._clock.now_ns()
+        self._sent.clear()
+        self._grid.begin()
+
+    def lower(self, timeout_s: float) -> None:
+        """Move all joints on straight lines to their rest positions, slowly.
+
+        Raises:
+            TransportTimeoutError: It did not arrive, or the servos fell silent.
+            SafetyError: A servo reports an error.
+        """
+        end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        rest = [at for at in self._rest if at is not None]
+        if rest:
+            self._asked = ()
+            self._move(self._codec.positions(self._samples(end_ns)), np.array(rest), end_ns)
+
+    def _torque_on(self, end_ns: int) -> FloatArray:
+        """Give torque at the measured positions, with the nominal gains; return these, (J,) [rad]."""
+        samples = self._clear_faults(end_ns)
+        start = self._codec.positions(samples)
+        self._check_start(start)
+        registers = self._codec.at({i: clipped(sample.ticks) for i, sample in samples.items()})
+        self._written = None
+        while True:
+            # The goal comes before the torque: a servo would jump to an old one.
+            self._bus.post(
+                [
+                    *self._family.alive(self._ids, False),
+                    *self._family.prepare(self._ids),
+                    *self._writes(registers),
+                ]
+            )
+            if all(sample.goal == registers.goals[i] for i, sample in self._samples(end_ns).items()):
+                break
+            self._require_time(end_ns, "the servos do not take their goals")
+        while True:
+            self._bus.post(self._family.torque(self._ids, ON))
+            if all(sample.torque == ON for sample in self._samples(end_ns).values()):
+                break
+            self._require_time(end_ns, "the servos give no torque")
+        self._written = registers
+        return start
+
+    def _require_time(self, end_ns: int, what: str) -> None:
+        if self._clock.now_ns() >= end_ns:
+            raise TransportTimeoutError(f"{self._where}: {what}; switch their supply off and on")
+
+    def _check_start(self, start: FloatArray) -> None:
+        limits = self.description.limits.trip_position
+        for servo, at, (low, high) in zip(self._servos, start, limits, strict=True):
+            if not low <= at <= high:
+                raise SafetyError(
+                    f"{self.description.name}: joint {servo.joint} is at {at:.2f} rad, outside {low:.2f} "
+                    f"to {high:.2f}: move it by hand (without torque: deal-hw stop), or check zero and "
+                    "direction of its servo in robot.yaml"
+                )
+
+    def _move(self, start: FloatArray, end: FloatArray, end_ns: int) -> None:
+        """Move the joints on straight lines to a pose, and wait until they are near and still."""
+        fastest = min(_HOMING_RAD_S, *(0.5 * v for v in self.description.limits.trip_velocity))
+        steps = max(round(np.abs(end - start).max() / fastest * self.description.state_rate_hz), 1)
+        step = 0
+        while True:
+            step = min(step + 1, steps)
+            self._bus.post(self._family.goals(self._codec.goals(start + (end - start) * step / steps)))
+            samples = self._samples(self._clock.now_ns() + _PATIENCE_NS)
+            self._judge(samples)
+            if self._fault:
+                raise SafetyError(self._fault)
+            off = np.abs(self._codec.positions(samples) - end)
+            speed = np.abs(self._codec.velocities(samples)).max()
+            if step == steps and off.max() < _ARRIVED_RAD and speed < _SETTLED_RAD_S:
+                return
+            if self._clock.now_ns() >= end_ns:
+                worst = int(off.argmax())
+                raise TransportTimeoutError(
+                    f"{self.description.name}: joint {self._servos[worst].joint} is still {off[worst]:.2f} "
+                    "rad from its pose: it is blocked, or its gain is too low to carry the arm"
+                )
+            self._clock.sleep_until_ns(self._poller.asked_ns + self._period_ns)
+
+    def _clear_faults(self, end_ns: int) -> dict[int, ServoSample]:
+        """Clear a fault if the servos report none now; return their samples."""
+        samples = self._samples(end_ns)
+        self._fault, self._watchdog = "", False
+        self._judge(samples)
+        if self._fault:
+            raise SafetyError(self._fault)
+        self._grid.begin()
+        return samples
+
+    def _samples(self, end_ns: int) -> dict[int, ServoSample]:
+        """Return a sample of every servo, now.
+
+        Raises:
+            TransportTimeoutError: The servos are silent.
+            FrameError: Their answers are corrupt.
+        """
+        address, size = self._family.block
+        failures = 0
+        while True:
+            try:
+                self._poller.asked_ns = self._bus.ask(self._ids, address, size)
+                found = self._bus.take(end_ns)
+            except (TransportTimeoutError, FrameError):
+                failures += 1
+                if failures == _MOST_FAILURES or self._clock.now_ns() >= end_ns:
+                    raise
+                continue
+            if found is None:
+                raise TransportTimeoutError(f"{self._where}: the servos do not answer in time")
+            self._poller.answered()
+            return {i: self._family.sample(i, data) for i, data in found.items()}
+
+    def _left_s(self, end_ns: int) -> float:
+        return max(0, end_ns - self._clock.now_ns()) / 1e9
+
+    # States.
+
+    def read_state(self, timeout_s: float) -> RobotState:
+        """Return the next state; request it if one is due and the answer fits the time.
+
+        Args:
+            timeout_s: Longest wait [s]; 0 takes received answers and requests nothing.
+        """
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        if self._sent and not self._anchored and timeout_s > 0:
+            # Once a command: with one state a command, an answer that is late costs a whole period.
+            self._anchored = True
+            self._poller.anchor(deadline_ns)
+        while not self._states:
+            if self._asked:
+                self._take(deadline_ns)
+            elif self._poller.fits(deadline_ns):
+                self._clock.sleep_until_ns(self._poller.next_ns)
+                self._ask()
+            else:
+                self._clock.sleep_until_ns(deadline_ns)
+            if not self._states and self._clock.now_ns() >= deadline_ns:
+                why = self._fault or f"check the servos' supply and cable ({self.transport_errors} errors)"
+                raise TransportTimeoutError(
+                    f"{self.description.name}: no state within {timeout_s:g} s; {why}"
+                )
+        return self._states.popleft()
+
+    def _ask(self) -> None:
+        now_ns = self._clock.now_ns()
+        if self._armed and self.watchdog_s and now_ns - self._alive_ns > round(self.watchdog_s * 1e9):
+            # Our own requests keep the servos' watchdogs quiet. So this check stops the motors if a caller
+            # only reads states.
+            self.passive()
+            self._watchdog = True
+        self._asked = self._ids
+        if self._misses >= _MISSES:
+            self._turn = (self._turn + 1) % len(self._ids)
+            self._asked = (self._ids[self._turn],)
+        address, size = self._family.block
+        self._poller.asked(now_ns, self._bus.ask(self._asked, address, size))
+
+    def _take(self, deadline_ns: int) -> None:
+        try:
+            found = self._bus.take(deadline_ns)
+        except (TransportTimeoutError, FrameError):
+            self._miss()
+            return
+        if found is None:
+            return
+        asked, self._asked = self._asked, ()
+        self._poller.answered()
+        for i in asked:
+            self._absent[i] = 0
+        if not any(self._absent.values()):
+            self._misses = 0
+        if asked != self._ids:
+            return
+        samples = {i: self._family.sample(i, data) for i, data in found.items()}
+        if self._sound(samples):
+            self._receive(samples)
+        else:
+            self._unsound += 1
+
+    def _sound(self, samples: Mapping[int, ServoSample]) -> bool:
+        """Return whether a sample follows from the one before it; if not, the next one is taken as it is.
+
+        A check of 8 bits lets one of some hundred corrupt answers pass. One of these must neither trip a run
+        nor reach a policy.
+        """
+        before, since_s = self._newest, (self._poller.asked_ns - self._newest_ns) / 1e9
+        self._newest, self._newest_ns = dict(samples), self._poller.asked_ns
+        if not before:
+            return True
+        most = self._reach * since_s + _JUMP_TICKS
+        far = any(abs(one.ticks - before[i].ticks) > most for i, one in samples.items())
+        changed = any(
+            (bool(one.fault), one.torque) != (bool(before[i].fault), before[i].torque)
+            for i, one in samples.items()
+        )
+        if (far or (self._armed and changed)) and not self._doubted:
+            self._doubted, self._newest = True, before
+            return False
+        self._doubted = False
+        return True
+
+    def _miss(self) -> None:
+        asked, self._asked = self._asked, ()
+        if len(asked) > 1:
+            self._misses += 1
+            if self._misses == _MISSES:
+                # Until each has answered alone, none is known to be present.
+                self._absent = dict.fromkeys(self._ids, 1)
+            return
+        self._absent[asked[0]] += 1
+        if self._absent[asked[0]] > _MISSES:
+            joint = next(servo.joint for servo in self._servos if servo.id == asked[0])
+            self._latch(
+                f"servo {asked[0]} ({joint}) stopped answering: it restarted, or lost its supply or its "
+                "cable. Check both, then start again"
+            )
+
+    def _latch(self, fault: str) -> None:
+        self._fault = self._fault or fault
+
+    def _receive(self, samples: Mapping[int, ServoSample]) -> None:
+        self._judge(samples)
+        byte_us = BITS_PER_BYTE * 1e6 / self._hardware.baud_rate
+        answer_us = self._bus.answer_bytes(1, self._family.block[1], False) * byte_us
+        # The first servo answers when it has read the request.
+        request_us = (self._family.request_bytes + len(self._ids)) * byte_us
+        first_us = round((self._poller.asked_ns - self._begin_ns) / 1e3 + request_us)
+        shift_us = self._grid.place(first_us)
+        if shift_us is None:
+            return
+        device_ns = (first_us + shift_us) * 1000
+        self._follow(samples, device_ns)
+        velocity = self._codec.velocities(samples)
+        # A servo's turn on the wire comes after those before it.
+        turn_us = np.arange(len(self._ids)) * answer_us
+        sent = self._in_force
+        self._states.append(
+            RobotState(
+                position=self._codec.positions(samples) + velocity * 1e-6 * (shift_us - turn_us),
+                velocity=velocity,
+                effort=self._codec.efforts(samples),
+                receive_ns=self._bus.stamp_ns,
+                device_ns=device_ns,
+                sequence=self._grid.number,
+                command_sequence=-1 if sent is None else sent.sequence,
+                command_age_ns=-1 if sent is None else device_ns - (sent.sent_ns - self._begin_ns),
+                status=self._status(samples),
+            )
+        )
+
+    def _judge(self, samples: Mapping[int, ServoSample]) -> None:
+        """Latch a servo's reported error, or lost torque."""
+        for servo in self._servos:
+            sample = samples[servo.id]
+            if sample.fault:
+                self._latch(f"servo {servo.id} ({servo.joint}) reports: {sample.fault}")
+            if self._armed and sample.torque != ON:
+                self._homed = self._armed = False
+                self._latch(
+                    f"servo {servo.id} ({servo.joint}) lost its torque: it restarted, or another program "
+                    "uses the bus. Check the supply, end other programs, then start again"
+                )
+
+    def _follow(self, samples: Mapping[int, ServoSample], device_ns: int) -> None:
+        """Find the command that the servos follow."""
+        asked = [sent for sent in self._sent if sent.sent_ns <= self._poller.asked_ns]
+        if not asked:
+            return
+        goals = {i: samples[i].goal for i in self._ids}
+        found = next((sent for sent in reversed(asked) if sent.goals == goals), None)
+        if found is not asked[-1] and asked[-1].sequence != self._missed_command:
+            self._missed_command = asked[-1].sequence
+            self._lost_commands += 1
+            # A lost packet may have had gains, too.
+            self._written = None
+        if found is None or found.sent_ns - self._begin_ns > device_ns:
+            # The sample was moved back to its point on the grid, before the command arrived.
+            return
+        self._in_force = found
+        while self._sent[0] is not found:
+            self._sent.popleft()
+
+    def _status(self, samples: Mapping[int, ServoSample]) -> Status:
+        flags = {
+            Status.ARMED: all(sample.torque == ON for sample in samples.values()),
+            Status.HOMED: self._homed,
+            Status.HOMING: self._homing,
+            Status.WATCHDOG: self._watchdog or any(sample.tripped for sample in samples.values()),
+            Status.FAULT: self._fault,
+        }
+        status = Status.NONE
+        for flag, is_set in flags.items():
+            status |= flag if is_set else Status.NONE
+        return status
+
+    # Commands.
+
+    def send_command(self, command: JointCommand) -> JointCommand:
+        """Send position targets; no register takes a velocity target or a feed-forward effort.
+
+        Raises:
+            SafetyError: A value is not finite.
+        """
+        registers = self._codec.encode(command)
+        self._sequence += 1
+        if self._armed:
+            # Without torque nothing is written: it is not known of every servo that a goal does not switch
+            # its torque on.
+            sent_ns = self._bus.post(self._writes(registers))
+            self._written, self._alive_ns, self._anchored = registers, sent_ns, False
+            self._sent.append(_Sent(self._sequence, sent_ns, registers.goals))
+        return self._codec.decode(registers)
+
+    def _writes(self, registers: Registers) -> Writes:
+        """Return the writes of a command: goals, and what changed of the rest."""
+        before = self._written
+        gains = {i: one for i, one in registers.gains.items() if before is None or before.gains[i] != one}
+        shares = {i: one for i, one in registers.shares.items() if before is None or before.shares[i] != one}
+        return [
+            *(self._family.gains(gains) if gains else ()),
+            *(self._family.efforts(shares) if shares else ()),
+            *self._family.goals(registers.goals),
+        ]
+
+    def passive(self) -> None:
+        """Brake or switch the motors off, as robot.yaml says; sent once, never waits.
+
+        States received before are discarded, and so is an answer that is still expected.
+        """
+        self._states.clear()
+        self._armed = self._homed = False
+        if self._asked:
+            self._asked = ()
+            self._poller.withdraw()
+        state = DAMPING if self._hardware.passive == "damping" else OFF
+        self._bus.post([*self._family.alive(self._ids, False), *self._family.torque(self._ids, state)])
+
+    @property
+    def if_cut(self) -> str:
+        """What the arm does if the connection is cut."""
+        if self.watchdog_s:
+            return (
+                f"If the cable is cut, the servos' own watchdog has stopped them after {self.watchdog_s:g} "
+                "s; they hold their position until their supply is switched off"
+            )
+        return super().if_cut
+
+    @property
+    def fault(self) -> str:
+        """Fault of a servo after which the host must not continue; "" for none. Latched until armed again."""
+        return self._fault
+
+    @property
+    def last_sequence(self) -> int:
+        """Number of the last command sent; -1 before the first."""
+        return self._sequence
+
+    @property
+    def transport_errors(self) -> int:
+        """Number of corrupt or missing answers, and of commands that the servos did not show."""
+        return self._bus.errors - self._errors_before + self._lost_commands + self._unsound
+
+    def fileno(self) -> int:
+        """Return the descriptor of the transport."""
+        return self._transport.fileno()
+
+    def take_wire(self) -> list[Message]:
+        """Return and forget the raw messages since the last call; if many, only the newest."""
+        wire = list(self._bus.wire)
+        self._bus.wire.clear()
+        return wire

@@ -1,0 +1,203 @@
+"""A bus of emulated STS servos: handles requests, and answers at the time a real bus would.
+
+Assumed, as no source says it: in a sync read each servo waits for the time that the answers before its own
+take, and not for the answers themselves. So the others still answer if one is missing. A broadcast ping is
+answered in the order of the ids. An incomplete request is forgotten after 10 ms without bytes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import and_
+from typing import Final
+
+from deal_hw.drivers.servo_bus.feetech.emulated_servo import StsServo
+from deal_hw.drivers.servo_bus.feetech.packets import (
+    BROADCAST,
+    FRAME_BYTES,
+    Instruction,
+    RequestFrame,
+    RequestParser,
+    status,
+)
+from deal_hw.drivers.servo_bus.feetech.registers import BAUD_RATES, PRESENT_POSITION
+from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE
+
+_GAP_NS: Final = 10_000_000
+
+
+class StsBus:
+    """The servos' side of a bus.
+
+    Requests are handled on arrival. An answer leaves after the time of request and answer on the wire, plus
+    the servo's return delay. Two servos with one id answer at the same time: a bit is 1 if both send 1.
+
+    Attributes:
+        servos: The servos; may be changed.
+        host_baud_rate: Rate of the host's port; a servo with another rate receives noise. None: the same.
+        echo: Whether the adapter returns the host's own bytes.
+        alive_ns: When the last request came [ns].
+
+    Args:
+        servos: The servos.
+        changed: Called after registers were written.
+        loses: Called for each read of the present position; returns whether the answer is lost.
+        echo: Whether the adapter returns the host's own bytes.
+    """
+
+    def __init__(
+        self,
+        servos: list[StsServo],
+        changed: Callable[[], None],
+        loses: Callable[[], bool],
+        *,
+        echo: bool = False,
+    ) -> None:
+        self.servos = servos
+        self.host_baud_rate: int | None = None
+        self.echo = echo
+        self.alive_ns = 0
+        self._now_ns = self._byte_ns = self._free_ns = 0
+        self._changed, self._loses_answer = changed, loses
+        self._parser = RequestParser()
+        self._replies: deque[tuple[int, bytes]] = deque()
+
+    @property
+    def errors(self) -> int:
+        """Corrupt requests received so far."""
+        return self._parser.errors
+
+    @property
+    def now_ns(self) -> int:
+        """Present time [ns], set by the owner; the servos' protections follow it."""
+        return self._now_ns
+
+    @now_ns.setter
+    def now_ns(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+        for servo in self.servos:
+            servo.tick(now_ns)
+
+    @property
+    def next_ns(self) -> int | None:
+        """When the next answer is complete [ns]; None if no answer waits."""
+        return self._replies[0][0] if self._replies else None
+
+    def take_reply(self) -> bytes:
+        """Return and forget the next answer."""
+        return self._replies.popleft()[1]
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host and handle the requests that they complete."""
+        hearing = [servo for servo in self.servos if self._hears(servo)]
+        rate = self.host_baud_rate or (hearing[0].baud_rate if hearing else BAUD_RATES[0])
+        self._occupy(len(data), rate)
+        if self.echo:
+            self._replies.append((self._free_ns, data))
+        if not hearing:
+            return
+        if self._now_ns - self._byte_ns > _GAP_NS:
+            self._parser.reset()
+        self._byte_ns = self._now_ns
+        for request in self._parser.feed(data):
+            self.alive_ns = self._now_ns
+            self._handle(request)
+
+    def _hears(self, servo: StsServo) -> bool:
+        return servo.awake(self._now_ns) and self.host_baud_rate in (None, servo.baud_rate)
+
+    def _listeners(self, servo: int) -> list[StsServo]:
+        return [s for s in self.servos if self._hears(s) and servo in (s.id, BROADCAST)]
+
+    def _handle(self, request: RequestFrame) -> None:
+        params = request.params
+        match request.instruction:
+            case Instruction.PING:
+                for servo in sorted({s.id for s in self._listeners(request.servo)}):
+                    self._answer([(s, servo, s.error, b"") for s in self._listeners(servo)])
+            case Instruction.READ if len(params) == 2 and request.servo != BROADCAST:
+                address, size = params
+                if not self._loses(address, size):
+                    self._answer(self._data(request.servo, address, size))
+            case Instruction.SYNC_READ if len(params) > 2:
+                self._read_group(params[0], params[1], params[2:])
+            case Instruction.SYNC_WRITE if len(params) > 2:
+                address, step = params[0], params[1] + 1
+                for k in range(2, len(params) - step + 1, step):
+                    for s in self._listeners(params[k]):
+                        s.write(address, params[k + 1 : k + step])
+                self._changed()
+            case _:
+                self._change(request)
+
+    def _change(self, request: RequestFrame) -> None:
+        """Do what changes the servos asked; an unknown instruction and wrong parameters change nothing."""
+        asked = self._listeners(request.servo)
+        # A servo answers by the id and the response level that it had when it was asked.
+        answering = [(s, s.id) for s in asked if s.answers(read=False)]
+        params = request.params
+        if request.instruction == Instruction.REBOOT:
+            answering = []
+        for s in asked:
+            match request.instruction:
+                case Instruction.WRITE if len(params) > 1:
+                    s.write(params[0], params[1:])
+                case Instruction.REG_WRITE if len(params) > 1:
+                    s.register_write(params[0], params[1:])
+                case Instruction.ACTION:
+                    s.act()
+                case Instruction.REBOOT:
+                    s.reboot(self._now_ns)
+                case Instruction.FACTORY_RESET:
+                    s.factory_reset()
+                case Instruction.BACKUP:
+                    s.back_up()
+                case Instruction.RESET:
+                    s.reset_status()
+                case Instruction.CALIBRATE if not params:
+                    s.calibrate()
+                case Instruction.CALIBRATE if len(params) == 2:
+                    s.calibrate(int.from_bytes(params, "little"))
+        self._changed()
+        if request.servo != BROADCAST:
+            self._answer([(s, servo, s.error, b"") for s, servo in answering])
+
+    def _loses(self, address: int, size: int) -> bool:
+        position = PRESENT_POSITION.address
+        return address <= position < address + size and self._loses_answer()
+
+    def _data(self, servo: int, address: int, size: int) -> list[tuple[StsServo, int, int, bytes]]:
+        """Return the answers of the servos with an id to a read."""
+        found = [(s, s.read(address, size)) for s in self._listeners(servo)]
+        return [(s, servo, s.error, data) for s, data in found if data is not None]
+
+    def _read_group(self, address: int, size: int, servos: Sequence[int]) -> None:
+        if self._loses(address, size):
+            return
+        rate = self.host_baud_rate or BAUD_RATES[0]
+        for servo in servos:
+            answers = self._data(servo, address, size) if servo != BROADCAST else []
+            if answers:
+                rate = answers[0][0].baud_rate
+                self._answer(answers)
+            else:
+                self._occupy(FRAME_BYTES + size, rate)
+
+    def _answer(self, answers: Sequence[tuple[StsServo, int, int, bytes]]) -> None:
+        """Send the answers (servo, id, error, data) of servos with one id, at the same time."""
+        if not answers:
+            return
+        frames = [status(servo, error, data) for _, servo, error, data in answers]
+        # On the open line a 0 wins over a 1.
+        data = bytes(reduce(and_, column) for column in zip(*frames, strict=False))
+        speaker = answers[0][0]
+        self._free_ns = max(self._free_ns, self._now_ns) + round(speaker.return_delay_s * 1e9)
+        self._occupy(len(data), speaker.baud_rate)
+        self._replies.append((self._free_ns, data))
+
+    def _occupy(self, size: int, baud_rate: int) -> None:
+        """Let some bytes take their time on the wire."""
+        wire_ns = round(size * BITS_PER_BYTE / baud_rate * 1e9)
+        self._free_ns = max(self._free_ns, self._now_ns) + wire_ns

@@ -1,0 +1,263 @@
+"""A bus of servos: what Dynamixel and Feetech have in common.
+
+A subclass knows the packets. Here are the port, the deadlines, and the requests that wait for their answers.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple, TypeAlias
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.servo_bus.registers import Register
+from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
+from deal_hw.transport import Message, Transport
+
+BITS_PER_BYTE: Final = 10
+"""On the wire: start bit, 8 data bits, stop bit."""
+_QUEUE: Final = 4096
+
+Writes: TypeAlias = Sequence[tuple[int, Mapping[int, bytes]]]
+"""Sync writes: an address, and the bytes that each servo gets there."""
+
+
+class Answer(NamedTuple):
+    """A servo's answer to a ping."""
+
+    model: int
+    firmware: int
+
+
+class WantedAnswer(NamedTuple):
+    """A requested answer: servos, bytes of each, whether in one packet, deadline [ns]."""
+
+    ids: tuple[int, ...]
+    size: int
+    fast: bool
+    until_ns: int
+
+
+class Port:
+    """Sends and receives the bytes of a bus.
+
+    Attributes:
+        baud_rate: Bits per second.
+        answer_s: Additional time for an answer [s].
+        wire: Messages sent and received; the newest few thousand.
+        buffer: Received bytes that nobody has read.
+        received_bytes: Received bytes so far, valid or not.
+        stamp_ns: Time of the newest bytes [ns].
+
+    Args:
+        transport: A byte stream, open.
+        clock: The clock of its stamps.
+        baud_rate: Baud rate of the bus, for the time of bytes.
+        answer_s: Additional time for an answer [s].
+    """
+
+    def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
+        self.baud_rate, self.answer_s = baud_rate, answer_s
+        self.wire: deque[Message] = deque(maxlen=_QUEUE)
+        self.buffer = bytearray()
+        self.written = bytearray()
+        self.received_bytes = self.stamp_ns = 0
+        self._transport, self._clock = transport, clock
+
+    def answer_ns(self, length: int) -> int:
+        """Return how long an answer of that many bytes may take [ns]."""
+        return round((length * BITS_PER_BYTE / self.baud_rate + self.answer_s) * 1e9)
+
+    def write(self, packet: bytes) -> None:
+        """Keep a packet until :meth:`flush`."""
+        self.written += packet
+
+    def flush(self) -> None:
+        """Send the written packets as one message."""
+        if self.written:
+            data, self.written = bytes(self.written), bytearray()
+            message = Message("tx", data, self._clock.now_ns())
+            self._transport.send(Message("", data, message.stamp_ns))
+            self.wire.append(message)
+
+    def receive(self, deadline_ns: int) -> bool:
+        """Wait for bytes; return whether any arrived."""
+        try:
+            message = self._transport.receive(max(0, deadline_ns - self._clock.now_ns()) / 1e9)
+        except TransportTimeoutError:
+            return False
+        self.buffer += message.payload
+        self.received_bytes += len(message.payload)
+        self.stamp_ns = message.stamp_ns
+        self.wire.append(Message("rx", message.payload, message.stamp_ns))
+        return True
+
+    def drop(self) -> None:
+        """Discard bytes that arrived too late for the previous answer."""
+        while self.receive(0):
+            pass
+        self.buffer.clear()
+
+
+class ServoBus(abc.ABC):
+    """Reads and writes servos' registers.
+
+    All deadlines are of the given clock. One corrupt answer is one missed sample: the bus counts it, raises
+    its error, and the next request begins with an empty buffer.
+
+    Attributes:
+        errors: Corrupt or missing answers so far.
+
+    Args:
+        port: The port.
+        clock: The clock of its stamps.
+    """
+
+    def __init__(self, port: Port, clock: Clock) -> None:
+        self.errors = 0
+        self._clock = clock
+        self._port = port
+        self._wanted: deque[WantedAnswer] = deque()
+
+    @property
+    def received_bytes(self) -> int:
+        """Received bytes so far, valid or not."""
+        return self._port.received_bytes
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the newest bytes [ns]."""
+        return self._port.stamp_ns
+
+    @property
+    def wire(self) -> deque[Message]:
+        """Messages sent and received; the newest few thousand."""
+        return self._port.wire
+
+    @abc.abstractmethod
+    def ping(self, servo: int) -> Answer:
+        """Return model and firmware of a servo.
+
+        Raises:
+            TransportTimeoutError: It is silent.
+            FrameError: Its answer is corrupt.
+        """
+
+    @abc.abstractmethod
+    def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
+        """Return all servos that answer a broadcast ping within a time [s]."""
+
+    @abc.abstractmethod
+    def read(self, servo: int, register: Register) -> int:
+        """Return a register, without sign; raises as :meth:`ping`."""
+
+    @abc.abstractmethod
+    def write(self, servo: int, register: Register, value: int) -> None:
+        """Write a register and wait for the servo's confirmation; raises as :meth:`ping`.
+
+        Raises:
+            ProtocolError: The servo refuses the value.
+        """
+
+    @staticmethod
+    @abc.abstractmethod
+    def answer_bytes(servos: int, size: int, fast: bool) -> int:
+        """Return the number of bytes of a group's answer."""
+
+    def post(self, writes: Writes) -> int:
+        """Write registers in one message without waiting; return the send time [ns].
+
+        Args:
+            writes: Sync writes, in order: an address, and the bytes of each servo.
+        """
+        self._put_writes(writes)
+        now_ns = self._clock.now_ns()
+        self._port.flush()
+        return now_ns
+
+    def ask(
+        self,
+        servos: Sequence[int],
+        address: int,
+        size: int,
+        *,
+        fast: bool = False,
+        writes: Writes = (),
+        behind: bool = False,
+    ) -> int:
+        """Request the same registers of servos in one message; return the send time [ns].
+
+        Args:
+            servos: Their ids.
+            address: The first register.
+            size: Number of bytes of each.
+            fast: Whether they answer in one packet, where the protocol has that, or each in its own.
+            writes: Sync writes before it in the same message, as in :meth:`post`.
+            behind: Wait for this answer after the one before it; otherwise that one is forgotten.
+        """
+        if not behind:
+            self._forget()
+        self._put_writes(writes)
+        self._put_group_read(servos, address, size, fast)
+        within_ns = self._port.answer_ns(self._wire_bytes(len(servos), size, fast))
+        now_ns = self._clock.now_ns()
+        self._port.flush()
+        self._wanted.append(WantedAnswer(tuple(servos), size, fast, now_ns + within_ns))
+        return now_ns
+
+    def take(self, deadline_ns: int) -> dict[int, bytes] | None:
+        """Return the registers of the oldest question by id, waiting for them until a deadline at most.
+
+        Returns:
+            None if no complete answer arrived until the deadline, but may still arrive.
+
+        Raises:
+            TransportTimeoutError: The servos are silent.
+            FrameError: The answer is corrupt.
+        """
+        wanted = self._wanted[0]
+        try:
+            while (found := self._collect(wanted)) is None:
+                if self._clock.now_ns() >= wanted.until_ns:
+                    raise self._incomplete(wanted)
+                if not self._port.receive(min(deadline_ns, wanted.until_ns)) and (
+                    self._clock.now_ns() >= deadline_ns
+                ):
+                    return None
+        except (FrameError, TransportTimeoutError):
+            self.errors += 1
+            self._wanted.popleft()
+            raise
+        self._wanted.popleft()
+        return found
+
+    def _forget(self) -> None:
+        """Discard received bytes and the answers that were still wanted."""
+        self._port.drop()
+        self._wanted.clear()
+
+    @abc.abstractmethod
+    def _put_writes(self, writes: Writes) -> None:
+        """Write sync writes to the port."""
+
+    @abc.abstractmethod
+    def _put_group_read(self, servos: Sequence[int], address: int, size: int, fast: bool) -> None:
+        """Write the request for the same registers of servos to the port."""
+
+    @abc.abstractmethod
+    def _wire_bytes(self, servos: int, size: int, fast: bool) -> int:
+        """Return the bytes that a group's answer waits for, before its request is sent."""
+
+    @abc.abstractmethod
+    def _collect(self, wanted: WantedAnswer) -> dict[int, bytes] | None:
+        """Return an answer from the received bytes; None while it may still become complete.
+
+        Raises:
+            FrameError: It is corrupt.
+            TransportTimeoutError: It will not become complete.
+        """
+
+    @abc.abstractmethod
+    def _incomplete(self, wanted: WantedAnswer) -> DealHwError:
+        """Return the error for an answer that is not complete at its deadline."""

@@ -1,0 +1,78 @@
+"""An arm that nothing but its robot.yaml describes: emulated in its own process, driven by each verb."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from arm_rig import BUSES, arm_file
+
+import deal_hw
+from deal_hw.cli.main import EXIT_OK, main
+from deal_hw.control.process.channel import Outcome
+from deal_hw.errors import PolicyError
+from deal_hw.findings import Severity
+from deal_hw.workflows.robot import carries_robot
+
+pytestmark = pytest.mark.real_time
+
+
+@pytest.fixture(params=BUSES, scope="module")
+def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The arm's robot.yaml; a state comes twice a command, so that a busy computer's late one costs less."""
+    folder = tmp_path_factory.mktemp(request.param)
+    arm_file(folder, request.param)
+    path = folder / "robot.yaml"
+    text = path.read_text(encoding="utf-8").replace("state_rate_hz: 50.0", "state_rate_hz: 100.0")
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def port(robot: Path) -> Iterator[str]:
+    """The port of the emulated arm."""
+    with deal_hw.emulate(str(robot), profile="sensor", seed=1) as emulated:
+        yield emulated.port
+    assert set(emulated.truth["parameters"]) >= {"shoulder.frictionloss", "elbow.servo_stiffness"}
+
+
+def test_doctor_finds_the_servos_and_their_states(robot: Path, port: str) -> None:
+    """No failure, and one phrase a servo."""
+    report = deal_hw.doctor(str(robot), port=port, seconds=1.0)
+    assert report.exit_code == 0
+    found = [finding.seen for finding in report.findings if finding.code == "link"]
+    assert len(found) == 1 and "shoulder: servo 1" in found[0] and "elbow: servo 2" in found[0]
+    assert not [finding for finding in report.findings if finding.severity is Severity.FAIL]
+
+
+def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Path) -> None:
+    """The dataset holds the robot, by which calibrate finds its kind; the replay needs only the recording."""
+    run = tmp_path / "run"
+    report = deal_hw.collect(str(robot), port=port, out=run, motion="chirp", seconds=2.0)
+    assert report.outcome is Outcome.FINISHED
+    assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 150
+    dataset = run / "dataset"
+    kept = (dataset / "robot" / "robot.yaml").read_text(encoding="utf-8")
+    assert "hardware:" in kept and "zero: 2000" in kept
+    assert json.loads((dataset / "dataset.json").read_text())["description"]["name"] == "two joints"
+    assert carries_robot(dataset)
+    again = deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again")
+    assert again.outcome is Outcome.FINISHED
+    difference = again.episodes[0].replay
+    assert difference is not None and difference.position.max() < 0.05
+
+
+def test_random_set_points_need_no_policy(robot: Path, port: str, tmp_path: Path) -> None:
+    """An arm stands without one; a policy that nobody named is asked for."""
+    report = deal_hw.collect(str(robot), port=port, out=tmp_path / "rich", seconds=2.0, attempts=1)
+    assert report.outcome is Outcome.FINISHED
+    with pytest.raises(PolicyError, match="needs a policy"):
+        deal_hw.deploy(str(robot), port=port, out=tmp_path / "deployed")
+
+
+def test_stop_makes_it_passive(robot: Path, port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """From any terminal, by the file's name."""
+    assert main(["stop", str(robot), "--port", port]) == EXIT_OK
+    assert "is passive" in capsys.readouterr().out

@@ -1,0 +1,139 @@
+"""Emulated arms of servos for tests: two joints, on either bus, in virtual time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.clock import VirtualClock
+from deal_hw.drivers.servo_arm.device import ArmDevice
+from deal_hw.drivers.servo_arm.emulator import arm_device
+from deal_hw.drivers.servo_arm.families import FAMILIES
+from deal_hw.drivers.servo_arm.robot import ServoArm
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.errors import TransportTimeoutError
+from deal_hw.sim.robots.file_description import file_description
+from deal_hw.sim.robots.hardware_section import HardwareSection, ServoEntry
+from deal_hw.sim.robots.robot_file import RobotFile, write_robot_file
+from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
+from deal_hw.sim.robots.user_robot import derive_robot
+from deal_hw.testing.robot_suite import default_command
+from deal_hw.transport import Transport
+from deal_hw.types import RobotState
+
+MJCF = """
+<mujoco model="two_joints">
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default>
+    <joint axis="0 1 0" range="-1.5 1.5" damping="0.6" armature="0.028" frictionloss="0.05"/>
+    <position kp="17.8" kv="0" forcerange="-2.94 2.94" ctrlrange="-1.5 1.5"/>
+    <geom type="capsule" size="0.012" mass="0.1" contype="0" conaffinity="0"/>
+  </default>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder"/>
+      <geom fromto="0 0 0 0 0 0.12"/>
+      <body name="fore" pos="0 0 0.12">
+        <joint name="elbow"/>
+        <geom fromto="0 0 0 0 0 0.12"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position name="shoulder" joint="shoulder"/><position name="elbow" joint="elbow"/></actuator>
+</mujoco>
+"""
+BUSES = ("dynamixel", "feetech")
+
+
+def arm_file(folder: Path, bus: str, **section: Any) -> RobotFile:
+    """Write an arm's MJCF and robot.yaml into a folder, and return the latter's content.
+
+    The shoulder's servo is mounted the other way round.
+    """
+    mjcf = folder / "arm.xml"
+    mjcf.write_text(MJCF, encoding="utf-8")
+    own = derive_robot(mjcf, name="two joints", control_rate_hz=50.0).file
+    gain = 400 if bus == "dynamixel" else 32
+    servos = (
+        ServoEntry(joint="shoulder", id=1, zero=2048, direction=-1, p_gain=gain),
+        ServoEntry(joint="elbow", id=2, zero=2000, p_gain=gain),
+    )
+    values = {"bus": bus, "servos": servos, "passive": "damping" if bus == "feetech" else "off", **section}
+    file = dataclasses.replace(
+        own,
+        joints=tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints),
+        hardware=HardwareSection(**values),
+    )
+    (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
+    return file
+
+
+class Rig:
+    """An emulated arm, its driver, and the wire between them, in virtual time."""
+
+    def __init__(
+        self,
+        folder: Path,
+        bus: str,
+        wrap: Callable[[Transport], Transport] = lambda transport: transport,
+        device_file: RobotFile | None = None,
+        **section: Any,
+    ) -> None:
+        self.file = arm_file(folder, bus, **section)
+        self.description = file_description(self.file, folder / "arm.xml")
+        assert self.file.hardware is not None
+        self.clock = VirtualClock()
+        self.phases: list[str] = []
+        self.loop: Any = None
+        space = default_space(self.description)
+        values = {**space.known, **{p.name: p.nominal for p in space.parameters}}
+        truth = SimulatedTruth(parameters=values, latency_s=0.0, seed=0)
+        self.device: ArmDevice = arm_device(device_file or self.file, self.description, truth, noisy=False)
+        self.virtual = VirtualTransport(self.device, self.clock)
+        self.robot = ServoArm(
+            wrap(self.virtual), self.clock, self.description, self.file.hardware, FAMILIES[bus]()
+        )
+
+    @property
+    def servos(self) -> list[Any]:
+        """The emulated servos, in the order of the joints."""
+        return list(self.device.bus.servos)
+
+    def armed(self) -> ServoArm:
+        """Return the driver, connected, homed and armed, after its first command."""
+        self.robot.connect()
+        self.robot.home(20.0)
+        self.robot.arm(1.0)
+        self.robot.send_command(default_command(self.robot))
+        return self.robot
+
+    def run(self, cycles: int, target: float = 0.0) -> list[RobotState]:
+        """Command and read as the control loop does; return the states."""
+        states = []
+        for _ in range(cycles):
+            deadline_ns = self.clock.now_ns() + 20_000_000
+            self.robot.send_command(default_command(self.robot, target))
+            while self.clock.now_ns() < deadline_ns:
+                try:
+                    states.append(self.robot.read_state((deadline_ns - self.clock.now_ns()) / 1e9))
+                except TransportTimeoutError:
+                    break
+        return states
+
+    def advance(self, seconds: float) -> None:
+        """Let device time pass without the driver."""
+        self.clock.advance_ns(round(seconds * 1e9))
+        try:
+            while True:
+                self.virtual.receive(0.0)
+        except TransportTimeoutError:
+            return
+
+    def true_position(self) -> np.ndarray[Any, Any]:
+        """True positions of the joints [rad]."""
+        return self.device.true_position

@@ -1,0 +1,148 @@
+#!/usr/bin/env python3
+"""Fault table of an arm of servos: results of faults, and the time until its motors are off or brake.
+
+python tools/measure_arm_faults.py --jobs 2 --out arm_dynamixel.json
+python tools/measure_arm_faults.py --transport feetech --jobs 2 --out arm_feetech.json
+python tools/measure_arm_faults.py --table faults.md arm_dynamixel.json arm_feetech.json
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from arm_rig import BUSES, arm_file
+from fault_acts import LINK_S, after, freeze_link, kill_both, link_cases, process_cases
+from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
+from fault_table import main
+
+from deal_hw.sim.robots.file_description import file_description
+from deal_hw.sim.robots.robot_file import write_robot_file
+
+SECONDS = 1.5
+ARMED, IDLE, BRAKING, PARTLY, STOPPED = "armed", "idle", "braking", "partly", "stopped"
+BY_ITSELF = ("gone", "cut", "frozen")
+DYNAMIXEL, FEETECH = ("dynamixel",), ("feetech",)
+ARM = "two joints"
+
+
+class ArmRig(Rig):
+    """An arm of two joints that plays a chirp; a wire is the kind of its servos."""
+
+    robot = ARM
+    wires = BUSES
+    longest_s = 1.2
+    active = frozenset({ARMED, PARTLY})
+    inactive = frozenset({IDLE, BRAKING, STOPPED})
+    phases = (CONNECTING, TAKING_OVER, ARMING, RUNNING, ENDING)
+
+    def __init__(
+        self,
+        case: Case,
+        wire: str,
+        folder: Path,
+        rng: np.random.Generator,
+        slot: int = 0,
+        typical_s: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(case, wire, folder, rng, slot, typical_s)
+        file = dataclasses.replace(arm_file(folder, wire), state_rate_hz=100.0)
+        (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
+        # The arm is known when its files are written, one for each repetition.
+        self.robot = str(folder / "robot.yaml")  # type: ignore[misc]
+        self.description = file_description(file, folder / "arm.xml")  # type: ignore[misc]
+
+    def emulator_options(self) -> list[str]:
+        """A port that keeps its name when the cable is put back."""
+        return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port")]
+
+    def arguments(self) -> list[str]:
+        """Play a chirp, or run the case's policy."""
+        seconds = ["--seconds", str(self._seconds)]
+        if self.case.policy or self.case.dry:
+            return ["deploy", self.robot, *self.policy_arguments()[:2], *seconds]
+        return ["collect", self.robot, "--motion", "chirp", *seconds]
+
+    @property
+    def _seconds(self) -> float:
+        return self.case.seconds or SECONDS
+
+    def phase_at(self, phase: str) -> tuple[str, float, float]:
+        """Phases by the time after the first torque; the emulated arm begins near its start pose."""
+        return {
+            CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
+            TAKING_OVER: (ARMED, 0.0, 0.1),
+            ARMING: (ARMED, 0.1, 0.2),
+            RUNNING: (ARMED, 0.4, min(self._seconds, SECONDS) - 0.8),
+            ENDING: (ARMED, self._seconds, 0.3),
+        }[phase]
+
+    def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
+        """States of the motors."""
+        return [(ns, what) for _, ns, what in report["changes"]]
+
+    def untouched(self, report: Mapping[str, Any]) -> str:
+        """Nothing gave torque."""
+        given = [what for _, what in self.changes(report) if what in self.active]
+        return f"the motors got {given}" if given else ""
+
+    def by_itself(self, report: Mapping[str, Any]) -> int:
+        """The port vanished, the wire was cut, or the servos hang."""
+        return next((ns for ns, what in self.changes(report) if what in BY_ITSELF), -1)
+
+
+_BOTH = "both processes are killed (SIGKILL); "
+CASES = (
+    Case(name="none", expect="goes on", codes=(0,)),
+    *(
+        # Servos answer only requests: without any, a dry run cannot see them.
+        case
+        for case in process_cases()
+        if not case.dry and not case.policy
+    ),
+    Case(
+        name=f"{_BOTH}the servos' watchdog stops them",
+        act=kill_both,
+        codes=(-9,),
+        phases=(RUNNING,),
+        wires=DYNAMIXEL,
+    ),
+    Case(
+        name=f"{_BOTH}nothing stops the servos",
+        expect="stiff",
+        act=kill_both,
+        codes=(-9,),
+        phases=(RUNNING,),
+        wires=FEETECH,
+    ),
+    *link_cases({"the cable is cut for {}": freeze_link}, cut=True),
+    *(
+        Case(
+            name=f"the cable is pulled, and put back after {seconds:g} s",
+            codes=(3, 0),
+            emulator=(*after("--vanish-after-s"), "--return-after-s", f"{seconds}"),
+            within_ms=2500.0,
+            from_ms=1e3 * seconds,
+        )
+        for seconds in LINK_S
+    ),
+    Case(name="60 % of the answers corrupt", emulator=("--corrupt", "0.6"), codes=(2, 3)),
+)
+TITLE = "Arm of servos: from a fault to motors without torque, or braking"
+WORDS = (
+    "This page has the time from each fault to motors that no longer follow goals.",
+    "`tools/measure_arm_faults.py` measured it on an emulated arm of two joints, profile `sensor`, over a",
+    "pseudo-terminal: Dynamixel servos, whose passive state is no torque, and Feetech servos, which brake.",
+    "Each repetition draws a random moment of a random phase (connecting, moving to the start pose, arming,",
+    "running, ending). Feetech servos have no watchdog: where both processes are killed, they hold their",
+    "last goal.",
+    "",
+)
+
+
+if __name__ == "__main__":
+    sys.exit(main(ArmRig, CASES, TITLE, WORDS, __doc__))
