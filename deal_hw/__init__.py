@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from deal_hw.workflows.own_robot.check import RobotCheck as RobotCheck
     from deal_hw.workflows.own_robot.check import check_robot as check_robot
     from deal_hw.workflows.own_robot.new import new_robot as new_robot
+    from deal_hw.workflows.policy import PolicyReport as PolicyReport
+    from deal_hw.workflows.policy import check_policy as check_policy
+    from deal_hw.workflows.policy import import_policy as import_policy
     from deal_hw.workflows.replay import replay as replay
     from deal_hw.workflows.running.report import RunReport as RunReport
     from deal_hw.workflows.running.settings import Go2LinkOptions as Go2LinkOptions
@@ -54,6 +57,7 @@ _EXPORTS = {
     "workflows.emulate": ("emulate", "EmulatedRobot"),
     "workflows.design_excitation": ("design_excitation",),
     "workflows.inspect": ("inspect", "Inspection"),
+    "workflows.policy": ("import_policy", "check_policy", "PolicyReport"),
     "workflows.replay": ("replay",),
     "workflows.own_robot.check": ("check_robot", "RobotCheck"),
     "workflows.own_robot.new": ("new_robot",),

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError, shown
+from deal_hw.rotations import in_base_frame, rotation_between
 from deal_hw.schema import SHOWN, STRICT, check_members, check_numbers, either, read_json, refusal
 from deal_hw.types import FloatArray, IntArray
 
@@ -53,7 +54,9 @@ reports, and the rotation vector that turns it to the target orientation [rad]."
 BASE_SIZE = 6
 
 VERDICT: Final = "calibration_verdict"
-"""Key in a policy's training record: the colour of its calibration's verdict."""
+"""Key in a policy's training record: the colour of its calibration's verdict, or of its import's."""
+IMPORTED: Final = "imported"
+"""Key in a policy's training record: how another trainer's policy was imported."""
 MAX_DELAY: Final = 100
 """Most control periods that an observation may look back: 2 s at 50 Hz."""
 MAX_TERMS: Final = 4096
@@ -71,6 +74,18 @@ _OF_ROBOT: Final = (
     "position_units",
 )
 """Fields of a spec that a robot's description has, too."""
+_LATER: Final = (
+    "position_units",
+    "clock_hz",
+    "command_range",
+    "action_offset",
+    "action_limit",
+    "target_range",
+    "delayed_commands",
+    "clock_rest",
+    "recurrent",
+)
+"""Fields that specs of earlier versions do not have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +96,7 @@ class ObservationTerm:
         quantity: The observed quantity. Positions are relative to the default pose; "action" is a former
             action. "command" is the requested velocity of the base: x and y [m/s], z [rad/s]. "clock" is a
             phase that turns ``clock_hz`` times a second from the first observation on. Command and clock are
-            the same at all delays.
+            the same at all delays, unless the spec says ``delayed_commands``.
         joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z; for the
             clock "sin" or "cos".
         scale: The factor applied to it [1/unit].
@@ -130,8 +145,8 @@ class PolicySpec:
         joint_names: The robot's joints in the order the policy was trained with.
         actuated: The joints of the action, in order.
         observation: The terms of the observation, in order.
-        action_scale: Position target [m or rad] = default + scale * action, (A,). Actions are unitless in
-            [-1, 1].
+        action_scale: Position target [m or rad] = centre + scale * action, (A,). Actions are unitless and in
+            [-1, 1], unless ``action_limit`` is another.
         default_position: The pose that observation and action are relative to, (J,).
         stiffness: kp sent with each target, (A,).
         damping: kd sent with each target, (A,).
@@ -144,6 +159,14 @@ class PolicySpec:
         clock_hz: Turns per second of the observed clock; 0: no clock.
         command_range: Lowest and highest velocity command of training, x, y [m/s] and yaw rate [rad/s],
             (3, 2); empty: not noted.
+        action_offset: The centre of the targets, (A,) [m or rad]; empty: the robot's default pose. With it
+            the policy has poses of its own, and the robot's default pose may be another.
+        action_limit: Largest absolute action; larger ones are clipped. Infinite: none is.
+        target_range: Lowest and highest target, (A, 2) [m or rad]. Targets are clipped to it, the observed
+            action is not; empty: no range.
+        delayed_commands: Whether delayed commands and clocks are the former ones.
+        clock_rest: Length of a command, (x, y, yaw) as one vector, below which the clock's terms are zero.
+        recurrent: Whether the network has a memory of its own between observations.
 
     Raises:
         ConfigurationError: A field is invalid; the message names the first one.
@@ -167,6 +190,12 @@ class PolicySpec:
     position_units: tuple[str, ...] = ()
     clock_hz: float = 0.0
     command_range: tuple[tuple[float, float], ...] = ()
+    action_offset: tuple[float, ...] = ()
+    action_limit: float = 1.0
+    target_range: tuple[tuple[float, float], ...] = ()
+    delayed_commands: bool = False
+    clock_rest: float = 0.0
+    recurrent: bool = False
 
     def __post_init__(self) -> None:
         for name, names in (
@@ -199,10 +228,19 @@ class PolicySpec:
             if term.joint not in known:
                 raise refusal(f"observation[{i}].joint", term.joint, either(known))
         self._check_clock()
-        if len(self.command_range) not in (0, len(AXES)) or not all(
-            len(ends) == 2 and -math.inf < ends[0] <= ends[1] < math.inf for ends in self.command_range
+        if self.action_offset:
+            check_numbers("action_offset", self.action_offset, A)
+        if not self.action_limit > 0:
+            raise refusal("action_limit", self.action_limit, "a number above 0, or Infinity")
+        for name, pairs, length in (
+            ("command_range", self.command_range, len(AXES)),
+            ("target_range", self.target_range, A),
         ):
-            raise refusal("command_range", self.command_range, "3 pairs (lowest, highest) of finite numbers")
+            if len(pairs) not in (0, length) or not all(
+                len(ends) == 2 and -math.inf < ends[0] <= ends[1] < math.inf for ends in pairs
+            ):
+                allowed = f"{length} pairs (lowest, highest) of finite numbers"
+                raise refusal(name, getattr(self, name), allowed)
         try:
             json.dumps(dict(self.training), allow_nan=False)
         except (TypeError, ValueError, RecursionError) as err:
@@ -241,6 +279,8 @@ class PolicySpec:
                 else "0, as no clock is observed"
             )
             raise refusal("clock_hz", self.clock_hz, allowed)
+        if not 0 <= self.clock_rest < math.inf:
+            raise refusal("clock_rest", self.clock_rest, "a finite number of at least 0")
 
     @property
     def observes_base(self) -> bool:
@@ -256,9 +296,9 @@ class PolicySpec:
         """Return the spec as JSON text."""
         values = {**dataclasses.asdict(self), "training": dict(self.training)}
         # A default stays out: a spec written before the field existed keeps its digest.
-        for name in ("position_units", "clock_hz", "command_range"):
-            if not values[name]:
-                del values[name]
+        for entry in dataclasses.fields(self):
+            if entry.name in _LATER and values[entry.name] == entry.default:
+                del values[entry.name]
         return json.dumps(values, sort_keys=True)
 
     @classmethod
@@ -289,6 +329,15 @@ class PolicySpec:
         Raises:
             PolicyMismatchError: It was made for another robot; the message names every field that differs.
         """
+        own_choice = {
+            name
+            for name, free in (
+                ("position_units", not self.position_units),
+                # The policy's own poses are inside its targets and observations.
+                ("default_position", bool(self.action_offset)),
+            )
+            if free
+        }
         wrong = {
             name: f"policy has {shown(given)}, robot has {shown(own)}"
             for name, (given, own) in {
@@ -299,7 +348,7 @@ class PolicySpec:
                 "default_position": (self.default_position, description.default_position),
                 "control_rate_hz": (self.control_rate_hz, description.control_rate_hz),
             }.items()
-            if given != own and not (name == "position_units" and not given)
+            if given != own and name not in own_choice
         }
         limits = description.limits
         for name, allowed in (
@@ -364,6 +413,10 @@ class ObservationBuilder:
         self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.target: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.clock: FloatArray = np.zeros(batch_shape)
+        # Without delays of their own, command and clock are read as they are now.
+        memory = depth if spec.delayed_commands else 1
+        self._command = np.zeros((memory, *batch_shape, len(AXES)))
+        self._clock = np.zeros((memory, *batch_shape, len(CLOCK_AXES)))
         self._fresh = np.ones(batch_shape, dtype=bool)
         self._reads = _reads(spec)
 
@@ -397,11 +450,15 @@ class ObservationBuilder:
             ConfigurationError: The policy observes the base, which is not given.
         """
         J = len(self._default)
-        past = [self._position, self._velocity]
+        past = [self._position, self._velocity, self._command, self._clock]
         self._shift(self._position)
         self._shift(self._velocity)
         self._position[0] = position[..., -J:] - self._default
         self._velocity[0] = velocity[..., -J:]
+        self._shift(self._command)
+        self._command[0] = self.command
+        self._shift(self._clock)
+        self._clock[0] = self._hands()
         if self.spec.observes_base:
             if position.shape[-1] != BASE_SIZE + J:
                 raise ConfigurationError(
@@ -427,6 +484,15 @@ class ObservationBuilder:
         self.clock = (self.clock + self.spec.clock_hz / self.spec.control_rate_hz) % 1.0
         return found
 
+    def _hands(self) -> FloatArray:
+        """Return sine and cosine of the clock's phase, (..., 2)."""
+        angle = 2.0 * np.pi * self.clock
+        hands = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+        if self.spec.clock_rest > 0:
+            resting = np.linalg.norm(self.command, axis=-1, keepdims=True) < self.spec.clock_rest
+            hands = np.where(resting, 0.0, hands)
+        return np.asarray(hands)
+
     @staticmethod
     def _shift(memory: FloatArray) -> None:
         memory[1:] = memory[:-1]
@@ -446,10 +512,9 @@ class ObservationBuilder:
             case "action":
                 return self._action
             case "command":
-                return self.command[None]
+                return self._command
             case "clock":
-                angle = 2.0 * np.pi * self.clock
-                return np.stack([np.sin(angle), np.cos(angle)], axis=-1)[None]
+                return self._clock
             case "place" | "target_rotation":
                 return self._world
             case "gravity" | "heading" | "angular_velocity" | "linear_velocity" | "height":
@@ -474,8 +539,14 @@ def _reads(spec: PolicySpec) -> list[_Read]:
     return [
         _Read(
             quantity,
-            # Command and clock are the same at all delays.
-            np.array([0 if quantity in ("command", "clock") else spec.observation[i].delay for i in found]),
+            np.array(
+                [
+                    0
+                    if quantity in ("command", "clock") and not spec.delayed_commands
+                    else spec.observation[i].delay
+                    for i in found
+                ]
+            ),
             np.array([_column(spec, spec.observation[i]) for i in found]),
             np.array(found),
             np.array([spec.observation[i].scale for i in found]),
@@ -490,50 +561,6 @@ def _column(spec: PolicySpec, term: ObservationTerm) -> int:
     together = BASE_QUANTITIES if term.quantity in BASE_QUANTITIES else WORLD_QUANTITIES
     first = len(AXES) * together.index(term.quantity) if term.quantity in together else 0
     return first + term.axes.index(term.joint)
-
-
-def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return vectors of the world, (..., 3), in the frame of a base at rotation vectors, (..., 3).
-
-    Rodrigues' formula for the inverse rotation.
-    """
-    angle = np.linalg.norm(rotation_vector, axis=-1, keepdims=True)
-    axis = rotation_vector / np.where(angle > 0, angle, 1.0)
-    along = np.sum(axis * vector, axis=-1, keepdims=True)
-    turned = np.cos(angle) * vector - np.sin(angle) * np.cross(axis, vector)
-    return np.asarray(turned + (1.0 - np.cos(angle)) * along * axis)
-
-
-def rotation_vector(quaternion: FloatArray) -> FloatArray:
-    """Return the rotation vector, (3,) [rad], of an orientation, (4,), a unit quaternion wxyz."""
-    w, v = float(quaternion[0]), quaternion[1:]
-    sine = float(np.linalg.norm(v))
-    # Of a rotation's two quaternions, take the one with the smaller angle.
-    angle = 2.0 * math.atan2(sine, abs(w))
-    return np.asarray(v * (math.copysign(1.0, w) * (angle / sine if sine > 0 else 2.0)))
-
-
-def rotation_between(present: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return the rotation vectors in the world, (..., 3) [rad], that turn orientations to wanted ones.
-
-    Args:
-        present: Orientations as rotation vectors around the identity, (..., 3).
-        wanted: The same.
-    """
-    # The quaternion wanted * conjugate(present); of its two signs, the one with the smaller angle.
-    (w, v), (b, u) = _half_turn(wanted), _half_turn(present)
-    real = w * b + np.sum(v * u, axis=-1, keepdims=True)
-    imaginary = (b * v - w * u - np.cross(v, u)) * np.where(real < 0.0, -1.0, 1.0)
-    sine = np.linalg.norm(imaginary, axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, np.abs(real))
-    return np.asarray(imaginary * np.where(sine > 0.0, angle / np.where(sine > 0.0, sine, 1.0), 2.0))
-
-
-def _half_turn(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the real, (..., 1), and the imaginary part, (..., 3), of the quaternion of a rotation vector."""
-    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
-    # numpy's sinc(x) is sin(pi x) / (pi x).
-    return np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * turn
 
 
 def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -155,13 +155,19 @@ def read_json(
             raise error(f"{path} cannot be read as {what}: {err}{then}") from err
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path, tags: Mapping[str, Callable[[Any], Any]] | None = None) -> Any:
     """Return the values of a YAML file; to be called inside :func:`reading`."""
-    return parse_yaml(read_bytes(path, YAML_BYTES).decode("utf-8"))
+    return parse_yaml(read_bytes(path, YAML_BYTES).decode("utf-8"), tags)
 
 
-def parse_yaml(text: str) -> Any:
-    """Return the plain values of YAML text; to be called inside :func:`reading`."""
+def parse_yaml(text: str, tags: Mapping[str, Callable[[Any], Any]] | None = None) -> Any:
+    """Return the plain values of YAML text; to be called inside :func:`reading`.
+
+    Args:
+        text: The text.
+        tags: Functions of a YAML node for tags beyond the plain ones, by the tag's full name. All others are
+            refused: no object is made.
+    """
     # Imported here, since control processes read no YAML.
     import yaml
 
@@ -174,7 +180,13 @@ def parse_yaml(text: str) -> Any:
 
     if len(text) > YAML_BYTES:
         raise ConfigurationError(f"{len(text)} characters of YAML; {YAML_BYTES} are allowed")
+    for tag, construct in (tags or {}).items():
+        Loader.add_constructor(tag, _constructor(construct))
     return yaml.load(text, Loader)
+
+
+def _constructor(construct: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    return lambda loader, node: construct(node)
 
 
 def _weigh(node: Any, weights: dict[int, float]) -> float:

@@ -14,8 +14,8 @@ from typing import Final, Protocol
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.errors import UnknownNameError
-from deal_hw.motions.behaviours import centre
+from deal_hw.errors import PolicyMismatchError, UnknownNameError
+from deal_hw.motions.behaviours import ActionMap
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray
@@ -58,14 +58,18 @@ def demonstration_policy(robot: str, checkpoint: Path | None = None) -> OnnxPoli
 
 
 def limited_action(
-    description: RobotDescription, scale: FloatArray, action: FloatArray, before: FloatArray
+    description: RobotDescription,
+    scale: FloatArray,
+    action: FloatArray,
+    before: FloatArray,
+    most: float = 1.0,
 ) -> FloatArray:
-    """Return actions, (..., A), in [-1, 1] that move the target no faster than the safety limits allow.
+    """Return actions, (..., A), up to ``most``, by which targets move no faster than the limits allow.
 
     The action itself is limited, so that the policy, which observes its last action, knows what was sent.
     """
-    step = np.array(description.limits.target_step) / scale
-    return np.clip(np.clip(action, -1.0, 1.0), before - step, before + step)
+    step = np.array(description.limits.target_step) / np.abs(scale)
+    return np.clip(np.clip(action, -most, most), before - step, before + step)
 
 
 @dataclass(eq=False)
@@ -84,7 +88,7 @@ class PopulationDemonstration:
         spec_digest: Digest of the policy's spec, training record included.
 
     Raises:
-        PolicyMismatchError: The policy was made for another robot.
+        PolicyMismatchError: The policy was made for another robot, or its network has a memory of its own.
     """
 
     policy: InitVar[BatchPolicy]
@@ -98,8 +102,12 @@ class PopulationDemonstration:
         spec.check_fits(description)
         self.spec_digest = spec.digest()
         self._policy, self._description = policy, description
-        self._scale = np.array(spec.action_scale)
-        self._offset = centre(description)
+        if spec.recurrent:
+            raise PolicyMismatchError(
+                "the policy's network has a memory of its own, which no recording holds, so its commands "
+                "cannot be computed from states; use a policy without"
+            )
+        self._map = ActionMap(spec, description)
 
     @property
     def trained_under(self) -> str:
@@ -130,8 +138,8 @@ class PopulationDemonstration:
         self._builder.target = np.repeat(np.array(TARGET_RAD)[None], count, axis=0)
         early = number - len(command)
         self._builder.clock = np.full(count, early * spec.clock_hz / spec.control_rate_hz % 1.0)
-        self._action = np.zeros((count, len(self._scale)))
-        for q, v, u in zip(position, velocity, (command - self._offset) / self._scale, strict=True):
+        self._action = np.zeros((count, len(spec.actuated)))
+        for q, v, u in zip(position, velocity, (command - self._map.centre) / self._map.scale, strict=True):
             self._builder.build(*(np.repeat(x[None], count, axis=0) for x in (q, v)))
             self._action = np.repeat(u[None], count, axis=0)
             self._builder.record_action(self._action)
@@ -145,9 +153,10 @@ class PopulationDemonstration:
         known = np.nan_to_num(position), np.nan_to_num(velocity)
         observation = self._builder.build(*known)
         wanted = np.where(finite, self._policy.act_batch(observation), 0.0)
-        self._action = limited_action(self._description, self._scale, wanted, self._action)
+        mapped = self._map
+        self._action = limited_action(self._description, mapped.scale, wanted, self._action, mapped.limit)
         self._builder.record_action(self._action)
-        return np.asarray(self._offset + self._scale * self._action)
+        return mapped.target(self._action)
 
 
 class Demonstration:

@@ -15,7 +15,8 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.locomotion import LocomotionEnv, joint_terms, locomotion_spec, vector_terms
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
-from deal_hw.policy import Observation, PolicySpec, rotation_between
+from deal_hw.policy import Observation, PolicySpec
+from deal_hw.rotations import rotation_between
 from deal_hw.types import FloatArray
 
 _UP = 2

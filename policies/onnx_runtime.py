@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,11 +24,16 @@ SPEC_KEY = "deal_hw.policy_spec"
 """Key of the spec, as JSON, in the ONNX file's metadata."""
 MAX_FILE_BYTES: Final = 100_000_000
 """Largest policy file: some 25 million weights, a hundred times what a policy at 50 Hz has."""
+MAX_MEMORY: Final = 65_536
+"""Most numbers of one part of a recurrent network's memory."""
 _NO_FOLDER: Final = os.devnull + "/weights-outside-of-the-file"
 
 
 class OnnxPolicy:
     """A policy from an ONNX file that contains its spec.
+
+    A recurrent network also has inputs and outputs for its memory, (B, n) each. What comes out goes in with
+    the next observation, and is zero after a reset.
 
     It uses one thread without spinning: a second thread costs more than it gains for networks of this size,
     and would disturb the control process.
@@ -54,17 +60,20 @@ class OnnxPolicy:
                 f"{self.path} was changed after it was checked: its SHA-256 begins {self.digest[:16]}, "
                 f"the checked file's {digest[:16]}; start again"
             )
-        self._session = _open(self.path, content)
+        self._session = open_session(self.path, content)
         try:
             self._spec = _read_spec(self.path, self._session)
             self._input, self._output = _check_shapes(self.path, self._session, self._spec)
+            self._kept = _check_memory(self.path, self._session, self._spec)
         except UnicodeDecodeError as err:
             raise PolicyError(
                 f"{self.path} is damaged: a name inside is no UTF-8 text; copy or export the file again"
             ) from err
         self._row = np.zeros((1, len(self._spec.observation)), dtype=np.float32)
         # The first run allocates memory; it must not happen in the first control cycle.
+        self._memory: list[Observation] = []
         self.act_batch(self._row)
+        self.reset()
 
     @property
     def spec(self) -> PolicySpec:
@@ -77,7 +86,8 @@ class OnnxPolicy:
         return bool(self._session.get_inputs()[0].shape[0] != 1)
 
     def reset(self) -> None:
-        """Do nothing: past values are part of the observation."""
+        """Clear the memory of a recurrent network; of others past values are part of the observation."""
+        self._memory = []
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,).
@@ -96,18 +106,28 @@ class OnnxPolicy:
     def act_batch(self, observations: Observation) -> FloatArray:
         """Return the actions, (B, A), for observations, (B, O).
 
+        A recurrent network begins anew with another B.
+
         Raises:
             PolicyError: The network fails on them, or answers with another shape.
         """
+        count = len(observations)
+        if self._kept and (not self._memory or len(self._memory[0]) != count):
+            self._memory = [np.zeros((count, kept.width), dtype=np.float32) for kept in self._kept]
+        values = {kept.input: value for kept, value in zip(self._kept, self._memory, strict=True)}
+        outputs = [self._output, *(kept.output for kept in self._kept)]
         try:
-            action: Any = self._session.run([self._output], {self._input: observations})[0]
+            action, *memory = self._session.run(outputs, {self._input: observations, **values})
         # onnxruntime's exceptions have no common base below Exception.
         except Exception as err:
             raise PolicyError(
                 f"{self.path}: the network fails on an observation of the right shape ({_first_line(err)}); "
                 "give another policy"
             ) from err
-        wanted = (len(observations), len(self._spec.actuated))
+        wanted = (count, len(self._spec.actuated))
+        if [np.shape(value) for value in memory] != [np.shape(value) for value in self._memory]:
+            raise PolicyError(f"{self.path}: the network's memory changes its shape; give another policy")
+        self._memory = memory
         if np.shape(action) != wanted:
             raise PolicyError(
                 f"{self.path}: output {self._output!r} came with shape {np.shape(action)}, the spec says "
@@ -149,7 +169,12 @@ def _open_at_once(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)
 
 
-def _open(path: Path, content: bytes) -> onnxruntime.InferenceSession:
+def open_session(path: Path, content: bytes) -> onnxruntime.InferenceSession:
+    """Return what runs the network of a file's bytes, with one thread and no other file.
+
+    Raises:
+        PolicyError: It is no ONNX, or cannot be run.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -199,6 +224,8 @@ def _first_line(err: Exception) -> str:
 def _check_shapes(path: Path, session: onnxruntime.InferenceSession, spec: PolicySpec) -> tuple[str, str]:
     """Return the names of input and output after comparing their shapes with the spec."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
+    if spec.recurrent:
+        inputs, outputs = inputs[:1], outputs[:1]
     if len(inputs) != 1 or len(outputs) != 1:
         raise PolicyError(
             f"{path}: expected one input and one output, found {[i.name for i in inputs]} and "
@@ -219,3 +246,38 @@ def _check_shapes(path: Path, session: onnxruntime.InferenceSession, spec: Polic
     if wrong:
         raise PolicyError(f"{path}: network and spec disagree: " + "; ".join(wrong))
     return str(inputs[0].name), str(outputs[0].name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A part of a network's memory, (B, width): its input and its output."""
+
+    input: str
+    output: str
+    width: int
+
+
+def _check_memory(path: Path, session: onnxruntime.InferenceSession, spec: PolicySpec) -> list[_Kept]:
+    """Return the memory's inputs and outputs, which come in pairs behind observation and action."""
+    if not spec.recurrent:
+        return []
+    inputs, outputs = session.get_inputs()[1:], session.get_outputs()[1:]
+    shapes = [[(tensor.type, *tensor.shape[1:]) for tensor in side] for side in (inputs, outputs)]
+    if not inputs or shapes[0] != shapes[1] or not all(_is_row(tensor) for tensor in (*inputs, *outputs)):
+        raise PolicyError(
+            f"{path}: the memory of a recurrent network has an output (batch, n) for each input, as "
+            f"tensor(float); found {[(t.name, t.shape) for t in inputs]} and "
+            f"{[(t.name, t.shape) for t in outputs]}"
+        )
+    pairs = zip(inputs, outputs, strict=True)
+    return [_Kept(str(i.name), str(o.name), int(i.shape[1])) for i, o in pairs]
+
+
+def _is_row(tensor: Any) -> bool:
+    sizes = tensor.shape
+    return (
+        tensor.type == "tensor(float)"
+        and len(sizes) == 2
+        and isinstance(sizes[1], int)
+        and 0 < sizes[1] <= MAX_MEMORY
+    )

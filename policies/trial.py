@@ -10,15 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 import time
 from dataclasses import dataclass
-from multiprocessing.connection import Pipe
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -30,15 +23,13 @@ from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.description import RobotDescription
 from deal_hw.errors import MissingExtraError, PolicyError
 from deal_hw.motions.behaviours import PolicyBehaviour
+from deal_hw.policies.separate_process import SeparateProcess
 from deal_hw.policies.trial_states import GivenVelocity, Probe, ProbeStates
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray
 
-_MAX_REPLY_BYTES: Final = 100_000_000
 _REPEATS: Final = 3
 """Repetitions of the timing of a late action."""
-_DYING_S: Final = 1.0
-_ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 MEMORY_BYTES: Final = 2**30
@@ -113,32 +104,19 @@ class TrialPolicy:
             PolicyError: The file holds no policy that can be loaded.
         """
         _require_onnxruntime()
-        self._end_ns = self._clock.now_ns() + round(self._settings.time_limit_s * 1e9)
-        self._connection, theirs = Pipe()
-        self._said = tempfile.TemporaryFile()
-        with theirs:
-            fd, settings = theirs.fileno(), self._settings
-            # A session of its own: Ctrl-C in the terminal reaches only this process, which then kills it.
-            self._child = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "deal_hw.policies.trial_process",
-                    str(fd),
-                    str(os.getpid()),
-                    str(MEMORY_BYTES),
-                    str(settings.processor_s),
-                    str(self.path),
-                ],
-                pass_fds=[fd],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._said,
-                start_new_session=True,
-                env={**os.environ, **_ONE_THREAD},
-            )
+        settings = self._settings
+        self._process = SeparateProcess(
+            "deal_hw.policies.trial_process",
+            [str(self.path)],
+            source=self.path,
+            does="loading and trying the network",
+            memory_bytes=MEMORY_BYTES,
+            processor_s=settings.processor_s,
+            time_limit_s=settings.time_limit_s,
+            clock=self._clock,
+        )
         try:
-            self._facts = self._ask()
+            self._facts = self._process.ask()
             self._spec = PolicySpec.from_json(self._facts["spec"])
         except BaseException:
             self.close()
@@ -150,15 +128,12 @@ class TrialPolicy:
 
     def close(self) -> None:
         """Kill the process."""
-        self._child.kill()
-        self._child.wait()
-        self._connection.close()
-        self._said.close()
+        self._process.close()
 
     @property
     def process_id(self) -> int:
         """Id of the process that runs the network."""
-        return self._child.pid
+        return self._process.process_id
 
     @property
     def spec(self) -> PolicySpec:
@@ -176,7 +151,13 @@ class TrialPolicy:
         return bool(self._facts["batches"])
 
     def reset(self) -> None:
-        """Do nothing: the observation carries the past."""
+        """Clear the memory of a recurrent network; of others the observation carries the past.
+
+        Raises:
+            PolicyError: The process ended.
+        """
+        if self._spec.recurrent:
+            self._process.ask([])
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,).
@@ -201,7 +182,7 @@ class TrialPolicy:
         Raises:
             PolicyError: The network fails, its answer is not finite, or it comes too late.
         """
-        reply = self._ask(observations.tolist())
+        reply = self._process.ask(observations.tolist())
         actions: FloatArray = np.array(reply["actions"], dtype=float)
         self.seconds = float(reply["seconds"])
         for row, i in np.argwhere(~np.isfinite(actions)):
@@ -210,43 +191,6 @@ class TrialPolicy:
                 "allowed: finite actions; train it again or give another policy"
             )
         return actions
-
-    def _ask(self, observations: list[Any] | None = None) -> dict[str, Any]:
-        """Return the answer to observations; None reads the first message, which describes the file."""
-        try:
-            if observations is not None:
-                self._connection.send_bytes(json.dumps(observations).encode())
-            left_s = (self._end_ns - self._clock.now_ns()) * 1e-9
-            if not self._connection.poll(max(left_s, 0.0)):
-                raise PolicyError(
-                    f"{self.path}: loading and trying the network was stopped after "
-                    f"{self._settings.time_limit_s:g} s; it is far too slow, or this computer is too busy; "
-                    "give another policy, or end other programs"
-                )
-            reply: dict[str, Any] = json.loads(self._connection.recv_bytes(_MAX_REPLY_BYTES))
-        except (EOFError, OSError) as err:
-            raise PolicyError(f"{self.path}: {self._describe_end()}") from err
-        if "error" in reply:
-            raise PolicyError(reply["error"])
-        return reply
-
-    def _describe_end(self) -> str:
-        """Return text on how the process ended."""
-        try:
-            code = self._child.wait(_DYING_S)
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            code = self._child.wait()
-        if code == -signal.SIGXCPU:
-            return (
-                f"the network gave no answer within {self._settings.processor_s} s of processor time; it "
-                "loops for ever or is far too slow; give another policy"
-            )
-        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        self._said.seek(0)
-        last = self._said.read()[-400:].decode(errors="replace").strip().splitlines()
-        words = f": {last[-1]}" if last else ""
-        return f"the network crashes the process that runs it ({how}{words}); give another policy"
 
 
 def _require_onnxruntime() -> None:

@@ -2,7 +2,8 @@
 
 It is started as ``python -m deal_hw.policies.trial_process FD PARENT MEMORY_BYTES SECONDS FILE``: one end of
 a socket as inherited descriptor, the parent's process id, limits, and the policy. Messages are JSON. The
-first describes the file. Then each list of observations is answered with actions and the processor time [s].
+first describes the file. Then each list of observations is answered with actions and the processor time [s];
+an empty list clears the network's memory.
 Errors are answered as ``{"error": ...}``.
 """
 
@@ -10,9 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
-import os
-import resource
 import sys
 import time
 from multiprocessing.connection import Connection
@@ -24,13 +22,14 @@ import numpy as np
 from deal_hw.control.process.realtime import die_with_parent
 from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policies.process_limits import limit
 
 
 def main() -> int:
     """Answer until the other end is closed; return the exit code."""
     fd, parent, memory, seconds, file = sys.argv[1:]
     die_with_parent(int(parent))
-    _limit(int(memory), int(seconds))
+    limit(int(memory), int(seconds))
     with Connection(int(fd)) as connection, contextlib.suppress(EOFError, ConnectionError):
         try:
             policy = OnnxPolicy(Path(file))
@@ -40,6 +39,10 @@ def main() -> int:
             )
             while True:
                 observations = np.array(json.loads(connection.recv_bytes()), dtype=np.float32)
+                if not observations.size:
+                    policy.reset()
+                    _send(connection, {"actions": [], "seconds": 0.0})
+                    continue
                 begun = time.process_time()
                 actions = policy.act_batch(observations)
                 took = time.process_time() - begun
@@ -53,20 +56,6 @@ def main() -> int:
 
 def _send(connection: Connection, message: dict[str, Any]) -> None:
     connection.send_bytes(json.dumps(message).encode())
-
-
-def _limit(memory: int, seconds: int) -> None:
-    """Limit memory and processor time of the network, beyond what Python and onnxruntime use already."""
-    in_use = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    for kind, limit in (
-        (resource.RLIMIT_AS, in_use + memory),
-        # The kernel ends an endless network with SIGXCPU.
-        (resource.RLIMIT_CPU, math.ceil(time.process_time()) + seconds),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        hard = resource.getrlimit(kind)[1]
-        with contextlib.suppress(ValueError, OSError):
-            resource.setrlimit(kind, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
 
 
 if __name__ == "__main__":

@@ -49,6 +49,7 @@ API_NAMES = {
     "Emulate a robot": ("emulate", "EmulatedRobot"),
     "Describe a robot": ("new_robot", "check_robot", "RobotCheck"),
     "Train and inspect": ("train", "Training", "inspect", "Inspection"),
+    "Policies of others": ("import_policy", "check_policy", "PolicyReport"),
 }
 """Pages of the API with names of ``deal_hw`` itself."""
 

@@ -191,6 +191,13 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             example="robot new robot.xml",
             extra="sim",
         ),
+        "policy": _verb(
+            "policy",
+            help="import a policy that mjlab, unitree_rl_lab or unitree_rl_gym trained; show, check policies",
+            config="KINDS",
+            example="policy import exported/policy.onnx --robot go2 --out walk.onnx",
+            extra="train",
+        ),
         "data": _verb(
             "data",
             help="show, verify and repair datasets; import and export recordings",

@@ -16,8 +16,8 @@ from deal_hw.policy import (
     ObservationBuilder,
     Policy,
     PolicySpec,
-    rotation_vector,
 )
+from deal_hw.rotations import rotation_vector
 from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
 
 
@@ -64,11 +64,36 @@ def position_command(description: RobotDescription | PolicySpec, target: FloatAr
     )
 
 
+class ActionMap:
+    """Turns the answers of a policy's network into actions and targets, as its spec says.
+
+    Attributes:
+        centre: The target of action 0, (A,).
+        scale: Change of the target by action 1, (A,).
+        limit: Largest absolute action.
+    """
+
+    def __init__(self, spec: PolicySpec, description: RobotDescription) -> None:
+        self.centre = np.array(spec.action_offset) if spec.action_offset else centre(description)
+        self.scale = np.array(spec.action_scale)
+        self.limit = spec.action_limit
+        self._range = np.array(spec.target_range).T if spec.target_range else None
+
+    def action(self, answer: FloatArray) -> FloatArray:
+        """Return the actions of answers, (..., A) each; NaN stays, for the safety filter to trip on."""
+        return np.clip(answer, -self.limit, self.limit)
+
+    def target(self, action: FloatArray) -> FloatArray:
+        """Return the targets of actions, (..., A) each."""
+        target = self.centre + self.scale * action
+        return target if self._range is None else np.clip(target, *self._range)
+
+
 class PolicyBehaviour:
     """Runs a policy: target = centre + scale x action, with the gains and limits of the policy's spec.
 
-    Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on. A requested velocity
-    is clipped to the policy's training range, if its spec contains one.
+    Actions are clipped, by default to [-1, 1]; NaN passes through, for the safety filter to trip on. A
+    requested velocity is clipped to the policy's training range, if its spec contains one.
 
     Attributes:
         follows_velocity: Whether it observes a requested velocity.
@@ -104,9 +129,8 @@ class PolicyBehaviour:
         self.follows_velocity = "command" in observed
         self._policy = policy
         self._observations = ObservationBuilder(spec)
-        self._scale = np.array(spec.action_scale)
-        self._centre = centre(description)
-        self._template = position_command(spec, self._centre)
+        self._map = ActionMap(spec, description)
+        self._template = position_command(spec, self._map.centre)
         self.action: FloatArray | None = None
 
     def reset(self) -> None:
@@ -121,14 +145,14 @@ class PolicyBehaviour:
         self._observations.command = np.clip(wanted, self._slowest, self._fastest)
         observation = self._observations.build(*self._coordinates(state))
         action = np.asarray(self._policy.act(observation), dtype=float)
-        if action.shape != self._scale.shape:
+        if action.shape != self._map.scale.shape:
             raise PolicyError(
-                f"the policy returned an action of shape {action.shape}, expected {self._scale.shape}; "
+                f"the policy returned an action of shape {action.shape}, expected {self._map.scale.shape}; "
                 "export a policy for this robot"
             )
-        self.action = np.clip(action, -1.0, 1.0)
+        self.action = self._map.action(action)
         self._observations.record_action(self.action)
-        return dataclasses.replace(self._template, position_target=self._centre + self._scale * self.action)
+        return dataclasses.replace(self._template, position_target=self._map.target(self.action))
 
     def _coordinates(self, state: RobotState) -> tuple[FloatArray, FloatArray]:
         """Return positions and velocities in the policy's layout, with the base's first if it needs them."""

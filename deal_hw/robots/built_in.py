@@ -119,6 +119,7 @@ GO2: Final = RobotEntry(
     task="deal_hw.policies.tasks:GO2",
     environment="deal_hw/Go2-v0",
     policy="deal_hw.policies:assets/go2_walk.onnx",
+    motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
 )
 GO2_ON_STAND: Final = RobotEntry(
     name="go2_on_stand",

@@ -126,6 +126,8 @@ class RobotEntry:
         task: The training task, a :class:`~deal_hw.policies.tasks.TrainingTask`.
         environment: Gymnasium's name of the task, such as ``"deal_hw/Ant-v0"``.
         policy: The shipped policy, ``"package:file"``.
+        motors: The joints in the order of the vendor's motor numbers, by which policies of other trainers
+            name them.
         needs: What pip installs for it; named where an import fails.
         origin: The distribution of a plug-in and its version; "" for a robot of deal-hw.
     """
@@ -146,6 +148,7 @@ class RobotEntry:
     task: Reference = ""
     environment: str = ""
     policy: str = ""
+    motors: Reference = ""
     needs: str = ""
     origin: str = ""
 
@@ -195,6 +198,10 @@ class RobotEntry:
     def recorded_description(self) -> RobotDescription:
         """Return the facts under which recordings are made: the driver's, where there is one."""
         return self.driver_description() if self.driven else self.model_description()
+
+    def motor_joints(self) -> tuple[str, ...]:
+        """Return the joints in the order of the vendor's motor numbers; () if that is not known."""
+        return tuple(self.load(self.motors)) if self.motors else ()
 
     def parameter_spaces(self) -> Mapping[str, Callable[[], ParameterSpace]]:
         """Return the parameter sets by name; the first is the default.

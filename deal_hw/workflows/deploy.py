@@ -48,7 +48,8 @@ class DeploySettings(RunOptions):
     """Description of the task, for the recording."""
 
     trust_calibration: bool = False
-    """Run a policy without a question or warning if its calibration has a red or amber verdict."""
+    """Run a policy without a question or warning if its calibration, or its import, has a red or amber
+    verdict."""
 
     record: bool = True
     """Record the episodes."""

@@ -18,6 +18,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from fakes import foreign_policy
+from fakes.foreign_policy import Foreign
 from verb_options import Option, kind_of, options
 
 from deal_hw.cli.main import VERBS, main, parse
@@ -34,6 +36,10 @@ MJCF = """<mujoco model="arm"><compiler angle="radian"/><option timestep="0.005"
 <actuator><position name="motor" joint="shoulder" kp="20" kv="0.5" forcerange="-20 20"/></actuator>
 </mujoco>"""
 
+MJLAB = (
+    "policy import mjlab.onnx --robot go2 --out walk.onnx --control-rate 50 --observation-scales 1 "
+    "--history 1 --command-range -1:1,-1:1,-1:1 --clock 2 --clock-at-rest runs"
+)
 RECORDINGS = "calibrate --model arm.xml --data fit.csv more.csv"
 LINES = (
     RECORDINGS,
@@ -61,6 +67,8 @@ LINES = (
     "keys add made_keys somebody",
     "robot new arm.xml --out new.yaml",
     "robot new arm.xml --out new.yaml --lerobot calibration.json",
+    MJLAB,
+    "policy import gym.onnx --config gym.yaml --robot go2 --out walk.onnx",
     "data info dataset",
     "data verify dataset",
     "data repair dataset",
@@ -123,6 +131,13 @@ VALUES: dict[str, tuple[str, ...]] = {
     "methods": ("eki",),
     "model": ("arm.xml",),
     "name": ("other",),
+    "config": ("gym.yaml",),
+    "joints": ("a,b",),
+    "motors": ("a,b",),
+    "observations": ("actions,commands",),
+    "observation_scales": ("2",),
+    "history": ("2",),
+    "command_range": ("0:1,0:1,0:1",),
     "nan_joint": ("FL_hip_joint",),
     "observers": ("watcher",),
     "out": ("elsewhere",),
@@ -245,6 +260,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "parameters.yaml").write_text(text, encoding="utf-8")
         distribution = json.dumps(udr_distribution("cartpole").to_json())
         (folder / "distribution.json").write_text(distribution, encoding="utf-8")
+        foreign_policy.mjlab_file(folder / "mjlab.onnx", Foreign())
+        (folder / "gym.onnx").write_bytes(Foreign().model().SerializeToString())
+        foreign_policy.write_yaml(folder / "gym.yaml", Foreign().gym_yaml())
         assert main("keys make --out made_keys --robot 192.168.1.20".split()) == 0
     return folder
 
@@ -277,6 +295,12 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     # The model is the test's own, and a shipped policy sound: neither needs a process that tries it first.
     monkeypatch.setattr("deal_hw.policies.trial.check_policy", lambda path, _: OnnxPolicy(path))
     monkeypatch.setattr("deal_hw.sim.engine.compiling._try", lambda path: None)
+
+    def tried(path: Path, description: Any, say: Any) -> Any:
+        did.append(str(foreign_policy.spec_of_file(path)))
+        raise SeenError
+
+    monkeypatch.setattr("deal_hw.workflows.policy._tried", tried)
     experiment = types.SimpleNamespace(afresh=note("afresh"), space=None, refused=0)
     demos = [importlib.import_module(f"deal_hw.cli.demo_{robot}") for robot in ("cartpole", "go2")]
     emulated = contextlib.nullcontext(types.SimpleNamespace(port="p"))

@@ -86,6 +86,7 @@ REQUIRED: dict[str, Any] = {
     "name": "n",
     "model": Path("m"),
     "env": "a:B-v0",
+    "policy": Path("p.onnx"),
 }
 
 

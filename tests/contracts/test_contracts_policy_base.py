@@ -17,10 +17,8 @@ from deal_hw.policy import (
     ObservationTerm,
     PolicySpec,
     base_features,
-    in_base_frame,
-    rotation_between,
-    rotation_vector,
 )
+from deal_hw.rotations import in_base_frame, rotation_between, rotation_vector
 
 J = len(DESCRIPTION.joint_names)
 

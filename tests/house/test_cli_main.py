@@ -96,7 +96,7 @@ def test_unknown_verb_lists_the_verbs_and_the_nearest(capsys: pytest.CaptureFixt
     assert out == ""
     assert err == (
         "deal-hw: error: unknown verb 'calibrat'; known: collect, calibrate, train, deploy, inspect, demo, "
-        "design-excitation, emulate, bridge, keys, robot, data, replay, stop, doctor, bench; "
+        "design-excitation, emulate, bridge, keys, robot, policy, data, replay, stop, doctor, bench; "
         "did you mean 'calibrate'?\n"
     )
 

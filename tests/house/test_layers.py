@@ -23,6 +23,7 @@ VOCABULARY = (
     "on_use",
     "documentation",
     "ranges",
+    "rotations",
     "child_process",
     "signals",
     "version",

@@ -28,8 +28,9 @@ from deal_hw.policies.demonstration import (
 from deal_hw.policies.go2_env import walk_spec
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policy import Observation, PolicySpec, in_base_frame
+from deal_hw.policy import Observation, PolicySpec
 from deal_hw.robots import parameter_spaces, robot_description, training_task
+from deal_hw.rotations import in_base_frame
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
 from deal_hw.sim.recordings.target import TargetRecording, record_target

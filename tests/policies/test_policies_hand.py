@@ -13,8 +13,9 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.demonstration import Demonstration
 from deal_hw.policies.hand_env import HandEnv, TurnTask, turn_spec
 from deal_hw.policies.locomotion import judge
-from deal_hw.policy import Observation, rotation_between
+from deal_hw.policy import Observation
 from deal_hw.robots import parameter_spaces, robot_description
+from deal_hw.rotations import rotation_between
 from deal_hw.types import FloatArray
 
 HAND = robot_description("allegro")

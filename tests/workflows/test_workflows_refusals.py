@@ -17,10 +17,16 @@ from deal_hw.ranges import option
 from deal_hw.workflows.emulation.process import arguments
 
 POSITIONAL = ("robot", "episode", "model")
-LINES = {"new_robot": ["robot", "new"], "check_robot": ["robot", "check"]}
+LINES = {
+    "new_robot": ["robot", "new"],
+    "check_robot": ["robot", "check"],
+    "import_policy": ["policy", "import"],
+    "check_policy": ["policy", "check"],
+}
 """Functions that are part of a verb."""
 CARTPOLE: dict[str, Any] = {"robot": "cartpole", "port": "no-port"}
 COLLECT = {**CARTPOLE, "out": "out"}
+IMPORT: dict[str, Any] = {"policy": "p.onnx", "robot": "go2", "out": "w.onnx"}
 SWEEP = {"robot": "cartpole", "out": "e.json"}
 
 TABLE: list[tuple[str, dict[str, Any], str]] = [
@@ -44,6 +50,10 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("new_robot", {"model": "m.xml"}, "model m.xml does not exist"),
     ("new_robot", {"model": "m.xml", "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 0.001 to"),
     ("check_robot", {"robot": "r.yaml"}, "r.yaml cannot be read: there is no such file"),
+    ("check_policy", {"policy": "none.onnx"}, "no such policy file: none.onnx"),
+    ("import_policy", {**IMPORT, "policy": "none.onnx"}, "no such file: none.onnx"),
+    ("import_policy", {**IMPORT, "robot": "go3"}, "unknown robot 'go3'; known: "),
+    ("import_policy", {**IMPORT, "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 1 to 1000 Hz"),
     ("deploy", {**CARTPOLE, "robot": "so101"}, "so101"),
     ("deploy", {**CARTPOLE, "policy": "none.onnx"}, "none.onnx"),
     ("deploy", {**CARTPOLE, "episodes": 0}, "--episodes 0: allowed are 1 to 10000"),
@@ -163,7 +173,7 @@ def as_words(verb: str, given: dict[str, Any]) -> list[str]:
     for name, value in given.items():
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             words += arguments(value, type(value)())
-        elif name in POSITIONAL:
+        elif name in (("policy",) if verb.endswith("_policy") else POSITIONAL):
             words.append(value)
         else:
             words += [option(name)] if value is True else [option(name), str(value)]

@@ -152,6 +152,11 @@ def _refuse_unseen(table: Table, spec: PolicySpec) -> None:
             f"--policy: the policy for {spec.robot!r} observes a clock, or a requested velocity or "
             "orientation, which recordings do not hold; record its commands, or leave --policy out"
         )
+    if spec.recurrent:
+        raise ConfigurationError(
+            f"--policy: the network of the policy for {spec.robot!r} has a memory of its own, which "
+            "recordings do not hold; record its commands, or leave --policy out"
+        )
     if spec.observes_base and (table.base_position is None or table.orientation is None):
         raise ConfigurationError(
             f"--policy: the policy for {spec.robot!r} observes a base, whose state {table.name} does not "
@@ -210,6 +215,7 @@ def _choices(
 
     spec = policy.spec
     centre, scale = _commands_of(spec, facts)
+    low, high = np.array(spec.target_range or ((-np.inf, np.inf),)).T
     number = np.round((table.time_s - table.time_s[0]) / period_s).astype(np.int64)
     position, velocity = _states(table, every)
     sound = np.isfinite(position).all(axis=1) & np.isfinite(velocity).all(axis=1)
@@ -219,9 +225,9 @@ def _choices(
         command = np.empty((len(rows), len(spec.actuated)))
         for k, row in enumerate(rows):
             observation = builder.build(position[row], velocity[row])
-            action = np.clip(policy.act_batch(observation[None])[0], -1.0, 1.0)
+            action = np.clip(policy.act_batch(observation[None])[0], -spec.action_limit, spec.action_limit)
             builder.record_action(action)
-            command[k] = centre + scale * action
+            command[k] = np.clip(centre + scale * action, low, high)
         # Before, its memory holds states that were not recorded.
         yield _Ticks(first, rows[spec.history :], command[spec.history :])
 
@@ -232,6 +238,8 @@ def _commands_of(spec: PolicySpec, facts: JointFacts) -> tuple[FloatArray, Float
     joints = [facts.names.index(name) for name in spec.actuated]
     if not facts.servo[joints].any():
         return np.zeros(len(joints)), scale * facts.full_effort[joints]
+    if spec.action_offset:
+        return np.array(spec.action_offset), scale
     places = [spec.joint_names.index(name) for name in spec.actuated]
     return np.array(spec.default_position)[places], scale
 

@@ -26,7 +26,7 @@ from deal_hw.motions.velocity import (
     limited_axes,
     make_source,
 )
-from deal_hw.policy import VERDICT, Policy
+from deal_hw.policy import IMPORTED, VERDICT, Policy, PolicySpec
 from deal_hw.schema import OPEN, from_values, plain
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.running.view import RunView
@@ -167,13 +167,9 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
             digests.append(policy.digest)
             verdict = policy.spec.training.get(VERDICT)
             if verdict == "red" and not plan.trust_calibration:
-                _ask(Path(plan.policy), view or RunView())
+                _ask(Path(plan.policy), policy.spec, view or RunView())
             elif verdict == "amber" and not plan.trust_calibration and view is not None:
-                view.warn(
-                    f"{Path(plan.policy).name} was trained under a calibration with an amber verdict: the "
-                    "calibrated model does not explain all of the robot's motion; read the alarms in its "
-                    "report, and be ready to stop the robot (Ctrl-C)"
-                )
+                view.warn(_amber(Path(plan.policy), policy.spec))
             walks = plan.motion not in ("excite", "rich")
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
             if limited and view is not None:
@@ -187,21 +183,52 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
     return dataclasses.replace(plan, policy_digest=digests[-1])
 
 
-def _ask(policy: Path, view: RunView) -> None:
-    """Ask whether to run a policy whose calibration has a red verdict.
+def _amber(policy: Path, spec: PolicySpec) -> str:
+    """Return the warning about a policy with an amber verdict."""
+    imported = _import_of(spec)
+    if imported is not None:
+        return (
+            f"{policy.name} was imported, but could not be tried in the simulator "
+            f"({imported.get('untried')}): nothing shows that joint order, signs and scales are right; hold "
+            "or hang the robot, and be ready to stop it (Ctrl-C)"
+        )
+    return (
+        f"{policy.name} was trained under a calibration with an amber verdict: the calibrated model does not "
+        "explain all of the robot's motion; read the alarms in its report, and be ready to stop the robot "
+        "(Ctrl-C)"
+    )
+
+
+def _ask(policy: Path, spec: PolicySpec, view: RunView) -> None:
+    """Ask whether to run a policy with a red verdict.
 
     Raises:
         PolicyError: The answer is no, or no operator can answer.
     """
-    seen = (
-        f"{policy.name} was trained under a calibration with a red verdict: the calibrated model predicts "
-        "the robot worse than the original one, or no held-out data show that it is better"
-    )
+    imported = _import_of(spec)
+    if imported is not None:
+        seen = (
+            f"{policy.name} was imported although it failed in the simulator ({imported.get('fault')}): a "
+            "joint order, a sign or a scale may be wrong"
+        )
+        do = "import it again with what its training used"
+    else:
+        seen = (
+            f"{policy.name} was trained under a calibration with a red verdict: the calibrated model "
+            "predicts the robot worse than the original one, or no held-out data show that it is better"
+        )
+        do = "calibrate again and retrain"
     answer = view.confirm(f"warning: {seen}", "run it all the same?")
     if answer is None:
-        raise PolicyError(f"{seen}; calibrate again and retrain, or run it with --trust-calibration")
+        raise PolicyError(f"{seen}; {do}, or run it with --trust-calibration")
     if not answer:
-        raise PolicyError("not run; calibrate again and retrain")
+        raise PolicyError(f"not run; {do}")
+
+
+def _import_of(spec: PolicySpec) -> Mapping[str, Any] | None:
+    """Return the record of an import; None for a policy that was trained here."""
+    found = spec.training.get(IMPORTED)
+    return found if isinstance(found, Mapping) else None
 
 
 def _open_policy(plan: RunPlan) -> Policy:

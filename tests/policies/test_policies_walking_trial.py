@@ -1,0 +1,173 @@
+"""A walk in the simulator tells a sound policy from one with exchanged joints or a wrong sign."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.policies import walking_trial
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policies.walking_trial import (
+    WalkingReport,
+    can_try,
+    describe_command,
+    trial_commands,
+    try_walking,
+)
+from deal_hw.policy import Observation, ObservationTerm, PolicySpec
+from deal_hw.types import FloatArray
+from deal_hw.workflows.shipped import required_policy
+
+SHIPPED = OnnxPolicy(required_policy("go2"))
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A walk half as long, of half as many robots, shows the same."""
+    monkeypatch.setattr(walking_trial, "SECONDS", 3.0)
+    monkeypatch.setattr(walking_trial, "ROBOTS", 2)
+
+
+class Wrong:
+    """The shipped policy as it would be after a wrong import.
+
+    Args:
+        joints: By a joint's name the one that it is taken for.
+        flipped: Which entries of the observation have the wrong sign.
+        reversed: Which joints move the wrong way.
+    """
+
+    def __init__(
+        self,
+        joints: Mapping[str, str] | None = None,
+        flipped: Callable[[ObservationTerm], bool] = lambda term: False,
+        reversed: Callable[[str], bool] = lambda name: False,
+    ) -> None:
+        own, taken = SHIPPED.spec, dict(joints or {})
+        terms = tuple(
+            dataclasses.replace(term, joint=taken.get(term.joint, term.joint)) for term in own.observation
+        )
+        self.spec = dataclasses.replace(own, observation=terms)
+        source = {taken.get(name, name): i for i, name in enumerate(own.actuated)}
+        self._order = [source[name] for name in own.actuated]
+        self._into = np.array([-1.0 if flipped(term) else 1.0 for term in own.observation])
+        self._out = np.array([-1.0 if reversed(name) else 1.0 for name in own.actuated])
+
+    def reset(self) -> None:
+        """No memory to clear."""
+
+    def act_batch(self, observations: Observation) -> FloatArray:
+        """Act."""
+        asked = (observations * self._into).astype(np.float32)
+        return np.asarray(SHIPPED.act_batch(asked)[:, self._order] * self._out)
+
+
+def exchanged(one: str, other: str) -> dict[str, str]:
+    """Return the joints of two legs, each taken for that of the other."""
+    parts = ("hip", "thigh", "calf")
+    pairs = [(f"{one}_{part}_joint", f"{other}_{part}_joint") for part in parts]
+    return {a: b for pair in pairs for a, b in (pair, pair[::-1])}
+
+
+def test_the_shipped_policy_walks() -> None:
+    """It stays up at all commands, and follows them."""
+    report = try_walking(SHIPPED, DRIVER)
+    assert report.faults() == ()
+    assert report.up == 1.0 and report.clipped < 0.1
+    assert [walk.up for walk in report.standing] == [1.0] * 7
+    followed = [walk.followed for walk in report.walks[1:]]
+    assert min(followed) > 0.5
+    # A robot that stands still follows nothing: the score's zero.
+    assert max(abs(walk.followed) for walk in report.standing) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("wrong", "commands"),
+    [
+        (Wrong(exchanged("FL", "FR")), 3),
+        (Wrong(exchanged("FL", "RL")), 2),
+        (Wrong({**exchanged("FL", "FR"), **exchanged("RL", "RR")}), 3),
+        (Wrong(flipped=lambda term: term.quantity == "angular_velocity"), 3),
+        (Wrong(flipped=lambda t: "hip" in t.joint, reversed=lambda name: "hip" in name), 3),
+        (Wrong(flipped=lambda term: term.quantity == "velocity"), 3),
+    ],
+    ids=["front legs", "left legs", "sides", "gyro", "hips", "velocities"],
+)
+def test_exchanged_legs_and_wrong_signs_are_caught(wrong: Wrong, commands: int) -> None:
+    """They fall, or do not go where they should, at several commands."""
+    faults = try_walking(wrong, DRIVER).faults()
+    assert len(faults) >= commands
+    assert all("falls after" in fault or "of the command" in fault for fault in faults)
+
+
+def test_one_flipped_axis_of_the_command_is_caught() -> None:
+    """The robot walks well, and turns the wrong way."""
+    report = try_walking(Wrong(flipped=lambda t: (t.quantity, t.joint) == ("command", "z")), DRIVER)
+    assert report.up == 1.0
+    assert len(report.faults()) == 2 and all(fault.startswith("turn") for fault in report.faults())
+
+
+def test_a_policy_that_stands_still_follows_nothing() -> None:
+    """It never falls; the score against standing still is zero."""
+
+    class Still(Wrong):
+        def act_batch(self, observations: Observation) -> FloatArray:
+            return np.zeros((len(observations), 12))
+
+    report = try_walking(Still(), DRIVER)
+    assert report.up == 1.0 and len(report.faults()) == 6
+
+
+def test_the_same_trial_gives_the_same_result() -> None:
+    """Its draws are fixed."""
+
+    def walk() -> WalkingReport:
+        return try_walking(SHIPPED, DRIVER, threads=1)
+
+    assert walk() == walk()
+
+
+@pytest.mark.parametrize(
+    ("ranges", "wanted"),
+    [
+        (
+            ((-1.0, 1.0), (-0.4, 0.4), (0.0, 0.0)),
+            ["stand", "ahead 0.5 m/s", "back 0.5 m/s", "left 0.4 m/s", "right 0.4 m/s"],
+        ),
+        (((0.2, 0.3), (0.0, 0.0), (0.0, 0.0)), ["stand", "ahead 0.3 m/s", "ahead 0.2 m/s"]),
+        (((0.0, 0.0),) * 3, ["stand"]),
+    ],
+)
+def test_commands_stay_in_the_training_range(
+    ranges: tuple[tuple[float, float], ...], wanted: list[str]
+) -> None:
+    """A direction that was not trained is not asked for."""
+    spec = dataclasses.replace(SHIPPED.spec, command_range=ranges)
+    assert [describe_command(command) for command in trial_commands(spec)] == wanted
+
+
+def test_who_cannot_walk_is_not_tried() -> None:
+    """A robot with a fixed base, and a policy that follows no velocity."""
+    still = dataclasses.replace(
+        SHIPPED.spec,
+        observation=tuple(t for t in SHIPPED.spec.observation if t.quantity != "command"),
+    )
+    cases: list[tuple[PolicySpec, RobotDescription, str]] = [
+        (SHIPPED.spec, DRIVER, ""),
+        (still, DRIVER, "the policy follows no commanded velocity"),
+        (SHIPPED.spec, CARTPOLE, "robot 'cartpole' does not walk"),
+    ]
+    for spec, description, said in cases:
+        assert can_try(spec, description) == said
+
+
+def test_the_shipped_file_is_there() -> None:
+    """The tests above stand on it."""
+    assert Path(SHIPPED.path).is_file()
