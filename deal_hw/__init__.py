@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from deal_hw.workflows.emulate import emulate as emulate
     from deal_hw.workflows.inspect import Inspection as Inspection
     from deal_hw.workflows.inspect import inspect as inspect
+    from deal_hw.workflows.own_robot.check import RobotCheck as RobotCheck
+    from deal_hw.workflows.own_robot.check import check_robot as check_robot
+    from deal_hw.workflows.own_robot.new import new_robot as new_robot
     from deal_hw.workflows.policy import PolicyReport as PolicyReport
     from deal_hw.workflows.policy import check_policy as check_policy
     from deal_hw.workflows.policy import import_policy as import_policy
     from deal_hw.workflows.replay import replay as replay
-    from deal_hw.workflows.robot import RobotCheck as RobotCheck
-    from deal_hw.workflows.robot import check_robot as check_robot
-    from deal_hw.workflows.robot import new_robot as new_robot
     from deal_hw.workflows.running.report import RunReport as RunReport
     from deal_hw.workflows.running.settings import Go2LinkOptions as Go2LinkOptions
     from deal_hw.workflows.running.settings import LegOptions as LegOptions
@@ -59,7 +59,8 @@ _EXPORTS = {
     "workflows.inspect": ("inspect", "Inspection"),
     "workflows.policy": ("import_policy", "check_policy", "PolicyReport"),
     "workflows.replay": ("replay",),
-    "workflows.robot": ("check_robot", "new_robot", "RobotCheck"),
+    "workflows.own_robot.check": ("check_robot", "RobotCheck"),
+    "workflows.own_robot.new": ("new_robot",),
     "workflows.running.report": ("RunReport",),
     "workflows.running.settings": ("LinkOptions", "Go2LinkOptions", "LegOptions", "SimulationOptions"),
     "workflows.stop": ("stop", "StopReport"),

@@ -3,8 +3,9 @@
     python tools/check_clients.py FOLDER
     python tools/check_clients.py FOLDER --only can_simple.py read_write.py --transcript clients.md
 
-FOLDER holds your own checkouts: ODriveResources (odriverobotics), DynamixelSDK (ROBOTIS-GIT), lerobot
-(huggingface, v0.4.4: later versions need Python 3.12) and unitree_sdk2_python (unitreerobotics). What is not
+FOLDER holds your own checkouts: ODriveResources (odriverobotics), DynamixelSDK (ROBOTIS-GIT),
+FTServo_Python (ftservo), lerobot (huggingface, v0.4.4: later versions need Python 3.12) and
+unitree_sdk2_python (unitreerobotics). What is not
 there is left out. Programs run unchanged, but for the port or bus that they open by name
 (tools/clients/sitecustomize.py), in a terminal where this tool presses the keys. Each has its own emulator. A
 program that fails is run again, up to three times in all, because its time limits are short for a busy
@@ -19,6 +20,7 @@ multicast, which a network of its own allows:
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -50,7 +52,9 @@ from deal_hw.drivers.cartpole.wire.odrive_frames import (
 )
 from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
 from deal_hw.errors import TransportError
+from deal_hw.robots import recorded_description
 from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.own_robot.new import new_robot
 
 TOOLS = Path(__file__).resolve().parent / "clients"
 _TRIES = 3
@@ -146,12 +150,24 @@ def run_in_terminal(
     return output.replace("\r\n", "\n").replace("\r", "\n"), code
 
 
-def prepare(client: Client, port: str, folder: Path) -> None:
-    """Do what a user does before the program: write its files, set the device up."""
+def write_files(client: Client, folder: Path) -> None:
+    """Write what a program, or its emulator, reads."""
     if "endpoints" in client.files:
         (folder / "flat_endpoints.json").write_text(json.dumps(flat_endpoints()))
     if "config" in client.files:
         (folder / "config.json").write_text(json.dumps(_CONFIG))
+    if "so101" in client.files:
+        motor = {"drive_mode": 0, "homing_offset": 0, "range_min": 0, "range_max": 4095}
+        names = recorded_description("so101").joint_names
+        motors = {name: {"id": number, **motor} for number, name in enumerate(names, start=1)}
+        calibration = folder / "so101.json"
+        calibration.write_text(json.dumps(motors))
+        mjcf = recorded_description("so101").mjcf
+        new_robot(mjcf, lerobot=calibration, out=folder / "robot.yaml", name="my so101")
+
+
+def prepare(client: Client, port: str) -> None:
+    """Do what a user does before the program: set the device up."""
     if client.prepare == "velocity":
         with can.interface.Bus(port, interface="slcan", bitrate=_BITRATE, sleep_after_open=0.1) as bus:
             for command, values in (
@@ -193,11 +209,14 @@ def check(client: Client, folder: Path, python: Path) -> Run:
 
 
 def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
-    with tempfile.TemporaryDirectory() as name, EmulatorProcess(*client.emulator) as emulator:
-        work = Path(name)
+    with contextlib.ExitStack() as stack:
+        work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        write_files(client, work)
+        words = [word.format(folder=work) for word in client.emulator]
+        emulator = stack.enter_context(EmulatorProcess(*words))
         port = emulator.port.partition("?")[0].removeprefix("slcan:")
-        prepare(client, port, work)
-        places = {"source": folder / client.source, "port": port, "tools": TOOLS}
+        prepare(client, port)
+        places = {"source": folder / client.source, "port": port, "tools": TOOLS, "folder": work}
         command = [str(python), "-u", *(part.format(**places) for part in client.command)]
         paths = [TOOLS, *(folder / path for path in client.paths)]
         environment = os.environ | {

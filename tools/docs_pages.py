@@ -46,13 +46,8 @@ API_NAMES = {
         "WireOptions",
     ),
     "Check and stop a robot": ("doctor", "stop", "StopReport"),
-    "Emulate and describe a robot": (
-        "emulate",
-        "EmulatedRobot",
-        "new_robot",
-        "check_robot",
-        "RobotCheck",
-    ),
+    "Emulate a robot": ("emulate", "EmulatedRobot"),
+    "Describe a robot": ("new_robot", "check_robot", "RobotCheck"),
     "Train and inspect": ("train", "Training", "inspect", "Inspection"),
     "Policies of others": ("import_policy", "check_policy", "PolicyReport"),
 }

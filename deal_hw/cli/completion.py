@@ -83,6 +83,11 @@ def completion(shell: str, verbs: Mapping[str, Verb]) -> str:
         config = getattr(importlib.import_module(verb.module), verb.config)
         table = (config if isinstance(config, Kinds) else one_kind(config)).table()
         found = {word: list(options_of(kind.settings).values()) for word, kind in table.items()}
+        for word, kind in table.items():
+            base = kind.usage.partition(" ")[0]
+            if kind.compound and base in found and word != base:
+                # One of its options makes it this kind.
+                found[base] = list({one.name: one for one in (*found[base], *found[word])}.values())
         first = [one for one in found.get("", ()) if one.positional and one.choices][:1]
         # A kind that a word and an option name together is found behind that word.
         own = [word for word, kind in table.items() if word and not kind.compound]

@@ -2,48 +2,93 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
-from deal_hw.workflows.kinds import InputKind, sub_verbs
-from deal_hw.workflows.robot import CheckRobotSettings, NewRobotSettings, RobotCheck, check_robot, new_robot
-
-
-@dataclass(frozen=True, kw_only=True)
-class New(NewRobotSettings):
-    """Write a robot.yaml from an MJCF: joints, units, gains, ranges, effort limits."""
-
-    model: tyro.conf.Positional[Path]
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
+from deal_hw.workflows.own_robot.check import (
+    CHECK_ROBOT,
+    CheckBusSettings,
+    CheckRobotSettings,
+    RobotCheck,
+    check_robot,
+)
+from deal_hw.workflows.own_robot.new import (
+    NEW_ROBOT,
+    NewFromBusSettings,
+    NewFromLeRobotSettings,
+    NewRobotSettings,
+    new_robot,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check(CheckRobotSettings):
     """Compare a robot.yaml with its MJCF, list what is missing, and simulate a second of holding."""
 
+    # Settings without options have no argument beside them that shows it to be one.
     robot: tyro.conf.Positional[Path]
 
 
-KINDS = sub_verbs(
-    new=InputKind(New, example="new robot.xml"),
-    check=InputKind(Check, example="check robot.yaml"),
-)
+_VERBS = {"new": NEW_ROBOT, "check": CHECK_ROBOT}
 
 
-def robot(config: New | Check) -> int | RobotCheck:
+def _table() -> Mapping[str, InputKind]:
+    table = {
+        _word(verb, name): kind for verb, kinds in _VERBS.items() for name, kind in kinds.table().items()
+    }
+    table["check"] = dataclasses.replace(table["check"], settings=Check)
+    return table
+
+
+def _find(arguments: Arguments) -> str:
+    verb = "" if arguments.first is None else str(arguments.first)
+    return _word(verb, _VERBS[verb].find(arguments)) if verb in _VERBS else verb
+
+
+def _word(verb: str, kind: str) -> str:
+    # The plain verb is the kind that no option names.
+    return f"{verb}-{kind}" if _VERBS[verb].table()[kind].usage else verb
+
+
+KINDS = Kinds(noun="sub-verb", table=_table, find=_find)
+
+
+def robot(
+    config: NewRobotSettings
+    | NewFromLeRobotSettings
+    | NewFromBusSettings
+    | CheckRobotSettings
+    | CheckBusSettings,
+) -> int | RobotCheck:
     """Run the verb.
 
     Returns:
         0, or the findings, whose exit code is 1 if a check failed.
 
     Raises:
-        ConfigurationError: A file cannot be used, or robot.yaml and MJCF contradict each other.
+        ConfigurationError: A file cannot be used, robot.yaml and MJCF contradict each other, or the servos
+            are not those of the arm.
+        DealHwError: The port cannot be opened, or its servos do not answer.
     """
-    if isinstance(config, Check):
-        found = check_robot(config.robot)
+    if isinstance(config, CheckRobotSettings):
+        found = check_robot(**vars(config))
         print(found.table())
         return found
     path = new_robot(**vars(config))
-    print(f"written: {path}; check its rates and limits, then: deal-hw robot check {path}")
+    check = f"deal-hw robot check {path}"
+    if isinstance(config, NewRobotSettings):
+        print(f"written: {path}; check its rates and limits, then: {check}")
+    elif isinstance(config, NewFromLeRobotSettings):
+        print(f"written: {path}; check its rates and limits")
+        print(
+            "Its zeros hold while the servos keep the homing offsets of this calibration. Compare them, and "
+            f"the directions, with the arm: {check} --port PORT --lerobot {config.lerobot} --by-hand"
+        )
+    else:
+        print(f"written: {path}; check its rates and limits, then: {check} --port {config.port}")
     return 0

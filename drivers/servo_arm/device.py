@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
-from deal_hw.drivers.servo_arm.families import DAMPING, ON
+from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
 from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
 from deal_hw.parameters import ParameterSpace
@@ -75,6 +75,7 @@ class ArmDevice:
         self._coming: deque[tuple[int, FloatArray]] = deque()
         self._tick = self._now_ns = 0
         self._held: dict[int, float] = {}
+        self._hands: dict[int, float] = {}
         self._sent: tuple[float, ...] = ()
         home = np.array(d.default_position)
         self._batch.set_state(home[None], np.zeros((1, len(home))))
@@ -88,6 +89,19 @@ class ArmDevice:
     def true_position(self) -> FloatArray:
         """True positions of the joints, (J,) [rad]; never on the wire."""
         return np.array(self._batch.position[0])
+
+    def turn(self, joint: str, position: float | None) -> None:
+        """Hold a joint at a position [rad] as by hand, from the next tick on; None lets it go.
+
+        Raises:
+            ValueError: Its motor has torque.
+        """
+        j = self._description.joint_names.index(joint)
+        if self.joints[j].torque != OFF and position is not None:
+            raise ValueError(f"{joint} has torque; nobody turns it by hand")
+        self._hands.pop(j, None)
+        if position is not None:
+            self._hands[j] = position
 
     @property
     def device_ns(self) -> int:
@@ -157,8 +171,18 @@ class ArmDevice:
         self._follow()
         self._command()
         self._batch.advance(self._setpoint[None, None, self._actuated])
+        self._hold()
         self._tick += 1
         self._sense()
+
+    def _hold(self) -> None:
+        """Leave the joints where hands hold them."""
+        self._hands = {j: at for j, at in self._hands.items() if self.joints[j].torque == OFF}
+        if self._hands:
+            held = list(self._hands)
+            position, velocity = self._batch.position.copy(), self._batch.velocity.copy()
+            position[0, held], velocity[0, held] = list(self._hands.values()), 0.0
+            self._batch.set_state(position, velocity)
 
     def _follow(self) -> None:
         """Take the servos' goals, which act after the latency."""

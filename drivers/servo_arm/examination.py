@@ -164,6 +164,6 @@ class ArmExamination:
         if found is None:
             raise TransportTimeoutError(
                 f"{self._where}: servo {servo.id} ({servo.joint}) answered a ping, but none of {_TRIES} "
-                "reads; the line is noisy, or another program uses the port"
+                "reads; two servos have this id, the line is noisy, or another program uses the port"
             )
         return found

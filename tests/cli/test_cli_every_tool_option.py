@@ -68,6 +68,7 @@ LINES = (
     "robot new arm.xml --out new.yaml",
     MJLAB,
     "policy import gym.onnx --config gym.yaml --robot go2 --out walk.onnx",
+    "robot new arm.xml --out new.yaml --lerobot calibration.json",
     "data info dataset",
     "data verify dataset",
     "data repair dataset",
@@ -115,11 +116,13 @@ VALUES: dict[str, tuple[str, ...]] = {
     "generations": ("7",),
     "holdout": ("hold.csv",),
     "hot_joint": ("FL_hip_joint",),
+    "joint_names": ("motor=shoulder",),
     "known": ("shoulder.damping", "0.3"),
     "latency": ("0.01",),
     "latency_range": ("0.001", "0.03"),
     "leave_out": ("fit.csv", "0.5", "1"),
     "link": ("link",),
+    "lerobot": ("calibration.json",),
     "listen": ("tls/127.0.0.1:7448",),
     "lost_joint": ("FL_hip_joint",),
     "low_hz": ("0.5",),
@@ -249,6 +252,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert main("robot new arm.xml --out arm.yaml --control-rate 50".split()) == 0
+        motor = {"id": 1, "drive_mode": 0, "homing_offset": 0, "range_min": 90, "range_max": 3990}
+        (folder / "calibration.json").write_text(json.dumps({"shoulder": motor}), encoding="utf-8")
         line = "data import fit.csv more.csv hold.csv --robot arm.yaml --out dataset"
         assert main(line.split()) == 0
         text = "parameters:\n  - {kind: dof_damping, elements: shoulder}\n"

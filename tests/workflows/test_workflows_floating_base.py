@@ -27,7 +27,7 @@ from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
-from deal_hw.workflows.robot import new_robot
+from deal_hw.workflows.own_robot.new import new_robot
 
 POLICY = ASSETS / "ant_udr.onnx"
 FACTORS = (1.5, 0.6)

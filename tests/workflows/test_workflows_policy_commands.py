@@ -25,7 +25,7 @@ from deal_hw.workflows.calibration.policy_commands import with_policy_commands
 from deal_hw.workflows.calibration.settings import FilesSettings, OwnDatasetSettings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
-from deal_hw.workflows.robot import new_robot
+from deal_hw.workflows.own_robot.new import new_robot
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import required_policy
 

@@ -47,6 +47,15 @@ def test_doctor_finds_the_servos_and_their_states(robot: Path, port: str) -> Non
     assert not [finding for finding in report.findings if finding.severity is Severity.FAIL]
 
 
+def test_robot_check_compares_file_and_servos(
+    robot: Path, port: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Through a real port: all answer, none is wrong."""
+    assert main(["robot", "check", str(robot), "--port", port]) == EXIT_OK
+    table = capsys.readouterr().out
+    assert f"all 2 answer on {port}" in table and "cycle: all servos answer after" in table
+
+
 def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Path) -> None:
     """The dataset holds the robot, by which calibrate finds its kind; the replay needs only the recording."""
     run = tmp_path / "run"

@@ -7,6 +7,8 @@ from typing import Final, Literal
 
 ODRIVE: Final = "ODriveResources/examples/"
 SERVOS: Final = "DynamixelSDK/python/tests/protocol2_0/"
+FEETECH: Final = "FTServo_Python/sms_sts/"
+SO101: Final = ("{folder}/robot.yaml", "--profile", "ideal", "--nominal")
 DYNAMIXEL: Final = ("cartpole", "--transport", "dynamixel", "--profile", "ideal")
 NEXT: Final = "Press any key"
 """What ROBOTIS' examples print before they wait for a key."""
@@ -21,15 +23,17 @@ class Client:
     Attributes:
         name: Its name in the table.
         source: File or folder below the user's folder that must be there.
-        command: Arguments after Python; ``{source}``, ``{port}`` and ``{tools}`` are replaced.
-        emulator: Arguments of ``deal-hw emulate``.
+        command: Arguments after Python; ``{source}``, ``{port}``, ``{tools}`` and ``{folder}``, its working
+            folder, are replaced.
+        emulator: Arguments of ``deal-hw emulate``; ``{folder}`` is replaced.
         opens: The port or bus that the program opens by name; "" if it takes it as an argument.
         paths: Folders below the user's folder for PYTHONPATH.
         packages: Packages that it needs beside those of deal-hw.
         own_python: Whether the user must name its Python, because no environment can be made for it here.
         prepare: What the user does before: "velocity" sets an ODrive to velocity control, "factory" resets
             servos, except id and rate.
-        files: Files in its working folder: "endpoints" and "config" of the emulated ODrive.
+        files: Files in its working folder: "endpoints" and "config" of the emulated ODrive, and "so101", an
+            SO-101's robot.yaml and LeRobot's calibration of it.
         servo_rate: Baud rate of the servos.
         keys: Pairs: what is printed, and the keys to press then; each once, in this order.
         must: Regular expressions that its output must contain.
@@ -48,7 +52,7 @@ class Client:
     packages: tuple[str, ...] = ()
     own_python: bool = False
     prepare: Literal["", "velocity", "factory"] = ""
-    files: tuple[Literal["endpoints", "config"], ...] = ()
+    files: tuple[Literal["endpoints", "config", "so101"], ...] = ()
     servo_rate: int = 57_600
     keys: tuple[tuple[str, str], ...] = ()
     must: tuple[str, ...] = ()
@@ -80,6 +84,19 @@ def _servos(name: str, rate: int = 57_600, **more: object) -> Client:
         opens="/dev/ttyUSB0",
         paths=("DynamixelSDK/python/src",),
         prepare="factory",
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def _feetech(name: str, **more: object) -> Client:
+    return Client(
+        name=f"sms_sts/{name}",
+        source=FEETECH + name,
+        command=("{source}",),
+        emulator=SO101,
+        opens="/dev/ttyUSB0",
+        paths=("FTServo_Python",),
+        files=("so101",),
         **more,  # type: ignore[arg-type]
     )
 
@@ -161,6 +178,35 @@ CLIENTS: Final = (
             r"position after half-turn homing: 2047",
             r"position after a move to 2400: 2(3[89]|4[01])\d",
         ),
+    ),
+    Client(
+        name="FeetechMotorsBus",
+        source="lerobot/src/lerobot/motors",
+        command=("{tools}/so_arm.py", "{port}", "{folder}/so101.json"),
+        emulator=SO101,
+        paths=("lerobot/src",),
+        packages=("deepdiff", "tqdm", "draccus", "accelerate", "datasets", "feetech-servo-sdk"),
+        files=("so101",),
+        must=(
+            r"calibrated: True P gains: \{'shoulder_pan': 16, .*'gripper': 16\}",
+            r"off by at most [0-3]\.",
+            "connected: False",
+        ),
+    ),
+    _feetech("ping.py", must=(r"\[ID:001\] ping Succeeded. SCServo model number : 777",)),
+    _feetech(
+        "read.py",
+        must=(r"\[ID:001\] PresPos:20[45]\d PresSpd:0",),
+        stop_after_s=3.0,
+        exit_codes=(130, 1, -2),
+        must_not=("[TxRxResult]", "[RxPacketError]"),
+    ),
+    _feetech(
+        "sync_read.py",
+        must=(r"\[ID:001\] PresPos:\d+ PresSpd:0", r"\[ID:006\] PresPos:\d+ PresSpd:0"),
+        stop_after_s=3.0,
+        exit_codes=(130, 1, -2),
+        must_not=("[RxPacketError]",),
     ),
     Client(
         name="go2_stand_example.py",
