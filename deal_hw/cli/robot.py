@@ -47,7 +47,10 @@ def _table() -> Mapping[str, InputKind]:
 
 def _find(arguments: Arguments) -> str:
     verb = "" if arguments.first is None else str(arguments.first)
-    return _word(verb, _VERBS[verb].find(arguments)) if verb in _VERBS else verb
+    if verb in _VERBS:
+        return _word(verb, _VERBS[verb].find(arguments))
+    # A kind that an option names has no word of its own.
+    return "" if verb in _table() else verb
 
 
 def _word(verb: str, kind: str) -> str:

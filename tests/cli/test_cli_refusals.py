@@ -416,7 +416,11 @@ def mistyped() -> Iterator[tuple[str, str]]:
             continue
         for word, kind in config.table().items():
             # Some kinds are found from another option or from a file; their tests are with their verbs.
-            if ".yaml" in (kind.usage or word) or config.choose(Arguments(word, {}))[0] != word:
+            if (
+                kind.compound
+                or ".yaml" in (kind.usage or word)
+                or config.choose(Arguments(word, {}))[0] != word
+            ):
                 continue
             by_option = kind.usage.startswith("--")
             stated = kind.usage.split()[0].removeprefix("--") if by_option else config.argument
