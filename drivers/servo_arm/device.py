@@ -71,7 +71,7 @@ class ArmDevice:
         self._dofs = list(robot.qvel)
         self._rng = np.random.default_rng((truth.seed, 2))
         self._tick_ns = round(1e9 / d.device_rate_hz)
-        self._latency = math.ceil(truth.latency_s * d.device_rate_hz - 1e-6)
+        self._latency_ns = round(1e9 * truth.latency_s)
         self._coming: deque[tuple[int, FloatArray]] = deque()
         self._tick = self._now_ns = 0
         self._held: dict[int, float] = {}
@@ -144,6 +144,7 @@ class ArmDevice:
         self.received_bytes += len(data)
         self._sense()
         self.bus.receive(data)
+        self._take_goals(self._now_ns)
 
     def advance_to(self, device_ns: int) -> bytes:
         """Run all ticks and answers up to and including a time [ns]; return the bytes sent meanwhile."""
@@ -169,7 +170,7 @@ class ArmDevice:
         now_ns = self._tick * self._tick_ns
         for joint in self.joints:
             joint.tick(now_ns, now_ns - self.bus.alive_ns)
-        self._follow()
+        self._follow(now_ns)
         self._command()
         self._batch.advance(self._setpoint[None, None, self._actuated])
         self._hold()
@@ -185,14 +186,19 @@ class ArmDevice:
             position[0, held], velocity[0, held] = list(self._hands.values()), 0.0
             self._batch.set_state(position, velocity)
 
-    def _follow(self) -> None:
-        """Take the servos' goals, which act after the latency."""
+    def _take_goals(self, now_ns: int) -> None:
+        """Take the servos' goals; they act from the first physics step that begins after the latency."""
         goals = np.array([joint.goal for joint in self.joints])
         zeros = np.array([servo.zero for servo in self._servos])
         wanted = self._direction * (goals - zeros) * _RAD
         if not np.array_equal(wanted, self._wanted):
             self._wanted = wanted
-            self._coming.append((self._tick + self._latency, wanted))
+            due = math.ceil((now_ns + self._latency_ns) / self._tick_ns - 1e-6)
+            self._coming.append((max(due, self._coming[-1][0] if self._coming else 0), wanted))
+
+    def _follow(self, now_ns: int) -> None:
+        """Let the goals act that are due."""
+        self._take_goals(now_ns)
         while self._coming and self._coming[0][0] <= self._tick:
             self._setpoint = self._coming.popleft()[1].copy()
 

@@ -91,6 +91,23 @@ def rig(tmp_path: Path, bus: str) -> Rig:
     return Rig(tmp_path, bus)
 
 
+def test_the_emulators_latency_is_the_truths(tmp_path: Path, bus: str) -> None:
+    """A goal acts from the first physics step of 2 ms that begins 5 ms after its reception."""
+    rig = Rig(tmp_path, bus)
+    device = rig.device
+    device._latency_ns = 5_000_000
+    for received_ns, acts_ns in (
+        (1_000_000_000, 1_006_000_000),
+        (2_000_300_000, 2_006_000_000),
+        (3_001_000_000, 3_006_000_000),
+        (4_001_100_000, 4_008_000_000),
+    ):
+        device.advance_to(received_ns)
+        rig.servos[1].put(GOAL[bus], 2000 + received_ns // 1_000_000_000)
+        device.receive(b"")
+        assert device._coming[-1][0] * 2_000_000 == acts_ns
+
+
 def test_both_directions_of_mounting(rig: Rig) -> None:
     """Both joints go where they are told, though one servo is mounted the other way round."""
     rig.armed()
