@@ -37,7 +37,8 @@ def zenoh_claim(port: str, options: WireOptions) -> str:
 
 def path_is_local(port: str) -> bool:
     """Return whether a serial port is a pseudo-terminal, or an emulator's link to one."""
-    return _resolved(port.partition("?")[0]).startswith("/dev/pts/")
+    # A link in the working folder has no slash.
+    return os.path.realpath(port.partition("?")[0]).startswith("/dev/pts/")
 
 
 def can_is_local(port: str) -> bool:

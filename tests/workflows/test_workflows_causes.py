@@ -58,10 +58,12 @@ def test_a_port_says_whether_there_is_a_cable(transport: str, port: str, local: 
     assert on_this_computer(transport, port) is local
 
 
-def test_a_link_to_an_emulator_is_followed(tmp_path: Path) -> None:
+def test_a_link_to_an_emulator_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`emulate --link` makes one."""
     (tmp_path / "robot").symlink_to("/dev/pts/7")
     assert on_this_computer("serial", str(tmp_path / "robot"))
+    monkeypatch.chdir(tmp_path)
+    assert on_this_computer("serial", "robot")
 
 
 @pytest.mark.parametrize(("flag", "reported"), [("state_stale", True), ("velocity", False)])
