@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.motions.behaviours import ActionMap
 from deal_hw.motions.scores.balance import TASK_SECONDS, BalanceResult, balance_result
 from deal_hw.parameters import ParameterSpace
 from deal_hw.policies.demonstration import BatchPolicy
@@ -51,15 +52,15 @@ def evaluate_batch(
     start = home if start_position is None else start_position
     loop.restart(np.ones(count, dtype=bool), theta, latency_s, start, np.zeros_like(home), rng)
     builder = ObservationBuilder(spec, (count,))
-    default = home[:, list(description.actuated_index)]
+    mapped = ActionMap(spec, description)
     positions, velocities = [], []
     lost = np.zeros(count, dtype=bool)
     for _ in range(round(seconds * description.control_rate_hz)):
         observation = builder.build(loop.reported_position, loop.reported_velocity)
-        action = np.clip(policy.act_batch(observation), -1.0, 1.0)
+        action = mapped.action(policy.act_batch(observation))
         builder.record_action(action)
         # A robot whose physics diverged reports the home pose, which is perfect balance. It counts as fallen.
-        lost |= loop.step(default + np.array(spec.action_scale) * action, rng)
+        lost |= loop.step(mapped.target(action), rng)
         positions.append(np.where(lost[:, None], (0.0, np.pi), loop.reported_position))
         velocities.append(np.where(lost[:, None], 0.0, loop.reported_velocity))
     position, velocity = np.stack(positions, axis=1), np.stack(velocities, axis=1)

@@ -159,17 +159,18 @@ def describe_command(command: Sequence[float]) -> str:
 
 
 def try_walking(
-    policy: TriedPolicy, description: RobotDescription, *, threads: int | None = None
+    policy: TriedPolicy, description: RobotDescription, *, seed: int = SEED, threads: int | None = None
 ) -> WalkingReport:
     """Let simulated robots walk with a policy, and others stand still.
 
     Args:
         policy: The policy.
         description: The robot, as its driver describes it; :func:`can_try` must allow it.
+        seed: Seeds latency and noise.
         threads: Threads of the physics; None for all CPUs.
     """
     commands = trial_commands(policy.spec)
-    run = _Run(policy.spec, description, commands, threads)
+    run = _Run(policy.spec, description, commands, seed, threads)
     walks = run.walks(policy)
     clipped = run.clipped
     return WalkingReport(walks=walks, standing=run.walks(None), clipped=clipped)
@@ -183,9 +184,10 @@ class _Run:
         spec: PolicySpec,
         description: RobotDescription,
         commands: Sequence[tuple[float, float, float]],
+        seed: int,
         threads: int | None,
     ) -> None:
-        self._spec, self._description, self._commands = spec, description, commands
+        self._spec, self._description, self._commands, self._seed = spec, description, commands, seed
         self._wanted = np.repeat(np.array(commands), ROBOTS, axis=0)
         self._count = len(self._wanted)
         self._loop = ServoLoop(description, ParameterSpace([]), self._count, threads=threads)
@@ -196,7 +198,7 @@ class _Run:
 
     def walks(self, policy: TriedPolicy | None) -> tuple[WalkAtCommand, ...]:
         """Return how the robots do with a policy; without one they hold their default pose."""
-        rng = np.random.default_rng(SEED)
+        rng = np.random.default_rng(self._seed)
         loop, description, count = self._loop, self._description, self._count
         home = np.repeat(np.array(description.default_position)[None], count, axis=0)
         stand = home[:, list(description.actuated_index)]

@@ -75,7 +75,7 @@ def policy(config: PolicyImport | PolicyCheck | PolicyShow) -> int | PolicyRepor
         return 0
     say: Say = print
     if isinstance(config, PolicyCheck):
-        report = check_policy(config.policy, say=say)
+        report = check_policy(**{**vars(config), "say": say})
         _print_faults(report)
         return report
     report = import_policy(**{**vars(config), "say": say})

@@ -121,6 +121,9 @@ class CheckPolicySettings:
     policy: File = field(kw_only=False)
     """The policy (.onnx), as `deal-hw deploy` takes it."""
 
+    robot: str = ""
+    """The robot; by default that of the policy's name. A robot of yours by its robot.yaml."""
+
     say: Annotated[Say, FROM_PYTHON] = silent
     """From Python: called with each message."""
 
@@ -224,7 +227,7 @@ def check_policy(settings: CheckPolicySettings) -> PolicyReport:
     path = Path(settings.policy)
     spec = read_policy(path)
     settings.say(policy_text(spec))
-    tried = _tried(path, entry_of(spec.robot).recorded_description(), settings.say)
+    tried = _tried(path, entry_of(settings.robot or spec.robot).recorded_description(), settings.say)
     return dataclasses.replace(tried, path=None if tried.faults else path)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -32,6 +33,8 @@ _UNARY: Final = {
     **{"aten::exp": "Exp", "aten::sqrt": "Sqrt", "aten::abs": "Abs", "aten::silu": "Silu"},
     **{"aten::silu_": "Silu", "aten::softsign": "Softsign"},
 }
+_BUFFERS: Final = ("hidden_state", "cell_state")
+"""What the exporters name an LSTM's memory."""
 _SAME: Final = ("aten::contiguous", "aten::detach", "aten::clone", "aten::dropout", "aten::to", "aten::alias")
 _BINARY: Final = {
     **{"aten::add": "Add", "aten::add_": "Add", "aten::sub": "Sub", "aten::sub_": "Sub"},
@@ -81,12 +84,15 @@ def convert(content: bytes, observations: int) -> Converted:
         ) from err
     graph = _Graph()
     with torch.no_grad():
-        if _is_lstm(module):
-            value = graph.lstm(module.memory, INPUT)
-            value = graph.follow(torch.jit.freeze(module.actor.eval()).graph, value)
+        lstm = _lstm_of(module)
+        if lstm:
+            value = INPUT
+            if hasattr(module, "normalizer"):
+                value = graph.follow(_frozen(module.normalizer), value)
+            value = graph.follow(_frozen(module.actor), graph.lstm(getattr(module, lstm), value))
         else:
             value = graph.follow(_frozen(module), INPUT)
-        reset = _reset_of(module)
+        reset = partial(_clear, module, bool(lstm))
         shape = np.shape(_answer(module, np.zeros((1, observations), dtype=np.float32)))
         reset()
     if len(shape) != 2 or shape[0] != 1:
@@ -103,11 +109,15 @@ def convert(content: bytes, observations: int) -> Converted:
     )
 
 
-def _is_lstm(module: Any) -> bool:
-    """Return whether a module is legged_gym's: an LSTM, whose memory the module holds, before the layers."""
+def _lstm_of(module: Any) -> str:
+    """Return the name of an LSTM whose memory the module holds, before the layers; "" for none.
+
+    legged_gym's exporter names it memory, Isaac Lab's rnn, with a normaliser before it.
+    """
     kinds = {name: part.original_name for name, part in module.named_children()}
     buffers = {name for name, _ in module.named_buffers(recurse=False)}
-    return kinds.get("memory") == "LSTM" and "actor" in kinds and {"hidden_state", "cell_state"} <= buffers
+    found = next((name for name in ("memory", "rnn") if kinds.get(name) == "LSTM"), "")
+    return found if "actor" in kinds and set(_BUFFERS) <= buffers else ""
 
 
 def _frozen(module: Any) -> Any:
@@ -120,19 +130,19 @@ def _frozen(module: Any) -> Any:
     if recurrent:
         raise PolicyError(
             f"the network is recurrent in a way that is not known: {', '.join(recurrent)}, buffers "
-            f"{', '.join(kept) or 'none'}; known is an LSTM named memory with hidden_state and cell_state "
-            "before the layers named actor, as legged_gym and unitree_rl_gym export it"
+            f"{', '.join(kept) or 'none'}; known is an LSTM named memory or rnn with hidden_state "
+            "and cell_state before the layers named actor, as legged_gym and Isaac Lab export it"
         )
     try:
-        return torch.jit.freeze(module).graph
+        return torch.jit.freeze(module.eval()).graph
     except Exception as err:
         raise PolicyError(f"the network cannot be frozen ({_line(err)}); export it for evaluation") from err
 
 
-def _reset_of(module: Any) -> Callable[[], None]:
-    if hasattr(module, "reset_memory"):
-        return lambda: module.reset_memory()
-    return lambda: None
+def _clear(module: Any, recurrent: bool) -> None:
+    if recurrent:
+        for name in _BUFFERS:
+            getattr(module, name).zero_()
 
 
 def _answer(module: Any, observation: Observation) -> npt.NDArray[Any]:

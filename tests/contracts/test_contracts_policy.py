@@ -336,3 +336,58 @@ def test_description_digest_changes_with_facts_not_with_sources() -> None:
         dataclasses.replace(DESCRIPTION, stiffness=(1.0, 2.0))
     with pytest.raises(ConfigurationError, match="wheel"):
         dataclasses.replace(DESCRIPTION, actuated=("wheel",))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"action_limit": 0.0}, "action_limit is 0.0; allowed: a number above 0, or Infinity"),
+        ({"action_limit": math.nan}, "action_limit is nan"),
+        ({"action_offset": (0.0,) * 3}, "action_offset is of length 3; allowed: 12"),
+        ({"action_offset": (math.inf,) * 12}, r"action_offset\[0\] is inf"),
+        ({"target_range": ((0.0, 1.0),)}, r"target_range is .*; allowed: 12 pairs"),
+        ({"target_range": ((1.0, 0.0),) * 12}, r"target_range is .*; allowed: 12 pairs"),
+        ({"clock_rest": -0.1}, "clock_rest is -0.1; allowed: a finite number of at least 0"),
+    ],
+)
+def test_fields_of_imported_policies_are_checked(fields: dict[str, Any], words: str) -> None:
+    """Centres, limits and ranges of actions, and the clock at rest."""
+    with pytest.raises(ConfigurationError, match=words):
+        PolicySpec.of_robot(
+            DRIVER, [ObservationTerm("clock", "sin", 1.0)], (1.0,) * 12, clock_hz=2.0, **fields
+        )
+
+
+def test_a_policy_with_its_own_centre_has_its_own_pose() -> None:
+    """The robot's default pose may be another: targets and observations are around the policy's."""
+    other = tuple(value + 0.1 for value in DRIVER.default_position)
+    terms = [ObservationTerm("position", name, 1.0) for name in DRIVER.joint_names]
+    spec = PolicySpec.of_robot(
+        DRIVER,
+        terms,
+        (0.5,) * 12,
+        default_position=other,
+        effort_limit=tuple(map(min, DRIVER.effort_limit, DRIVER.limits.effort)),
+    )
+    with pytest.raises(PolicyMismatchError, match="default_position: policy has"):
+        spec.check_fits(DRIVER)
+    own = dataclasses.replace(spec, action_offset=other, action_limit=math.inf)
+    own.check_fits(DRIVER)
+    again = PolicySpec.from_json(own.to_json())
+    assert again == own and again.digest() != spec.digest()
+
+
+def test_the_clock_is_zero_at_rest_and_turns_on() -> None:
+    """Its phase goes on; with delayed commands and clocks the past ones are seen."""
+    terms = [ObservationTerm("clock", "sin", 1.0, delay) for delay in (0, 1)]
+    terms += [ObservationTerm("command", "x", 1.0, delay) for delay in (0, 1)]
+    fields: dict[str, Any] = {"clock_hz": 12.5, "clock_rest": 0.1, "delayed_commands": True}
+    builder = ObservationBuilder(PolicySpec.of_robot(DRIVER, terms, (1.0,) * 12, **fields))
+    state = np.zeros(12), np.zeros(12)
+    seen = []
+    for speed in (0.0, 0.5, 0.5, 0.05):
+        builder.command = np.array([speed, 0.0, 0.0])
+        seen.append(builder.build(*state))
+    # A quarter of a turn each period: sines 0, 1, 0, -1, the first and the last at rest.
+    wanted = np.array([[0, 0, 0, 0], [1, 0, 0.5, 0], [0, 1, 0.5, 0.5], [0, 0, 0.05, 0.5]])
+    np.testing.assert_allclose(np.array(seen), wanted, atol=1e-6)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,16 @@ import pytest
 import torch
 from fakes import foreign_policy
 from fakes.foreign_policy import DESCRIPTION, ISAAC, STIFFNESS, Foreign, pose
-from fakes.recurrent_modules import Gated, Recurrent, Rolling
+from fakes.recurrent_modules import (
+    Endless,
+    Gated,
+    Greedy,
+    IsaacRecurrent,
+    Layers,
+    Recurrent,
+    Rolling,
+    Writing,
+)
 from onnx import TensorProto, helper, numpy_helper
 
 from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS
@@ -199,6 +208,141 @@ def test_other_memories_are_refused_by_name(
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     with pytest.raises(PolicyError, match=said):
         imported(tmp_path / "motion.pt", config)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_isaac_labs_lstm_has_a_normaliser(
+    tmp_path: Path, imported: Callable[..., OnnxPolicy], layers: int
+) -> None:
+    """Its exporter names the LSTM otherwise; the ONNX of the same exporter has the states as inputs."""
+    torch.manual_seed(layers)
+    module = IsaacRecurrent(layers).eval()
+    foreign_policy.save_script(module, tmp_path / "policy.pt")
+    config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
+    order = [ISAAC.index(name) for name in DESCRIPTION.actuated]
+    drawn = np.random.default_rng(0).standard_normal((5, 47)).astype(np.float32)
+    module.reset_memory()
+    with torch.no_grad():
+        wanted = [module(torch.as_tensor(row[None]))[0].numpy()[order] for row in drawn]
+    (tmp_path / "policy.onnx").write_bytes(isaac_lstm(module, layers).SerializeToString())
+    for file in ("policy.pt", "policy.onnx"):
+        policy = imported(tmp_path / file, config)
+        assert policy.spec.recurrent and policy.takes_batches
+        np.testing.assert_allclose([policy.act(row) for row in drawn], wanted, atol=1e-5)
+        policy.reset()
+        both = policy.act_batch(np.repeat(drawn[:1], 3, axis=0))
+        np.testing.assert_allclose(both, np.repeat(wanted[:1], 3, axis=0), atol=1e-5)
+
+
+def isaac_lstm(module: IsaacRecurrent, layers: int) -> onnx.ModelProto:
+    """Return the network as Isaac Lab exports it: inputs obs, h_in, c_in of a batch of one."""
+    state, kind, row = [layers, 1, 16], TensorProto.FLOAT, helper.make_tensor_value_info
+    gates, last = [0, 3, 1, 2], cast(Any, module.actor[0])
+
+    def turned(value: torch.Tensor) -> npt.NDArray[Any]:
+        parts = np.split(value.detach().numpy(), 4)
+        return np.concatenate([parts[k] for k in gates])
+
+    weights = {
+        "mean": module.normalizer.mean.numpy(),
+        "std": module.normalizer.std.numpy() + np.float32(1e-2),
+        "zero": np.array([0], dtype=np.int64),
+        "gain": last.weight.detach().numpy().T.copy(),
+        "bias": last.bias.detach().numpy(),
+    }
+    nodes = [
+        helper.make_node("Sub", ["obs", "mean"], ["centred"]),
+        helper.make_node("Div", ["centred", "std"], ["x"]),
+        helper.make_node("Unsqueeze", ["x", "zero"], ["y0"]),
+        helper.make_node("Split", ["h_in"], [f"h{k}" for k in range(layers)], num_outputs=layers, axis=0),
+        helper.make_node("Split", ["c_in"], [f"c{k}" for k in range(layers)], num_outputs=layers, axis=0),
+    ]
+    for k in range(layers):
+        own = {
+            name: getattr(module.rnn, f"{name}_l{k}")
+            for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        }
+        weights[f"W{k}"], weights[f"R{k}"] = turned(own["weight_ih"])[None], turned(own["weight_hh"])[None]
+        weights[f"B{k}"] = np.concatenate([turned(own["bias_ih"]), turned(own["bias_hh"])])[None]
+        given = [f"y{k}", f"W{k}", f"R{k}", f"B{k}", "", f"h{k}", f"c{k}"]
+        nodes += [
+            helper.make_node("LSTM", given, [f"s{k}", f"hn{k}", f"cn{k}"], hidden_size=16),
+            helper.make_node("Identity", [f"hn{k}"], [f"y{k + 1}"]),
+        ]
+    nodes += [
+        helper.make_node("Squeeze", [f"y{layers}", "zero"], ["last"]),
+        helper.make_node("MatMul", ["last", "gain"], ["product"]),
+        helper.make_node("Add", ["product", "bias"], ["actions"]),
+        *(
+            helper.make_node("Concat", [f"{n}n{k}" for k in range(layers)], [f"{n}_out"], axis=0)
+            for n in "hc"
+        ),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [row("obs", kind, [1, 47]), row("h_in", kind, state), row("c_in", kind, state)],
+        [row("actions", kind, [1, 12]), row("h_out", kind, state), row("c_out", kind, state)],
+        [numpy_helper.from_array(np.ascontiguousarray(value), name) for name, value in weights.items()],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+
+
+def test_each_known_layer_is_converted(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
+    """Activations, norms, sums and clips give what torch gives."""
+    torch.manual_seed(0)
+    module = Layers().eval()
+    foreign_policy.save_script(module, tmp_path / "policy.pt")
+    config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
+    policy = imported(tmp_path / "policy.pt", config)
+    drawn = 3 * np.random.default_rng(0).standard_normal((50, 47)).astype(np.float32)
+    with torch.no_grad():
+        wanted = module(torch.as_tensor(drawn)).numpy()
+    assert wanted.std() > 0.1
+    order = [ISAAC.index(name) for name in DESCRIPTION.actuated]
+    np.testing.assert_allclose(policy.act_batch(drawn), wanted[:, order], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("module", "said"),
+    [
+        (Endless, "operation prim::Loop of the network is not known"),
+        (Greedy, "the network fails on an observation|memory|crashes"),
+    ],
+)
+def test_what_loops_or_takes_all_memory_ends(
+    tmp_path: Path, imported: Callable[..., OnnxPolicy], module: type[torch.nn.Module], said: str
+) -> None:
+    """A loop is refused before it runs; the process has limits."""
+    foreign_policy.save_script(module(), tmp_path / "motion.pt")
+    config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
+    with pytest.raises(PolicyError, match=said):
+        imported(tmp_path / "motion.pt", config)
+
+
+def test_a_network_that_writes_a_file_does_not(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
+    """TorchScript can map a file to memory, and would make it."""
+    made = tmp_path / "made"
+    foreign_policy.save_script(Writing(str(made)), tmp_path / "motion.pt")
+    config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
+    with pytest.raises(PolicyError, match="the network fails on an observation"):
+        imported(tmp_path / "motion.pt", config)
+    assert not made.exists()
+
+
+def test_a_yaml_of_deploy_mujoco(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
+    """It has no order of motors, no range, and the control period in two numbers."""
+    foreign = Foreign(joints=ORDERS["mixed"])
+    values = foreign.gym_yaml()
+    for name in ("control_dt", "leg_joint2motor_idx", "max_cmd", "msg_type", "imu_type"):
+        del values[name]
+    values.update(simulation_dt=0.002, control_decimation=10, xml_path="scene.xml", cmd_init=[0.5, 0, 0])
+    terms = (*(name for name in foreign_policy.TERMS if name != "gait_phase"), "gait_phase")
+    script = foreign.torchscript(tmp_path / "motion.pt", terms=terms)
+    config = foreign_policy.write_yaml(tmp_path / "go2.yaml", values)
+    policy = imported(script, config, joints=foreign.joints, command_range=MJLAB["command_range"], clock=2.5)
+    assert policy.spec.control_rate_hz == pytest.approx(50.0)
+    np.testing.assert_allclose(targets(policy), shipped_targets(), atol=TARGET_RAD)
 
 
 def linear_network(gain: npt.NDArray[Any]) -> onnx.ModelProto:
