@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from deal_hw.cli.dialogue import TerminalDialogue
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.own_robot.check import (
     CHECK_ROBOT,
@@ -78,6 +79,10 @@ def robot(
             are not those of the arm.
         DealHwError: The port cannot be opened, or its servos do not answer.
     """
+    if isinstance(config, NewFromBusSettings):
+        config = dataclasses.replace(config, dialogue=TerminalDialogue("robot new --bus"))
+    if isinstance(config, CheckBusSettings) and config.by_hand:
+        config = dataclasses.replace(config, dialogue=TerminalDialogue("robot check --by-hand"))
     if isinstance(config, CheckRobotSettings):
         found = check_robot(**vars(config))
         print(found.table())

@@ -9,15 +9,16 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from deal_hw.data.files import dataset_of
 from deal_hw.description import RobotDescription
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.robots.entry import API_VERSION, RobotEntry, WireEntry, load
-from deal_hw.sim.robots.file_description import file_description
-from deal_hw.sim.robots.robot_file import RobotFile, read_robot_file
+
+if TYPE_CHECKING:
+    from deal_hw.sim.robots.robot_file import RobotFile
 
 WIRE = "serial"
 """The wire of a servo bus: an adapter on a serial port."""
@@ -43,7 +44,7 @@ def machine_of(robot: str) -> str:
 def has_hardware(robot: str) -> bool:
     """Return whether a robot.yaml names its bus; False for one that cannot be read, which its reader says."""
     try:
-        return read_robot_file(robot_yaml(robot)).hardware is not None
+        return _read(robot_yaml(robot)).hardware is not None
     except DealHwError:
         return False
 
@@ -55,7 +56,7 @@ def file_entry(robot: str) -> RobotEntry:
         ConfigurationError: Its robot.yaml cannot be read.
     """
     path = robot_yaml(robot)
-    file = read_robot_file(path)
+    file = _read(path)
     return RobotEntry(
         name=robot,
         api_version=API_VERSION,
@@ -77,7 +78,16 @@ def driven_description(path: Path, file: RobotFile) -> RobotDescription:
             f"{path}: its model {file.mjcf} does not exist ({mjcf}); write its path at `mjcf`, relative to "
             "robot.yaml"
         )
+    from deal_hw.sim.robots.file_description import file_description
+
     return file_description(file, mjcf)
+
+
+def _read(path: Path) -> RobotFile:
+    # Imported here: naming a robot of the table loads no YAML reader.
+    from deal_hw.sim.robots.robot_file import read_robot_file
+
+    return read_robot_file(path)
 
 
 def no_driver(robot: str) -> str:

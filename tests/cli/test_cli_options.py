@@ -87,6 +87,8 @@ REQUIRED: dict[str, Any] = {
     "model": Path("m"),
     "env": "a:B-v0",
     "policy": Path("p.onnx"),
+    "lerobot": Path("l.json"),
+    "bus": "feetech",
 }
 
 

@@ -429,7 +429,8 @@ def mistyped() -> Iterator[tuple[str, str]]:
 
 def slips(begin: str, settings: type, stated: str) -> Iterator[tuple[str, str]]:
     """Yield mistyped lines of one settings type; the field ``stated`` is in the line's beginning."""
-    needed = {"robot": "cartpole", "port": "--port p", "out": "--out o", "episode": "e"}
+    robot = "--robot go2" if begin.startswith("policy") else "cartpole"
+    needed = {"robot": robot, "port": "--port p", "out": "--out o", "episode": "e"}
     hints = typing.get_type_hints(settings)
     required = [
         next(iter(typing.get_args(hints[f.name])), "x") if f.name not in needed else needed[f.name]

@@ -16,6 +16,8 @@ from pathlib import Path
 import pytest
 import tomllib
 
+from deal_hw.sim.robots.robot_file import ActuatorEntry, JointEntry, RobotFile, write_robot_file
+
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 FOLDERS = ("deal_hw", *LEAVES)
@@ -229,12 +231,23 @@ def test_command_runs_from_the_wheel(unpacked: Path, tmp_path: Path) -> None:
 
 def test_a_message_of_the_wheel_names_a_page_that_can_be_opened(unpacked: Path, tmp_path: Path) -> None:
     """Outside the repository a refusal names the page of the installed package by its full path."""
+    joint = JointEntry(name="hinge", unit="rad", actuator=ActuatorEntry())
+    robot = RobotFile(
+        version=1,
+        name="mine",
+        mjcf="mine.xml",
+        actuation="position",
+        control_rate_hz=50.0,
+        state_rate_hz=50.0,
+        joints=(joint,),
+    )
+    (tmp_path / "robot.yaml").write_text(write_robot_file(robot), encoding="utf-8")
     words = ["deploy", "robot.yaml", "--port", "p"]
     code = f"import sys; from deal_hw.cli.main import main; sys.exit(main({words}))"
     done = run_elsewhere(code, unpacked, tmp_path)
     assert done.returncode == 2, done.stderr
     (named,) = re.findall(r"(/\S+\.md)", done.stderr)
-    assert Path(named) == unpacked / "deal_hw/docs/how-to/add.md" and Path(named).is_file()
+    assert Path(named) == unpacked / "deal_hw/docs/how-to/servo-arm.md" and Path(named).is_file()
 
 
 @pytest.mark.slow

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 import pytest
-import torch
 from fakes import foreign_policy
 from fakes.foreign_policy import DESCRIPTION, ISAAC, STIFFNESS, Foreign, pose
-from fakes.recurrent_modules import (
-    Endless,
-    Gated,
-    Greedy,
-    IsaacRecurrent,
-    Layers,
-    Recurrent,
-    Rolling,
-    Writing,
-)
 from onnx import TensorProto, helper, numpy_helper
 
 from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS
@@ -40,6 +30,9 @@ from deal_hw.rotations import rotation_vector
 from deal_hw.types import FloatArray
 from deal_hw.workflows.shipped import required_policy
 
+if TYPE_CHECKING:
+    import torch
+
 TARGET_RAD = 2e-5
 """Largest difference of targets: sums of single precision with factors up to 5."""
 MJLAB = {
@@ -56,6 +49,11 @@ ORDERS = {
     "ours": DESCRIPTION.joint_names,
     "mixed": tuple(np.random.default_rng(5).permutation(DESCRIPTION.joint_names).tolist()),
 }
+
+
+def modules() -> Any:
+    """Return the networks with a memory; their module loads torch, so collecting the tests does not."""
+    return importlib.import_module("fakes.recurrent_modules")
 
 
 @pytest.fixture
@@ -175,8 +173,10 @@ def test_an_lstms_memory_is_input_and_output(
     tmp_path: Path, imported: Callable[..., OnnxPolicy], layers: int
 ) -> None:
     """Step by step as in torch; a reset clears it, and robots in a batch have a memory each."""
+    import torch
+
     torch.manual_seed(layers)
-    module = Recurrent(layers).eval()
+    module = modules().Recurrent(layers).eval()
     foreign_policy.save_script(module, tmp_path / "motion.pt")
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     policy = imported(tmp_path / "motion.pt", config)
@@ -198,13 +198,13 @@ def test_an_lstms_memory_is_input_and_output(
 
 
 @pytest.mark.parametrize(
-    ("module", "said"), [(Rolling, "keeps a memory of its own|not known"), (Gated, r"memory \(GRU\)")]
+    ("module", "said"), [("Rolling", "keeps a memory of its own|not known"), ("Gated", r"memory \(GRU\)")]
 )
 def test_other_memories_are_refused_by_name(
-    tmp_path: Path, imported: Callable[..., OnnxPolicy], module: type[torch.nn.Module], said: str
+    tmp_path: Path, imported: Callable[..., OnnxPolicy], module: str, said: str
 ) -> None:
     """The state would else be frozen at its first value, and nothing would tell."""
-    foreign_policy.save_script(module(), tmp_path / "motion.pt")
+    foreign_policy.save_script(getattr(modules(), module)(), tmp_path / "motion.pt")
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     with pytest.raises(PolicyError, match=said):
         imported(tmp_path / "motion.pt", config)
@@ -215,8 +215,10 @@ def test_isaac_labs_lstm_has_a_normaliser(
     tmp_path: Path, imported: Callable[..., OnnxPolicy], layers: int
 ) -> None:
     """Its exporter names the LSTM otherwise; the ONNX of the same exporter has the states as inputs."""
+    import torch
+
     torch.manual_seed(layers)
-    module = IsaacRecurrent(layers).eval()
+    module = modules().IsaacRecurrent(layers).eval()
     foreign_policy.save_script(module, tmp_path / "policy.pt")
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     order = [ISAAC.index(name) for name in DESCRIPTION.actuated]
@@ -234,7 +236,7 @@ def test_isaac_labs_lstm_has_a_normaliser(
         np.testing.assert_allclose(both, np.repeat(wanted[:1], 3, axis=0), atol=1e-5)
 
 
-def isaac_lstm(module: IsaacRecurrent, layers: int) -> onnx.ModelProto:
+def isaac_lstm(module: Any, layers: int) -> onnx.ModelProto:
     """Return the network as Isaac Lab exports it: inputs obs, h_in, c_in of a batch of one."""
     state, kind, row = [layers, 1, 16], TensorProto.FLOAT, helper.make_tensor_value_info
     gates, last = [0, 3, 1, 2], cast(Any, module.actor[0])
@@ -290,8 +292,10 @@ def isaac_lstm(module: IsaacRecurrent, layers: int) -> onnx.ModelProto:
 
 def test_each_known_layer_is_converted(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
     """Activations, norms, sums and clips give what torch gives."""
+    import torch
+
     torch.manual_seed(0)
-    module = Layers().eval()
+    module = modules().Layers().eval()
     foreign_policy.save_script(module, tmp_path / "policy.pt")
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     policy = imported(tmp_path / "policy.pt", config)
@@ -306,15 +310,15 @@ def test_each_known_layer_is_converted(tmp_path: Path, imported: Callable[..., O
 @pytest.mark.parametrize(
     ("module", "said"),
     [
-        (Endless, "operation prim::Loop of the network is not known"),
-        (Greedy, "the network fails on an observation|memory|crashes"),
+        ("Endless", "operation prim::Loop of the network is not known"),
+        ("Greedy", "the network fails on an observation|memory|crashes"),
     ],
 )
 def test_what_loops_or_takes_all_memory_ends(
-    tmp_path: Path, imported: Callable[..., OnnxPolicy], module: type[torch.nn.Module], said: str
+    tmp_path: Path, imported: Callable[..., OnnxPolicy], module: str, said: str
 ) -> None:
     """A loop is refused before it runs; the process has limits."""
-    foreign_policy.save_script(module(), tmp_path / "motion.pt")
+    foreign_policy.save_script(getattr(modules(), module)(), tmp_path / "motion.pt")
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     with pytest.raises(PolicyError, match=said):
         imported(tmp_path / "motion.pt", config)
@@ -323,7 +327,7 @@ def test_what_loops_or_takes_all_memory_ends(
 def test_a_network_that_writes_a_file_does_not(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
     """TorchScript can map a file to memory, and would make it."""
     made = tmp_path / "made"
-    foreign_policy.save_script(Writing(str(made)), tmp_path / "motion.pt")
+    foreign_policy.save_script(modules().Writing(str(made)), tmp_path / "motion.pt")
     config = foreign_policy.write_yaml(tmp_path / "go2.yaml", Foreign().gym_yaml())
     with pytest.raises(PolicyError, match="the network fails on an observation"):
         imported(tmp_path / "motion.pt", config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from pathlib import Path
 
@@ -14,9 +15,10 @@ pytestmark = pytest.mark.real_time
 
 @pytest.mark.parametrize("name", CODECS)
 def test_no_codec_takes_a_corrupt_frame(name: str) -> None:
-    """Of 2000 frames with one fault none comes out (expected from 16 bits: 0.03)."""
+    """Of 2000 frames with one fault none comes out, but by chance (16 bits: 0.03; Feetech's 8 bits: 8)."""
     row = fuzz(name, CODECS[name], 2000, seed=3)
-    assert row["corrupt"] > 1900 and row["accepted"] == 0
+    by_chance = 2000 / 2 ** CODECS[name].bits
+    assert row["corrupt"] > 1900 and row["accepted"] <= by_chance + 5 * math.sqrt(by_chance)
 
 
 def test_a_codec_without_a_check_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

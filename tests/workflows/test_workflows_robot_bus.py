@@ -16,6 +16,7 @@ import pytest
 from arm_rig import BUSES, Rig
 
 import deal_hw
+from deal_hw.cli import dialogue as dialogues
 from deal_hw.cli.main import EXIT_ERROR, main
 from deal_hw.drivers.servo_arm.families import FAMILIES, OFF, ON
 from deal_hw.drivers.servo_arm.survey import Survey
@@ -33,7 +34,6 @@ from deal_hw.errors import (
 from deal_hw.findings import Finding, Severity
 from deal_hw.sim.robots.robot_file import read_robot_file, write_robot_file
 from deal_hw.sim.robots.user_robot import read_robot
-from deal_hw.workflows.own_robot import dialogue as dialogues
 from deal_hw.workflows.own_robot.compare import bus_findings
 from deal_hw.workflows.own_robot.fitting import RAD
 from deal_hw.workflows.own_robot.lerobot import LeRobotMotor

@@ -12,7 +12,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.findings import Finding, Severity
 from deal_hw.workflows.kinds import InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, File, from_settings
-from deal_hw.workflows.own_robot.dialogue import Dialogue, TerminalDialogue
+from deal_hw.workflows.own_robot.dialogue import Dialogue, required
 from deal_hw.workflows.robot import load_robot
 from deal_hw.workflows.say import html_table
 
@@ -126,8 +126,8 @@ def _on_bus(robot: UserRobot, settings: CheckBusSettings) -> list[Finding]:
             "it out"
         )
     dialogue = settings.dialogue
-    if settings.by_hand and dialogue is None:
-        dialogue = TerminalDialogue("robot check --by-hand")
+    if settings.by_hand:
+        dialogue = required(dialogue, "robot check --by-hand")
     with link.open_bus(section.bus, settings.port, section.baud_rate) as survey:
         return list(bus_findings(robot, survey, motors, dialogue))
 

@@ -12,7 +12,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, File, from_settings
-from deal_hw.workflows.own_robot.dialogue import Dialogue, TerminalDialogue
+from deal_hw.workflows.own_robot.dialogue import Dialogue, required
 from deal_hw.workflows.robot import check_name, user_robots
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ def _with_servos(
         from deal_hw.workflows.own_robot import link
         from deal_hw.workflows.own_robot.ask_bus import ask_bus
 
-        dialogue = settings.dialogue or TerminalDialogue("robot new --bus")
+        dialogue = required(settings.dialogue, "robot new --bus")
         rate = settings.baud_rate
         with link.open_bus(settings.bus, settings.port, rate) as survey:
             return ask_bus(robot, survey, dialogue, bus=settings.bus, baud_rate=rate)
