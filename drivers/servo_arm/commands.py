@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -12,11 +11,9 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.families import LoopGains, ServoSample
 from deal_hw.errors import SafetyError
-from deal_hw.sim.robots.hardware_section import MOST_GAIN, TICKS, HardwareSection, ServoEntry
+from deal_hw.sim.robots.hardware_section import MOST_GAIN, RAD, TICKS, HardwareSection, ServoEntry
 from deal_hw.types import FloatArray, JointCommand
 
-RAD: Final = 2 * math.pi / TICKS
-"""One tick [rad]."""
 _SHARE_DIGITS: Final = 3
 """Effort limits are sent in steps of 0.1 %, as Feetech's register has them."""
 
@@ -66,9 +63,7 @@ class CommandCodec:
 
     def positions(self, samples: Mapping[int, ServoSample]) -> FloatArray:
         """Return the joints' positions, (J,) [rad]."""
-        return np.array(
-            [servo.direction * (samples[servo.id].ticks - servo.zero) * RAD for servo in self.joints]
-        )
+        return np.array([servo.position(samples[servo.id].ticks) for servo in self.joints])
 
     def velocities(self, samples: Mapping[int, ServoSample]) -> FloatArray:
         """Return the joints' velocities, (J,) [rad/s]."""
@@ -109,9 +104,7 @@ class CommandCodec:
         gains = [(registers.gains[servo.id], self._nominal[servo.id]) for servo in servos]
         shares = np.array([registers.shares[servo.id] for servo in servos])
         return JointCommand(
-            position_target=np.array(
-                [servo.direction * (registers.goals[servo.id] - servo.zero) * RAD for servo in servos]
-            ),
+            position_target=np.array([servo.position(registers.goals[servo.id]) for servo in servos]),
             velocity_target=zeros,
             stiffness=np.array(
                 [kp * _ratio(new.p, own.p) for kp, (new, own) in zip(d.stiffness, gains, strict=True)]

@@ -17,13 +17,12 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import reported
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.robots.hardware_section import TICKS, HardwareSection
+from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
 from deal_hw.types import FloatArray
 
 BRAKE: Final = 0.55
 """Damping of a motor whose terminals are joined [N·m·s/rad]: kt²/R of an STS3215 in BAM's identification."""
-_RAD: Final = 2 * math.pi / TICKS
 
 
 class ArmDevice:
@@ -63,7 +62,6 @@ class ArmDevice:
         by_joint = {servo.joint: servo for servo in hardware.servos}
         self._servos = [by_joint[name] for name in d.joint_names]
         self._description, self._noisy = d, noisy
-        self._direction = np.array([servo.direction for servo in self._servos])
         self._actuated = np.array(d.actuated_index)
         self._batch = ServoBatch(robot, space, 1, threads=1)
         self._batch.set_parameters(np.array([[truth.parameters[name] for name in space.names]]))
@@ -188,9 +186,8 @@ class ArmDevice:
 
     def _take_goals(self, now_ns: int) -> None:
         """Take the servos' goals; they act from the first physics step that begins after the latency."""
-        goals = np.array([joint.goal for joint in self.joints])
-        zeros = np.array([servo.zero for servo in self._servos])
-        wanted = self._direction * (goals - zeros) * _RAD
+        told = zip(self._servos, self.joints, strict=True)
+        wanted = np.array([servo.position(joint.goal) for servo, joint in told])
         if not np.array_equal(wanted, self._wanted):
             self._wanted = wanted
             due = math.ceil((now_ns + self._latency_ns) / self._tick_ns - 1e-6)
@@ -243,5 +240,5 @@ class ArmDevice:
         for j, (joint, servo) in enumerate(zip(self.joints, self._servos, strict=True)):
             most = limit.get(j, math.inf)
             duty = servo.direction * effort[j] / most if math.isfinite(most) and joint.torque == ON else 0.0
-            ticks = servo.zero + servo.direction * round(float(position[j]) / _RAD)
-            joint.sense(ticks, servo.direction * float(velocity[j]) / _RAD, min(max(duty, -1.0), 1.0))
+            ticks = servo.ticks(float(position[j]))
+            joint.sense(ticks, servo.direction * float(velocity[j]) / RAD, min(max(duty, -1.0), 1.0))

@@ -10,7 +10,7 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.servo_arm.commands import RAD, CommandCodec, Registers, clipped
+from deal_hw.drivers.servo_arm.commands import CommandCodec, Registers, clipped
 from deal_hw.drivers.servo_arm.examination import ArmExamination, ArmInfo
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, ServoSample
 from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Writes
@@ -18,7 +18,7 @@ from deal_hw.drivers.servo_bus.polling import Poller
 from deal_hw.drivers.servo_bus.samples import SampleGrid
 from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
 from deal_hw.robot import Robot
-from deal_hw.sim.robots.hardware_section import HardwareSection
+from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
 from deal_hw.transport import Message, Transport
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 

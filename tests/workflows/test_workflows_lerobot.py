@@ -15,8 +15,8 @@ import deal_hw
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.robots import driver_description, recorded_description
+from deal_hw.sim.robots.hardware_section import RAD
 from deal_hw.sim.robots.robot_file import RobotFile, read_robot_file
-from deal_hw.workflows.own_robot.fitting import RAD
 from deal_hw.workflows.own_robot.lerobot import read_calibration
 
 SO101_MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")

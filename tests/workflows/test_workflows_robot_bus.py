@@ -32,10 +32,10 @@ from deal_hw.errors import (
     WrongDeviceError,
 )
 from deal_hw.findings import Finding, Severity
+from deal_hw.sim.robots.hardware_section import RAD
 from deal_hw.sim.robots.robot_file import read_robot_file, write_robot_file
 from deal_hw.sim.robots.user_robot import read_robot
 from deal_hw.workflows.own_robot.compare import bus_findings
-from deal_hw.workflows.own_robot.fitting import RAD
 from deal_hw.workflows.own_robot.lerobot import LeRobotMotor
 
 MODEL = {"dynamixel": r.MODEL_NUMBER, "feetech": f.MODEL_NUMBER}

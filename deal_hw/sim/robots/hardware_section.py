@@ -14,6 +14,8 @@ from deal_hw.schema import FINITE, refusal
 
 TICKS: Final = 4096
 """Ticks a turn, of Feetech STS and of Dynamixel X servos (12 bits)."""
+RAD: Final = 2 * math.pi / TICKS
+"""One tick [rad]."""
 MOST_SERVOS: Final = 32
 _BAUD_RATES: Final = {
     "feetech": (128_000, 250_000, 500_000, 1_000_000),
@@ -60,6 +62,10 @@ class ServoEntry:
     def ticks(self, position: float) -> int:
         """Return the servo's position [ticks] at a position of the joint [rad]."""
         return self.zero + self.direction * round(position * TICKS / (2 * math.pi))
+
+    def position(self, ticks: int) -> float:
+        """Return the joint's position [rad] at a position of the servo [ticks]."""
+        return self.direction * (ticks - self.zero) * RAD
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,13 +10,13 @@ from deal_hw.drivers.servo_arm.survey import ServoFacts, Survey
 from deal_hw.drivers.servo_bus.interface import Answer
 from deal_hw.errors import ConfigurationError, DealHwError, FrameError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
-from deal_hw.sim.robots.hardware_section import HardwareSection, ServoEntry
+from deal_hw.sim.robots.hardware_section import RAD, HardwareSection, ServoEntry
 from deal_hw.sim.robots.positive import positive_directions
 from deal_hw.sim.robots.robot_file import JointEntry
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.workflows.own_robot.by_hand import Hands
 from deal_hw.workflows.own_robot.dialogue import Dialogue
-from deal_hw.workflows.own_robot.fitting import RAD, angles
+from deal_hw.workflows.own_robot.fitting import angles
 from deal_hw.workflows.own_robot.lerobot import LeRobotMotor
 
 _ROUNDS: Final = 100
@@ -128,7 +128,7 @@ def _servo(
         found += _of_lerobot(code, servo, facts, motors)
     yield from found
     if all(one.severity is Severity.NOTE for one in found):
-        at = servo.direction * (sample.ticks - servo.zero) * RAD
+        at = servo.position(sample.ticks)
         seen = (
             f"{facts.model}, at {sample.ticks} ticks = {at:.3f} rad, limits {facts.least} to {facts.most}, "
             f"homing offset {facts.offset}, {facts.volts:.1f} V, {facts.celsius} °C, "
@@ -164,7 +164,7 @@ def _problems(
         yield fail(str(error))
     if sample.fault:
         yield fail(f"reports {sample.fault}")
-    at = servo.direction * (sample.ticks - servo.zero) * RAD
+    at = servo.position(sample.ticks)
     limits = robot.description().limits.trip_position[robot.joint_names.index(joint.name)]
     if not limits[0] <= at <= limits[1]:
         yield fail(

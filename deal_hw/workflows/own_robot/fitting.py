@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.robots.hardware_section import TICKS, HardwareSection, ServoEntry
+from deal_hw.sim.robots.hardware_section import RAD, TICKS, HardwareSection, ServoEntry
 from deal_hw.sim.robots.robot_file import JointEntry, RobotFile
 
-RAD: Final = 2 * math.pi / TICKS
-"""One tick [rad]."""
 STS3215_RAD_S: Final = 5.2
 """Fastest an STS3215 turns [rad/s]: 3400 ticks/s, the goal speed that it has after a start, at 7.4 V."""
 MOST_DIFFERENCE: Final = 0.3
