@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.families import Family
-from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Answer, ServoBus
+from deal_hw.drivers.servo_bus.interface import Answer, ServoBus
 from deal_hw.errors import (
     ConfigurationError,
     DealHwError,
@@ -91,10 +91,9 @@ class ArmExamination:
         return ArmInfo("; ".join(phrases))
 
     def _check_speed(self) -> None:
-        count, (_, size) = len(self._hardware.servos), self._family.block
-        answers = self._bus.answer_bytes(count, size, False)
-        bits = BITS_PER_BYTE * (answers + 2 * self._family.request_bytes + 6 * count)
-        need_s, period_s = bits / self._hardware.baud_rate, 1 / self._description.state_rate_hz
+        count = len(self._hardware.servos)
+        need_s = self._family.cycle_s(self._bus, count, self._hardware.baud_rate)
+        period_s = 1 / self._description.state_rate_hz
         if need_s > _MOST_SHARE * period_s:
             raise ConfigurationError(
                 f"at {self._hardware.baud_rate} baud one state of {count} servos and a command take "
@@ -117,30 +116,23 @@ class ArmExamination:
                 f"{self._where}: no servo answers at {self._hardware.baud_rate} baud; check the servos' "
                 "supply, the adapter's cable, the port, and baud_rate in robot.yaml"
             )
-        listed = ", ".join(f"{i} ({self._model(one.model)})" for i, one in sorted(there.items()))
+        listed = ", ".join(f"{i} ({self._family.model_name(one.model)})" for i, one in sorted(there.items()))
         return TransportTimeoutError(
             f"{self._where}: servo {absent} does not answer; these do: {listed}. Check the cable between the "
             "servos, and the ids in robot.yaml; of two servos with one id neither can be read"
         )
 
     def _check_model(self, servo: ServoEntry, answer: Answer) -> str:
-        model = self._model(answer.model)
+        model = self._family.model_name(answer.model)
         known = servo.model.lower()
-        if answer.model not in self._family.models:
-            raise WrongDeviceError(
-                f"{self._where}: servo {servo.id} ({servo.joint}) is of model number {answer.model}, which "
-                f"deal-hw does not know as {self._family.name}; known: "
-                f"{', '.join(sorted(set(self._family.models.values())))}"
-            )
+        if problem := self._family.unknown_model(answer.model):
+            raise WrongDeviceError(f"{self._where}: servo {servo.id} ({servo.joint}) {problem}")
         if known and known != model:
             raise WrongDeviceError(
                 f"{self._where}: servo {servo.id} ({servo.joint}) is a {model}, robot.yaml says {known}; "
                 "check id and model there"
             )
         return model
-
-    def _model(self, number: int) -> str:
-        return self._family.models.get(number, f"model {number}")
 
     def _try(self, request: Callable[[], T]) -> T | None:
         for _ in range(_TRIES):

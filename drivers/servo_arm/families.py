@@ -14,7 +14,7 @@ from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.servo_bus.feetech.bus import FeetechBus
 from deal_hw.drivers.servo_bus.feetech.packets import explain_fault
-from deal_hw.drivers.servo_bus.interface import Answer, ServoBus, Writes
+from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Answer, ServoBus, Writes
 from deal_hw.errors import ConfigurationError
 from deal_hw.transport import Transport
 
@@ -72,6 +72,22 @@ class Family(abc.ABC):
     watchdog_s: ClassVar[float] = 0.0
     tool: ClassVar[str]
     request_bytes: ClassVar[int]
+
+    def model_name(self, number: int) -> str:
+        """Return a model's name, or its number in words."""
+        return self.models.get(number, f"model {number}")
+
+    def unknown_model(self, number: int) -> str:
+        """Return what to say of a model that is not one of these; "" if it is."""
+        if number in self.models:
+            return ""
+        known = ", ".join(sorted(set(self.models.values())))
+        return f"is of model number {number}, which deal-hw does not know as {self.name}; known: {known}"
+
+    def cycle_s(self, bus: ServoBus, servos: int, baud_rate: int) -> float:
+        """Return the time of one sample and one command of so many servos on the wire [s]."""
+        answers = bus.answer_bytes(servos, self.block[1], False)
+        return BITS_PER_BYTE * (answers + 2 * self.request_bytes + 6 * servos) / baud_rate
 
     @abc.abstractmethod
     def bus(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> ServoBus:

@@ -11,7 +11,7 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.servo_arm.families import OFF, Family, LoopGains, ServoSample
 from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus.feetech import registers as f
-from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Answer, ServoBus
+from deal_hw.drivers.servo_bus.interface import Answer, ServoBus
 from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.errors import FrameError, TransportTimeoutError
 
@@ -23,8 +23,6 @@ _LISTEN_S: Final = 0.3
 _SEARCHES: Final = 2
 _VOLT: Final = 0.1
 """Unit of voltages, of both kinds of servos."""
-_RPM: Final = 0.229
-"""Unit of a Dynamixel servo's velocity limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +32,6 @@ class ServoFacts:
     Attributes:
         id: Its id.
         model: Its model, such as sts3215, or its number.
-        firmware: As its ping gives it.
         offset: Its homing offset [ticks].
         least: Its own lowest goal [ticks].
         most: Its own highest goal [ticks].
@@ -48,7 +45,6 @@ class ServoFacts:
 
     id: int
     model: str
-    firmware: int
     offset: int
     least: int
     most: int
@@ -124,10 +120,6 @@ class Survey:
             found |= self.bus.broadcast_ping(_LISTEN_S)
         return dict(sorted(found.items()))
 
-    def model(self, number: int) -> str:
-        """Return a model's name, or its number in words."""
-        return self.family.models.get(number, f"model {number}")
-
     def facts(self, servo: int, answer: Answer) -> ServoFacts:
         """Return what a servo says about itself.
 
@@ -145,8 +137,7 @@ class Survey:
         speed = table.velocity_limit
         return ServoFacts(
             id=servo,
-            model=self.model(answer.model),
-            firmware=answer.firmware,
+            model=self.family.model_name(answer.model),
             offset=self._offset(read(table.offset)),
             least=read(table.least),
             most=read(table.most),
@@ -155,7 +146,7 @@ class Survey:
             volt_range=(least_volts, most_volts),
             celsius=read(table.celsius),
             most_celsius=read(table.most_celsius),
-            velocity_limit=None if speed is None else read(speed) * _RPM * 6.283185307179586 / 60,
+            velocity_limit=None if speed is None else read(speed) * r.RAD_S_PER_COUNT,
         )
 
     def _offset(self, value: int) -> int:
@@ -206,11 +197,6 @@ class Survey:
                 continue
             found.append((self.clock.now_ns() - start_ns) / 1e9)
         return sorted(found)
-
-    def cycle_s(self, servos: int, baud_rate: int) -> float:
-        """Return the time of one sample and one command of so many servos on the wire [s]."""
-        answers = self.bus.answer_bytes(servos, self.family.block[1], False)
-        return BITS_PER_BYTE * (answers + 2 * self.family.request_bytes + 6 * servos) / baud_rate
 
     def _surely(self, servo: int, request: Callable[[], T], together: Sequence[int] = ()) -> T:
         for _ in range(_TRIES):

@@ -106,12 +106,8 @@ def _found(file: RobotFile, survey: Survey, baud_rate: int) -> dict[int, ServoFa
         )
     found = {}
     for servo, answer in answers.items():
-        if answer.model not in survey.family.models:
-            known = ", ".join(sorted(set(survey.family.models.values())))
-            raise WrongDeviceError(
-                f"{survey.where}: servo {servo} is of model number {answer.model}, which deal-hw does not "
-                f"know as {survey.family.name}; known: {known}"
-            )
+        if problem := survey.family.unknown_model(answer.model):
+            raise WrongDeviceError(f"{survey.where}: servo {servo} {problem}")
         if problem := survey.family.version_problem(survey.bus, servo, answer):
             raise VersionMismatchError(f"{survey.where}: servo {servo} {problem}")
         facts = found[servo] = survey.facts(servo, answer)

@@ -56,13 +56,10 @@ def bus_findings(
             except (TransportTimeoutError, FrameError):
                 continue
     yield from _present(section, answers, survey)
-    missing = False
-    for servo in section.servos:
-        if servo.id in answers:
-            yield from _servo(robot, servo, answers[servo.id], survey, motors)
-        else:
-            missing = True
-    if missing:
+    present = [servo for servo in section.servos if servo.id in answers]
+    for servo in present:
+        yield from _servo(robot, servo, answers[servo.id], survey, motors)
+    if len(present) < len(section.servos):
         return
     yield _cycle(robot, section, survey)
     if dialogue is not None:
@@ -86,7 +83,7 @@ def hardware_of(robot: UserRobot) -> HardwareSection:
 def _present(section: HardwareSection, answers: Mapping[int, Answer], survey: Survey) -> Iterator[Finding]:
     missing = [f"{one.id} ({one.joint})" for one in section.servos if one.id not in answers]
     known = {one.id for one in section.servos}
-    extra = [f"{i} ({survey.model(one.model)})" for i, one in answers.items() if i not in known]
+    extra = [f"{i} ({survey.family.model_name(one.model)})" for i, one in answers.items() if i not in known]
     if missing:
         there = ", ".join(map(str, answers)) or "none"
         yield Finding(
@@ -123,7 +120,7 @@ def _servo(
     except TransportTimeoutError as error:
         yield Finding(code, Severity.FAIL, str(error))
         return
-    found = list(_problems(code, robot, servo, joint, facts, sample, survey))
+    found = list(_problems(code, robot, servo, joint, answer, facts, sample, survey))
     if motors is not None:
         found += _of_lerobot(code, servo, facts, motors)
     yield from found
@@ -142,6 +139,7 @@ def _problems(
     robot: UserRobot,
     servo: ServoEntry,
     joint: JointEntry,
+    answer: Answer,
     facts: ServoFacts,
     sample: ServoSample,
     survey: Survey,
@@ -149,12 +147,11 @@ def _problems(
     def fail(seen: str, do: str = "") -> Finding:
         return Finding(code, Severity.FAIL, seen, do)
 
-    number = Answer(_number(survey, facts.model), facts.firmware)
-    if number.model not in survey.family.models:
+    if answer.model not in survey.family.models:
         yield fail(f"{facts.model}, which deal-hw does not know as {survey.family.name}", "use another servo")
     elif servo.model and servo.model.lower() != facts.model:
         yield fail(f"a {facts.model}, robot.yaml says {servo.model}", "correct id or model in robot.yaml")
-    if problem := survey.family.version_problem(survey.bus, servo.id, number):
+    if problem := survey.family.version_problem(survey.bus, servo.id, answer):
         yield fail(problem)
     low, high = joint.position_range or (0.0, 0.0)
     try:
@@ -185,10 +182,6 @@ def _problems(
     if not facts.volt_range[0] <= facts.volts <= facts.volt_range[1]:
         allowed = f"{facts.volt_range[0]:.1f} to {facts.volt_range[1]:.1f}"
         yield fail(f"{facts.volts:.1f} V; it allows {allowed} V", "use the supply for this servo")
-
-
-def _number(survey: Survey, model: str) -> int:
-    return next((number for number, name in survey.family.models.items() if name == model), -1)
 
 
 def _of_lerobot(
@@ -226,7 +219,7 @@ def _cycle(robot: UserRobot, section: HardwareSection, survey: Survey) -> Findin
     ids = [servo.id for servo in section.servos]
     times = survey.round_trips_s(ids, _ROUNDS)
     lost, period_ms = _ROUNDS - len(times), 1e3 / robot.file.state_rate_hz
-    wire_ms = 1e3 * survey.cycle_s(len(ids), section.baud_rate)
+    wire_ms = 1e3 * survey.family.cycle_s(survey.bus, len(ids), section.baud_rate)
     if not times:
         return Finding("cycle", Severity.FAIL, f"no answer of all servos in {_ROUNDS}", "look for noise")
     median_ms, late_ms = 1e3 * times[len(times) // 2], 1e3 * times[len(times) * 99 // 100]
