@@ -7,7 +7,7 @@ the network's, in observations as in actions.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -214,11 +214,46 @@ def unmeasured(term: str, robot: str) -> PolicyMismatchError:
     )
 
 
-def unknown_term(format: str, term: str, known: Mapping[str, Any]) -> ConfigurationError:
-    """Return the error for a term that is not known."""
-    return ConfigurationError(
-        f"{format}: observation term {term!r} is unknown; known are {either(sorted(known))}; train without "
-        "it, or tell its meaning to the project"
+def quantity_of(term: str, known: Mapping[str, Quantity], format: str, robot: str) -> Quantity:
+    """Return what a term observes.
+
+    Args:
+        term: Its name.
+        known: The format's terms.
+        format: The format, for the message.
+        robot: The robot's name, for the message.
+
+    Raises:
+        PolicyMismatchError: No sensor of the robot measures it.
+        ConfigurationError: It is not known.
+    """
+    if term in UNMEASURED:
+        raise unmeasured(term, robot)
+    if term not in known:
+        raise ConfigurationError(
+            f"{format}: observation term {term!r} is unknown; known are {either(sorted(known))}; train "
+            "without it, or tell its meaning to the project"
+        )
+    return known[term]
+
+
+def joints_of(
+    names: Sequence[str], default: Sequence[float], stiffness: Sequence[float], damping: Sequence[float]
+) -> tuple[ForeignJoint, ...]:
+    """Return joints from one list for each of their values."""
+    return tuple(
+        ForeignJoint(name=name, default=pose, stiffness=kp, damping=kd)
+        for name, pose, kp, kd in zip(names, default, stiffness, damping, strict=True)
+    )
+
+
+def actions_around(
+    names: Sequence[str], default: Sequence[float], scale: Sequence[float]
+) -> tuple[ForeignAction, ...]:
+    """Return actions that are offsets from the default pose."""
+    return tuple(
+        ForeignAction(joint=name, scale=factor, offset=pose)
+        for name, pose, factor in zip(names, default, scale, strict=True)
     )
 
 

@@ -13,19 +13,16 @@ from typing import Final
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.policies.importing.manifest import (
     AXES_OF,
-    UNMEASURED,
-    ForeignAction,
-    ForeignJoint,
     ForeignPolicy,
     ForeignTerm,
-    unknown_term,
-    unmeasured,
+    actions_around,
+    joints_of,
+    quantity_of,
 )
 from deal_hw.policies.importing.supplement import (
     REST,
     Supplement,
     parse_history,
-    parse_range,
     parse_values,
 )
 from deal_hw.policy import Quantity
@@ -81,10 +78,7 @@ def parse(metadata: Mapping[str, str], answers: Supplement, robot: str) -> Forei
     joints = _names(metadata, "joint_names")
     terms = term_names(metadata)
     for name in terms:
-        if name in UNMEASURED:
-            raise unmeasured(name, robot)
-        if name not in TERMS:
-            raise unknown_term(FORMAT, name, TERMS)
+        quantity_of(name, TERMS, FORMAT, robot)
     if answers.get("joints"):
         joints = _renamed(joints, answers.joints)
     stiffness, damping, default, scale = (
@@ -114,14 +108,8 @@ def parse(metadata: Mapping[str, str], answers: Supplement, robot: str) -> Forei
     clocked = any(TERMS[name] == "clock" for name in terms)
     return ForeignPolicy(
         format=FORMAT,
-        joints=tuple(
-            ForeignJoint(name=name, default=pose, stiffness=kp, damping=kd)
-            for name, pose, kp, kd in zip(joints, default, stiffness, damping, strict=True)
-        ),
-        actions=tuple(
-            ForeignAction(joint=name, scale=factor, offset=pose)
-            for name, pose, factor in zip(joints, default, scale, strict=True)
-        ),
+        joints=joints_of(joints, default, stiffness, damping),
+        actions=actions_around(joints, default, scale),
         terms=tuple(_term(name, joints, scales[name], history[name], clip) for name in terms),
         control_rate_hz=rate,
         command_range=_range(answers) if commanded else (),
@@ -219,8 +207,7 @@ def _term(name: str, joints: Sequence[str], scale: float, history: int, clip: fl
 
 
 def _range(answers: Supplement) -> tuple[tuple[float, float], ...]:
-    why = "mjlab's metadata do not say the range of the velocity commands"
-    return parse_range(answers.need("command_range", why, "-1:1,-0.5:0.5,-1:1"))
+    return answers.need_command_range("mjlab's metadata do not say the range of the velocity commands")
 
 
 def _clock(answers: Supplement) -> float:

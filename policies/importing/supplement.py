@@ -71,6 +71,10 @@ class Supplement:
             raise ConfigurationError(f"{why}; give it as it was in training: {option(name)} {example}")
         return value
 
+    def need_command_range(self, why: str) -> tuple[tuple[float, float], ...]:
+        """Return the range of the velocity commands; errors as :meth:`need` and :func:`parse_range`."""
+        return parse_range(self.need("command_range", why, "-1:1,-0.5:0.5,-1:1"))
+
     def refuse_unused(self, source: str) -> None:
         """Refuse answers to questions that a file answers itself.
 

@@ -13,16 +13,16 @@ from typing import Any, Final
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.policies.importing.manifest import (
     AXES_OF,
-    UNMEASURED,
-    ForeignAction,
     ForeignJoint,
     ForeignPolicy,
     ForeignTerm,
-    unknown_term,
+    actions_around,
+    joints_of,
+    quantity_of,
     unmeasured,
 )
 from deal_hw.policies.importing.reading import motor_names, row, section, whole
-from deal_hw.policies.importing.supplement import Supplement, parse_history, parse_range
+from deal_hw.policies.importing.supplement import Supplement, parse_history
 from deal_hw.policy import Quantity
 from deal_hw.reading import number
 
@@ -88,17 +88,8 @@ def parse(values: Any, answers: Supplement, robot: str) -> ForeignPolicy:
     clock = answers.get("clock") if "phase" in names else None
     return ForeignPolicy(
         format=FORMAT,
-        joints=(
-            *(
-                ForeignJoint(name=name, default=pose, stiffness=kp, damping=kd)
-                for name, pose, kp, kd in zip(joints, default, kps, kds, strict=True)
-            ),
-            *held,
-        ),
-        actions=tuple(
-            ForeignAction(joint=name, scale=factor, offset=pose)
-            for name, pose, factor in zip(joints, default, scale, strict=True)
-        ),
+        joints=(*joints_of(joints, default, kps, kds), *held),
+        actions=actions_around(joints, default, scale),
         terms=terms,
         control_rate_hz=1.0 / _period_s(found),
         command_range=_range(found, answers) if "commands" in names else (),
@@ -145,10 +136,7 @@ def _names(found: Mapping[str, Any], count: int, answers: Supplement, robot: str
         )
     )
     for name in names:
-        if name in UNMEASURED:
-            raise unmeasured(name, robot)
-        if name not in TERMS:
-            raise unknown_term(FORMAT, name, TERMS)
+        quantity_of(name, TERMS, FORMAT, robot)
     if len(set(names)) < len(names):
         raise ConfigurationError(f"--observations names a term twice: {shown(', '.join(names))}")
     return names
@@ -169,10 +157,7 @@ def _held(found: Mapping[str, Any], answers: Supplement, robot: str) -> tuple[Fo
     kps, kds, pose = (
         row(found.get(f"arm_waist_{n}"), f"arm_waist_{n}", len(names)) for n in ("kps", "kds", "target")
     )
-    return tuple(
-        ForeignJoint(name=name, default=at, stiffness=kp, damping=kd)
-        for name, at, kp, kd in zip(names, pose, kps, kds, strict=True)
-    )
+    return joints_of(names, pose, kps, kds)
 
 
 def _period_s(found: Mapping[str, Any]) -> float:
@@ -186,8 +171,9 @@ def _period_s(found: Mapping[str, Any]) -> float:
 
 def _range(found: Mapping[str, Any], answers: Supplement) -> tuple[tuple[float, float], ...]:
     if found.get("max_cmd") is None:
-        why = "the yaml has no max_cmd, so it does not say the range of the velocity commands"
-        return parse_range(answers.need("command_range", why, "-1:1,-0.5:0.5,-1:1"))
+        return answers.need_command_range(
+            "the yaml has no max_cmd, so it does not say the range of the velocity commands"
+        )
     return tuple((-abs(most), abs(most)) for most in row(found["max_cmd"], "max_cmd", 3))
 
 

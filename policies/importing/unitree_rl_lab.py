@@ -17,17 +17,15 @@ from typing import Any, Final
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.policies.importing.manifest import (
     AXES_OF,
-    UNMEASURED,
     ForeignAction,
-    ForeignJoint,
     ForeignPolicy,
     ForeignTerm,
     check_history,
-    unknown_term,
-    unmeasured,
+    joints_of,
+    quantity_of,
 )
 from deal_hw.policies.importing.reading import flag, motor_names, row, section, span, whole
-from deal_hw.policies.importing.supplement import REST, Supplement, parse_range
+from deal_hw.policies.importing.supplement import REST, Supplement
 from deal_hw.policy import Quantity
 from deal_hw.reading import number, object_of, read_yaml, reading
 
@@ -110,9 +108,8 @@ def parse(values: Any, answers: Supplement, robot: str, names: Sequence[str] = (
         notes.append(note)
     return ForeignPolicy(
         format=FORMAT,
-        joints=tuple(
-            ForeignJoint(name=name, default=pose, stiffness=stiffness[slot], damping=damping[slot])
-            for name, pose, slot in zip(joints, default, slots, strict=True)
+        joints=joints_of(
+            joints, default, [stiffness[slot] for slot in slots], [damping[slot] for slot in slots]
         ),
         actions=actions,
         terms=terms,
@@ -187,11 +184,7 @@ def _terms(
     scale_first, frames = (flag(found.pop(name, False), f"observations.{name}") for name in _SWITCHES)
     terms, clock_hz = [], 0.0
     for name, value in found.items():
-        if name in UNMEASURED:
-            raise unmeasured(name, robot)
-        if name not in TERMS:
-            raise unknown_term(FORMAT, str(name), TERMS)
-        what, quantity = f"observations.{name}", TERMS[name]
+        what, quantity = f"observations.{name}", quantity_of(str(name), TERMS, FORMAT, robot)
         term = section(value, what, _TERM_KEYS)
         params = object_of(term.get("params") or {}, f"{what}.params")
         if quantity == "clock":
@@ -271,8 +264,9 @@ def _ranges(
         return ()
     commands = object_of(values or {}, "commands")
     if "base_velocity" not in commands:
-        why = "deploy.yaml has no commands.base_velocity, the range of the velocity commands"
-        return parse_range(answers.need("command_range", why, "-1:1,-0.5:0.5,-1:1"))
+        return answers.need_command_range(
+            "deploy.yaml has no commands.base_velocity, the range of the velocity commands"
+        )
     base = section(commands["base_velocity"], "commands.base_velocity", ("ranges",), ("ranges",))
     what = "commands.base_velocity.ranges"
     ranges = section(base["ranges"], what, (*_RANGES, "heading"), _RANGES)
