@@ -16,7 +16,8 @@ from deal_hw.drivers.go2.descriptions.leg_geometry import (
     foot_positions,
 )
 from deal_hw.motions.scores.velocity_error import Track
-from deal_hw.sim.legged.velocity_filter import filtered_velocity, rotated, standing_feet
+from deal_hw.rotations import rotated
+from deal_hw.sim.legged.velocity_filter import filtered_velocity, standing_feet
 from deal_hw.types import FloatArray, Trajectory
 
 FOOT_RADIUS_M: Final = 0.022

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
-from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
-from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
+from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import reported
@@ -53,7 +52,7 @@ class ArmDevice:
         space: ParameterSpace,
         truth: SimulatedTruth,
         joints: Sequence[EmulatedJoint],
-        bus: EmulatedBus | StsBus,
+        bus: ServosSide[Any],
         *,
         noisy: bool = True,
     ) -> None:

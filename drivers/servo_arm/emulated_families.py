@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from deal_hw.drivers.servo_arm.families import OFF, ON, Dynamixel, Feetech, LoopGains
 from deal_hw.drivers.servo_bus import registers as r
@@ -15,6 +15,7 @@ from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
 from deal_hw.drivers.servo_bus.feetech.emulated_servo import StsServo
 from deal_hw.drivers.servo_bus.registers import OperatingMode
+from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.sim.robots.hardware_section import ServoEntry
 
 _COUNTS_S: Final = 60 / (0.229 * r.PULSES)
@@ -165,7 +166,7 @@ class StsJoint(EmulatedJoint):
         """Do nothing: the bus advances its protections, and there is no watchdog."""
 
 
-EmulatedArm: TypeAlias = tuple[Sequence[EmulatedJoint], EmulatedBus | StsBus]
+EmulatedArm: TypeAlias = tuple[Sequence[EmulatedJoint], ServosSide[Any]]
 
 
 def dynamixel_arm(servos: Sequence[ServoEntry], baud_rate: int) -> EmulatedArm:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -12,6 +11,7 @@ from deal_hw.drivers.servo_bus.emulated_servo import (
     RESET_ALL,
     EmulatedServo,
 )
+from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE
 from deal_hw.drivers.servo_bus.packets import (
     BROADCAST,
     Error,
@@ -24,24 +24,20 @@ from deal_hw.drivers.servo_bus.packets import (
     status,
 )
 from deal_hw.drivers.servo_bus.registers import PRESENT_POSITION
+from deal_hw.drivers.servo_bus.servos_side import ServosSide, at_once
 
-_BITS_PER_BYTE = 10
 _CLEAR_TURNS: Final = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 """Parameters of Clear: the position, and a safety code."""
 
 
-class EmulatedBus:
+class EmulatedBus(ServosSide[EmulatedServo]):
     """The servos' side of a bus.
 
     Packets are handled on arrival. An answer leaves after the time of request and answer on a wire of the
     servo's baud rate, plus its return delay.
 
     Attributes:
-        servos: The servos; may be changed.
         fast_read: Whether they know Fast Sync and Bulk Read; older firmware does not.
-        host_baud_rate: Rate of the host's port; a servo with another rate receives noise. None: the same.
-        now_ns: Present time [ns], set by the owner.
-        alive_ns: When the last packet came [ns].
 
     Args:
         servos: The servos.
@@ -49,30 +45,19 @@ class EmulatedBus:
         loses: Called for each read of the present position; returns whether the answer is lost.
     """
 
+    position = PRESENT_POSITION
+
     def __init__(
         self, servos: list[EmulatedServo], changed: Callable[[], None], loses: Callable[[], bool]
     ) -> None:
-        self.servos = servos
+        super().__init__(servos, changed, loses)
         self.fast_read = True
-        self.host_baud_rate: int | None = None
-        self.now_ns = self.alive_ns = 0
-        self._changed, self._loses_answer = changed, loses
         self._parser = PacketParser()
-        self._replies: deque[tuple[int, bytes]] = deque()
 
     @property
     def errors(self) -> int:
         """Corrupt packets received so far."""
         return self._parser.errors
-
-    @property
-    def next_ns(self) -> int | None:
-        """When the next answer is complete [ns]; None if no answer waits."""
-        return self._replies[0][0] if self._replies else None
-
-    def take_reply(self) -> bytes:
-        """Return and forget the next answer."""
-        return self._replies.popleft()[1]
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the packets that they complete."""
@@ -85,9 +70,6 @@ class EmulatedBus:
         for packet in self._parser.feed(data):
             self.alive_ns = self.now_ns
             self._handle(packet)
-
-    def _hears(self, servo: EmulatedServo) -> bool:
-        return servo.awake(self.now_ns) and self.host_baud_rate in (None, servo.baud_rate)
 
     def _listeners(self, servo: int) -> list[EmulatedServo]:
         return [s for s in self.servos if s.protocol == 2 and self._hears(s) and servo in (s.id, BROADCAST)]
@@ -173,10 +155,6 @@ class EmulatedBus:
             self._write(params[at], address, params[at + 5 : at + 5 + size])
             at += 5 + size
 
-    def _loses(self, address: int, size: int) -> bool:
-        position = PRESENT_POSITION.address
-        return address <= position < address + size and self._loses_answer()
-
     def _read_group(self, packet: Packet, wanted: Sequence[tuple[int, int, int]]) -> None:
         fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
         if not wanted or self._loses(*wanted[0][1:]) or (fast and not self.fast_read):
@@ -219,12 +197,11 @@ class EmulatedBus:
     ) -> None:
         """Send the errors and data of servos that were asked by one id."""
         if answers and servo != BROADCAST:
-            # On the open line a 0 wins over a 1.
             sent = (status(servo, error | s.alert, data) for s, error, data in answers)
-            self._send(packet, answers[0][0], bytes(map(_and, zip(*sent, strict=False))))
+            self._send(packet, answers[0][0], at_once(sent))
 
     def _send(self, packet: Packet, servo: EmulatedServo, data: bytes) -> None:
-        wire_s = _BITS_PER_BYTE * (packet.size + len(data)) / servo.baud_rate
+        wire_s = BITS_PER_BYTE * (packet.size + len(data)) / servo.baud_rate
         start_ns = max(self.now_ns, self._replies[-1][0] if self._replies else 0)
         self._replies.append((start_ns + round((wire_s + servo.return_delay_s) * 1e9), data))
 
@@ -233,13 +210,6 @@ class EmulatedBus:
             return
         data = servo.read(params[0], params[1])[1] if code == Instruction.READ and len(params) == 2 else b""
         self._replies.append((self.now_ns, protocol_1_status(servo.id, data)))
-
-
-def _and(values: tuple[int, ...]) -> int:
-    result = 0xFF
-    for value in values:
-        result &= value
-    return result
 
 
 def _words(data: bytes) -> tuple[int, int]:

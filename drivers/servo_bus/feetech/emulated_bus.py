@@ -7,10 +7,7 @@ answered in the order of the ids. An incomplete request is forgotten after 10 ms
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
-from functools import reduce
-from operator import and_
 from typing import Final
 
 from deal_hw.drivers.servo_bus.feetech.emulated_servo import StsServo
@@ -24,21 +21,19 @@ from deal_hw.drivers.servo_bus.feetech.packets import (
 )
 from deal_hw.drivers.servo_bus.feetech.registers import BAUD_RATES, PRESENT_POSITION
 from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE
+from deal_hw.drivers.servo_bus.servos_side import ServosSide, at_once
 
 _GAP_NS: Final = 10_000_000
 
 
-class StsBus:
+class StsBus(ServosSide[StsServo]):
     """The servos' side of a bus.
 
     Requests are handled on arrival. An answer leaves after the time of request and answer on the wire, plus
     the servo's return delay. Two servos with one id answer at the same time: a bit is 1 if both send 1.
 
     Attributes:
-        servos: The servos; may be changed.
-        host_baud_rate: Rate of the host's port; a servo with another rate receives noise. None: the same.
         echo: Whether the adapter returns the host's own bytes.
-        alive_ns: When the last request came [ns].
 
     Args:
         servos: The servos.
@@ -46,6 +41,8 @@ class StsBus:
         loses: Called for each read of the present position; returns whether the answer is lost.
         echo: Whether the adapter returns the host's own bytes.
     """
+
+    position = PRESENT_POSITION
 
     def __init__(
         self,
@@ -55,39 +52,15 @@ class StsBus:
         *,
         echo: bool = False,
     ) -> None:
-        self.servos = servos
-        self.host_baud_rate: int | None = None
+        super().__init__(servos, changed, loses)
         self.echo = echo
-        self.alive_ns = 0
-        self._now_ns = self._byte_ns = self._free_ns = 0
-        self._changed, self._loses_answer = changed, loses
+        self._byte_ns = self._free_ns = 0
         self._parser = RequestParser()
-        self._replies: deque[tuple[int, bytes]] = deque()
 
     @property
     def errors(self) -> int:
         """Corrupt requests received so far."""
         return self._parser.errors
-
-    @property
-    def now_ns(self) -> int:
-        """Present time [ns], set by the owner; the servos' protections follow it."""
-        return self._now_ns
-
-    @now_ns.setter
-    def now_ns(self, now_ns: int) -> None:
-        self._now_ns = now_ns
-        for servo in self.servos:
-            servo.tick(now_ns)
-
-    @property
-    def next_ns(self) -> int | None:
-        """When the next answer is complete [ns]; None if no answer waits."""
-        return self._replies[0][0] if self._replies else None
-
-    def take_reply(self) -> bytes:
-        """Return and forget the next answer."""
-        return self._replies.popleft()[1]
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the requests that they complete."""
@@ -105,8 +78,10 @@ class StsBus:
             self.alive_ns = self._now_ns
             self._handle(request)
 
-    def _hears(self, servo: StsServo) -> bool:
-        return servo.awake(self._now_ns) and self.host_baud_rate in (None, servo.baud_rate)
+    def _advance(self) -> None:
+        # The servos' protections follow the time.
+        for servo in self.servos:
+            servo.tick(self._now_ns)
 
     def _listeners(self, servo: int) -> list[StsServo]:
         return [s for s in self.servos if self._hears(s) and servo in (s.id, BROADCAST)]
@@ -164,10 +139,6 @@ class StsBus:
         if request.servo != BROADCAST:
             self._answer([(s, servo, s.error, b"") for s, servo in answering])
 
-    def _loses(self, address: int, size: int) -> bool:
-        position = PRESENT_POSITION.address
-        return address <= position < address + size and self._loses_answer()
-
     def _data(self, servo: int, address: int, size: int) -> list[tuple[StsServo, int, int, bytes]]:
         """Return the answers of the servos with an id to a read."""
         found = [(s, s.read(address, size)) for s in self._listeners(servo)]
@@ -189,9 +160,7 @@ class StsBus:
         """Send the answers (servo, id, error, data) of servos with one id, at the same time."""
         if not answers:
             return
-        frames = [status(servo, error, data) for _, servo, error, data in answers]
-        # On the open line a 0 wins over a 1.
-        data = bytes(reduce(and_, column) for column in zip(*frames, strict=False))
+        data = at_once(status(servo, error, data) for _, servo, error, data in answers)
         speaker = answers[0][0]
         self._free_ns = max(self._free_ns, self._now_ns) + round(speaker.return_delay_s * 1e9)
         self._occupy(len(data), speaker.baud_rate)
