@@ -21,6 +21,13 @@ def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray
     return np.asarray(turned + (1.0 - np.cos(angle)) * along * axis)
 
 
+def rotated(orientation: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return vectors of a base's frame, (T, 3), in the world, for orientations wxyz, (T, 4)."""
+    axis = orientation[:, 1:]
+    turned = np.cross(axis, vectors)
+    return np.asarray(vectors + 2.0 * (orientation[:, :1] * turned + np.cross(axis, turned)))
+
+
 def rotation_vector(quaternion: FloatArray) -> FloatArray:
     """Return the rotation vector, (3,) [rad], of an orientation, (4,), a unit quaternion wxyz."""
     w, v = float(quaternion[0]), quaternion[1:]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deal_hw.rotations import rotated
 from deal_hw.sim.legged.leg_odometry import smoothed_height
-from deal_hw.sim.legged.velocity_filter import GRAVITY, filtered_velocity, rotated, standing_feet
+from deal_hw.sim.legged.velocity_filter import GRAVITY, filtered_velocity, standing_feet
 
 STEP_S = 0.002
 

@@ -11,6 +11,7 @@ from deal_hw.data.importing.columns import POSITION_UNITS, TIME_UNITS, ColumnMap
 from deal_hw.data.importing.guess import guess_time, unguessed
 from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError, short
+from deal_hw.rotations import rotated
 from deal_hw.types import FloatArray
 
 _QUANTITIES = ("pos", "position", "vel", "velocity", "effort", "torque")
@@ -293,8 +294,6 @@ def _in_world(channels: Channels, velocity: FloatArray, orientation: FloatArray 
             f"{channels.path}: base_velocity has the base's axes, and there is no orientation to turn them; "
             "name it in the column map"
         )
-    from deal_hw.sim.legged.velocity_filter import rotated
-
     return rotated(orientation, velocity)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.rotations import rotated
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
 from deal_hw.sim.legged.velocity_filter import (
@@ -16,7 +17,6 @@ from deal_hw.sim.legged.velocity_filter import (
     HEIGHT_M,
     LIFT_DRIFT,
     filtered_velocity,
-    rotated,
     standing_feet,
 )
 from deal_hw.sim.parameters.fields import element_id

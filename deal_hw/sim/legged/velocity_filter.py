@@ -39,13 +39,6 @@ HEIGHT_M: Final = 0.03
 because the errors of one stance are alike."""
 
 
-def rotated(orientation: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return vectors of a base's frame, (T, 3), in the world, for orientations wxyz, (T, 4)."""
-    axis = orientation[:, 1:]
-    turned = np.cross(axis, vectors)
-    return np.asarray(vectors + 2.0 * (orientation[:, :1] * turned + np.cross(axis, turned)))
-
-
 def standing_feet(load: FloatArray, weight_n: float) -> npt.NDArray[np.bool_]:
     """Return which feet stand, (T, F).
 
