@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -13,19 +12,14 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.commands import CommandCodec, Registers, clipped
 from deal_hw.drivers.servo_arm.examination import ArmExamination, ArmInfo
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, ServoSample
-from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, Writes
-from deal_hw.drivers.servo_bus.polling import Poller
+from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, ServoBus, Writes
+from deal_hw.drivers.servo_bus.polled_robot import MISSES, PolledRobot, status_of
 from deal_hw.drivers.servo_bus.samples import SampleGrid
-from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
-from deal_hw.robot import Robot
+from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
-from deal_hw.transport import Message, Transport
+from deal_hw.transport import Transport
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
-_QUEUE: Final = 4096
-_COMMANDS: Final = 64
-_MISSES: Final = 3
-"""Samples in a row without an answer before servos are asked one by one, and before one counts as absent."""
 _HOMING_RAD_S: Final = 0.5
 """Fastest joint on the way to the start pose [rad/s]: a person beside the arm can step back."""
 _ARRIVED_RAD: Final = 0.2
@@ -49,13 +43,12 @@ class _Sent(NamedTuple):
     goals: Mapping[int, int]
 
 
-class ServoArm(Robot):
+class ServoArm(PolledRobot[ServoBus]):
     """An arm of servos.
 
-    Servos send only answers, so :meth:`read_state` requests a state ``state_rate_hz`` times a second, timed
-    as :class:`Poller` says. A state needs all servos. They have no common clock: times are this computer's,
-    and each servo's position is moved from its turn on the wire to the state's time by its velocity. Every
-    sample holds the servos' goals: a command counts as in force once all show it.
+    A state needs all servos. They have no common clock: times are this computer's, and each servo's position
+    is moved from its turn on the wire to the state's time by its velocity. Every sample holds the servos'
+    goals: a command counts as in force once all show it.
 
     Zeros and directions are those of robot.yaml; the servos' own are not changed. The command's stiffness and
     damping scale the gains that belong to those of the description. The reported effort is the motor's duty
@@ -75,6 +68,7 @@ class ServoArm(Robot):
     """
 
     stopped_by = "the servos' supply switch"
+    info: ArmInfo | None
 
     def __init__(
         self,
@@ -84,73 +78,35 @@ class ServoArm(Robot):
         hardware: HardwareSection,
         family: Family,
     ) -> None:
+        bus = family.bus(transport, clock, hardware.baud_rate, hardware.answer_ms * 1e-3)
+        super().__init__(transport, clock, bus, description.state_rate_hz, "the servos' supply and cable")
         self.description = description  # type: ignore[misc]  # A user's robot is known at run time.
-        self._rest = tuple(servo.rest for servo in CommandCodec(description, hardware).joints)
-        self.lowers = None not in self._rest  # type: ignore[misc]
-        self.watchdog_s = family.watchdog_s  # type: ignore[misc]
-        self.info: ArmInfo | None = None
-        self._transport, self._clock, self._hardware, self._family = transport, clock, hardware, family
+        self._hardware, self._family = hardware, family
         self._codec = CommandCodec(description, hardware)
         self._servos = self._codec.joints
         self._ids = tuple(servo.id for servo in self._servos)
-        self._period_ns = round(1e9 / description.state_rate_hz)
-        self._bus = family.bus(transport, clock, hardware.baud_rate, hardware.answer_ms * 1e-3)
-        self._poller = Poller(clock, self._period_ns)
+        self._rest = tuple(servo.rest for servo in self._servos)
+        self.lowers = None not in self._rest  # type: ignore[misc]
+        self.watchdog_s = family.watchdog_s  # type: ignore[misc]
         fastest = max((v for v in description.limits.trip_velocity if np.isfinite(v)), default=np.inf)
         self._reach = _REACH * fastest / RAD
         self._forget()
 
     def _forget(self) -> None:
-        self._poller.restart()
+        super()._forget()
         self._grid = SampleGrid(round(self._period_ns / 1e3))
-        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
-        self._sent: deque[_Sent] = deque(maxlen=_COMMANDS)
         self._in_force: _Sent | None = None
         self._written: Registers | None = None
-        self._sequence = self._missed_command = -1
         self._begin_ns = self._clock.now_ns()
-        self._alive_ns = self._misses = self._turn = 0
-        self._asked: tuple[int, ...] = ()
+        self._misses = self._turn = 0
         self._absent = dict.fromkeys(self._ids, 0)
         self._newest: dict[int, ServoSample] = {}
         self._newest_ns = self._unsound = 0
         self._doubted = False
-        self._homed = self._homing = self._armed = self._anchored = self._watchdog = False
-        self._fault = ""
-        self._lost_commands, self._errors_before = 0, self._bus.errors
 
-    def connect(self) -> None:
-        """Open the transport, find all servos, and check their models and settings; nothing is changed."""
-        if self.info is not None:
-            return
-        if not self._transport.can_send:
-            raise ConfigurationError(
-                "servos answer only to requests, but a dry run sends nothing; leave --dry-run out"
-            )
-        self._transport.open()
-        try:
-            examination = ArmExamination(
-                self._bus, self._family, self._hardware, self.description, self._where
-            )
-            self.info = examination.run()
-            self._forget()
-        except BaseException:
-            self._transport.close()
-            raise
-
-    @property
-    def _where(self) -> str:
-        return str(getattr(self._transport, "port", type(self._transport).__name__))
-
-    def disconnect(self) -> None:
-        """Close the transport."""
-        self._transport.close()
-        self.info = None
-
-    def reopen(self) -> None:
-        """Open the port again where it vanished."""
-        self._transport.reopen()
-        self._asked = ()
+    def _examine(self) -> ArmInfo:
+        """Find all servos, and check their models and settings; nothing is changed."""
+        return ArmExamination(self._bus, self._family, self._hardware, self.description, self._where).run()
 
     # Motion to the start pose, and torque.
 
@@ -306,50 +262,16 @@ class ServoArm(Robot):
             self._poller.answered()
             return {i: self._family.sample(i, data) for i, data in found.items()}
 
-    def _left_s(self, end_ns: int) -> float:
-        return max(0, end_ns - self._clock.now_ns()) / 1e9
-
     # States.
 
-    def read_state(self, timeout_s: float) -> RobotState:
-        """Return the next state; request it if one is due and the answer fits the time.
+    def _whom(self) -> tuple[int, ...]:
+        if self._misses < MISSES:
+            return self._ids
+        self._turn = (self._turn + 1) % len(self._ids)
+        return (self._ids[self._turn],)
 
-        Args:
-            timeout_s: Longest wait [s]; 0 takes received answers and requests nothing.
-        """
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        if self._sent and not self._anchored and timeout_s > 0:
-            # Once a command: with one state a command, an answer that is late costs a whole period.
-            self._anchored = True
-            self._poller.anchor(deadline_ns)
-        while not self._states:
-            if self._asked:
-                self._take(deadline_ns)
-            elif self._poller.fits(deadline_ns):
-                self._clock.sleep_until_ns(self._poller.next_ns)
-                self._ask()
-            else:
-                self._clock.sleep_until_ns(deadline_ns)
-            if not self._states and self._clock.now_ns() >= deadline_ns:
-                why = self._fault or f"check the servos' supply and cable ({self.transport_errors} errors)"
-                raise TransportTimeoutError(
-                    f"{self.description.name}: no state within {timeout_s:g} s; {why}"
-                )
-        return self._states.popleft()
-
-    def _ask(self) -> None:
-        now_ns = self._clock.now_ns()
-        if self._armed and self.watchdog_s and now_ns - self._alive_ns > round(self.watchdog_s * 1e9):
-            # Our own requests keep the servos' watchdogs quiet. So this check stops the motors if a caller
-            # only reads states.
-            self.passive()
-            self._watchdog = True
-        self._asked = self._ids
-        if self._misses >= _MISSES:
-            self._turn = (self._turn + 1) % len(self._ids)
-            self._asked = (self._ids[self._turn],)
-        address, size = self._family.block
-        self._poller.asked(now_ns, self._bus.ask(self._asked, address, size))
+    def _request(self, servos: tuple[int, ...]) -> int:
+        return self._bus.ask(servos, *self._family.block)
 
     def _take(self, deadline_ns: int) -> None:
         try:
@@ -399,22 +321,19 @@ class ServoArm(Robot):
         asked, self._asked = self._asked, ()
         if len(asked) > 1:
             self._misses += 1
-            if self._misses == _MISSES:
+            if self._misses == MISSES:
                 # Until each has answered alone, none is known to be present.
                 self._absent = dict.fromkeys(self._ids, 1)
             return
         self._absent[asked[0]] += 1
         # While none answers, it is the cable or the supply of all, and states grow old.
         others = [i for i in self._ids if i != asked[0]]
-        if self._absent[asked[0]] > _MISSES and (not others or any(not self._absent[i] for i in others)):
+        if self._absent[asked[0]] > MISSES and (not others or any(not self._absent[i] for i in others)):
             joint = next(servo.joint for servo in self._servos if servo.id == asked[0])
             self._latch(
                 f"servo {asked[0]} ({joint}) stopped answering: it restarted, or lost its supply or its "
                 "cable. Check both, then start again"
             )
-
-    def _latch(self, fault: str) -> None:
-        self._fault = self._fault or fault
 
     def _receive(self, samples: Mapping[int, ServoSample]) -> None:
         self._judge(samples)
@@ -479,17 +398,15 @@ class ServoArm(Robot):
             self._sent.popleft()
 
     def _status(self, samples: Mapping[int, ServoSample]) -> Status:
-        flags = {
-            Status.ARMED: all(sample.torque == ON for sample in samples.values()),
-            Status.HOMED: self._homed,
-            Status.HOMING: self._homing,
-            Status.WATCHDOG: self._watchdog or any(sample.tripped for sample in samples.values()),
-            Status.FAULT: self._fault,
-        }
-        status = Status.NONE
-        for flag, is_set in flags.items():
-            status |= flag if is_set else Status.NONE
-        return status
+        return status_of(
+            {
+                Status.ARMED: all(sample.torque == ON for sample in samples.values()),
+                Status.HOMED: self._homed,
+                Status.HOMING: self._homing,
+                Status.WATCHDOG: self._watchdog or any(sample.tripped for sample in samples.values()),
+                Status.FAULT: self._fault,
+            }
+        )
 
     # Commands.
 
@@ -525,11 +442,8 @@ class ServoArm(Robot):
 
         States received before are discarded, and so is an answer that is still expected.
         """
-        self._states.clear()
-        self._armed = self._homed = False
-        if self._asked:
-            self._asked = ()
-            self._poller.withdraw()
+        self._disarm()
+        self._homed = False
         state = DAMPING if self._hardware.passive == "damping" else OFF
         self._bus.post([*self._family.alive(self._ids, False), *self._family.torque(self._ids, state)])
 
@@ -544,26 +458,6 @@ class ServoArm(Robot):
         return super().if_cut
 
     @property
-    def fault(self) -> str:
-        """Fault of a servo after which the host must not continue; "" for none. Latched until armed again."""
-        return self._fault
-
-    @property
-    def last_sequence(self) -> int:
-        """Number of the last command sent; -1 before the first."""
-        return self._sequence
-
-    @property
     def transport_errors(self) -> int:
-        """Number of corrupt or missing answers, and of commands that the servos did not show."""
-        return self._bus.errors - self._errors_before + self._lost_commands + self._unsound
-
-    def fileno(self) -> int:
-        """Return the descriptor of the transport."""
-        return self._transport.fileno()
-
-    def take_wire(self) -> list[Message]:
-        """Return and forget the raw messages since the last call; if many, only the newest."""
-        wire = list(self._bus.wire)
-        self._bus.wire.clear()
-        return wire
+        """Number of corrupt, missing or misread answers, and of commands that the servos did not show."""
+        return super().transport_errors + self._unsound

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,7 +16,7 @@ from deal_hw.drivers.cartpole.dynamixel.homing import Homing
 from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.drivers.servo_bus.bus import Bus
-from deal_hw.drivers.servo_bus.polling import Poller
+from deal_hw.drivers.servo_bus.polled_robot import MISSES, PolledRobot, status_of
 from deal_hw.drivers.servo_bus.registers import (
     PROFILE_ONGOING,
     RAD_S_PER_COUNT,
@@ -26,16 +25,11 @@ from deal_hw.drivers.servo_bus.registers import (
     explain_hardware_error,
 )
 from deal_hw.drivers.servo_bus.samples import SampleGrid, TickClock
-from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
-from deal_hw.robot import Robot
+from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
 from deal_hw.schema import from_values
-from deal_hw.transport import Message, Transport
+from deal_hw.transport import Transport
 from deal_hw.types import JointCommand, RobotState, Status
 
-_QUEUE = 4096
-_MISSES = 3
-"""Samples in a row without answer before the servos are asked one by one, and before one counts as absent."""
-_COMMANDS = 64
 _CLEAR_NS = 500_000_000
 _AT_STOP_M = 0.001
 
@@ -56,14 +50,12 @@ class _Sent(NamedTuple):
     received_ns: int = -1
 
 
-class DynamixelCartpole(Robot):
+class DynamixelCartpole(PolledRobot[Bus]):
     """A cart-pole on two X-series servos.
 
-    Servos send only answers, so :meth:`read_state` requests a state ``state_rate_hz`` times a second, timed
-    as :class:`Poller` says. A state needs both servos. Every sample holds the belt servo's goals: a command
-    counts as in force once the servo shows it. The command's message also requests the servo's clock. This
-    computer's own time stamps contain delays of its scheduler and of the adapter. A calibration would read
-    these as motion.
+    A state needs both servos. Every sample holds the belt servo's goals: a command counts as in force once
+    the servo shows it. The command's message also requests the servo's clock. This computer's own time stamps
+    contain delays of its scheduler and of the adapter. A calibration would read these as motion.
 
     There are two watchdogs. The belt servo's own (Bus Watchdog) stops it when this computer falls silent. The
     driver switches the torque off when states are read but no commands are sent.
@@ -79,6 +71,7 @@ class DynamixelCartpole(Robot):
 
     description: ClassVar[RobotDescription] = DESCRIPTION
     watchdog_s: ClassVar[float] = WATCHDOG_S
+    info: DynamixelInfo | None
 
     def __init__(
         self,
@@ -89,66 +82,33 @@ class DynamixelCartpole(Robot):
         if settings is None or isinstance(settings, Mapping):
             settings = from_values(DynamixelSettings, dict(settings or {}))
         self.settings = settings
-        self.info: DynamixelInfo | None = None
-        self._transport, self._clock = transport, clock
-        self._period_ns = round(1e9 / self.description.state_rate_hz)
+        bus = Bus(transport, clock, settings.baud_rate, settings.answer_s)
+        rate_hz = self.description.state_rate_hz
+        super().__init__(transport, clock, bus, rate_hz, "that both servos are powered, and the cable")
         self._servos = (settings.cart_id, settings.pole_id)
         self._turns = dict.fromkeys(self._servos, 0)
-        self._bus = Bus(transport, clock, settings.baud_rate, settings.answer_s)
         self.servos = Servos(self._bus, clock, settings)
-        self._poller = Poller(clock, self._period_ns)
         self._forget()
 
     def _forget(self) -> None:
-        servos = (self.settings.cart_id, self.settings.pole_id)
-        self._ticks = {servo: TickClock() for servo in servos}
+        super()._forget()
+        self._ticks = {servo: TickClock() for servo in self._servos}
         self._grid = SampleGrid(round(self._period_ns / 1e6))
-        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
-        self._sent: deque[_Sent] = deque(maxlen=_COMMANDS)
         self._in_force: tuple[int, int] | None = None
         self._written: Goal | None = None
-        self._sequence = self._missed_command = -1
-        self._alive_ns = 0
-        self._poller.restart()
-        self._asked: tuple[int, ...] = ()
         self._stamping = False
         self._pair_misses = 0
-        self._misses = dict.fromkeys(servos, 0)
+        self._misses = dict.fromkeys(self._servos, 0)
         self._zero = 0
         self._pole = PoleAngle(self.settings)
-        self._homed = self._homing = self._armed = self._anchored = self._watchdog = self._stopped = False
-        self._fault = ""
-        self._lost_commands, self._errors_before = 0, self._bus.errors
+        self._stopped = False
 
-    def connect(self) -> None:
-        """Open the transport, find both servos, check their settings, and switch their torque off."""
-        if self.info is not None:
-            return
-        if not self._transport.can_send:
-            raise ConfigurationError(
-                "servos answer only to requests, but a dry run sends nothing; leave --dry-run out"
-            )
-        self._transport.open()
-        try:
-            where = str(getattr(self._transport, "port", type(self._transport).__name__))
-            examination = Examination(self._bus, self.settings, self._clock, where)
-            info = examination.run(self.description.state_rate_hz)
-            self._forget()
-            self.info = info
-            self.servos.fast, self.servos.most_effort = info.fast_sync_read, info.effort_limit
-        except BaseException:
-            self._transport.close()
-            raise
-
-    def disconnect(self) -> None:
-        """Close the transport."""
-        self._transport.close()
-        self.info = None
-
-    def reopen(self) -> None:
-        """Open the port again where it vanished."""
-        self._transport.reopen()
-        self._asked, self._stamping = (), False
+    def _examine(self) -> DynamixelInfo:
+        """Find both servos, check their settings, and switch their torque off."""
+        examination = Examination(self._bus, self.settings, self._clock, self._where)
+        info = examination.run(self.description.state_rate_hz)
+        self.servos.fast, self.servos.most_effort = info.fast_sync_read, info.effort_limit
+        return info
 
     def home(self, timeout_s: float) -> None:
         """Find the middle of the rail, move the cart there, then wait until a hand has set the pole upright.
@@ -194,9 +154,6 @@ class DynamixelCartpole(Robot):
         self._armed, self._anchored, self._alive_ns = True, False, self._clock.now_ns()
         self._sent.clear()
 
-    def _left_s(self, deadline_ns: int) -> float:
-        return max(0, deadline_ns - self._clock.now_ns()) / 1e9
-
     def _clear_faults(self) -> None:
         """Clear a fault if the servos report none now."""
         deadline_ns = self._clock.now_ns() + _CLEAR_NS
@@ -208,50 +165,27 @@ class DynamixelCartpole(Robot):
             clock.restarted = False
         self._grid.begin()
 
-    def read_state(self, timeout_s: float) -> RobotState:
-        """Return the next state; request it if one is due and the answer fits the time.
-
-        Args:
-            timeout_s: Longest wait [s]; 0 takes received answers and requests nothing.
-        """
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        if self._sent and not self._anchored and timeout_s > 0:
-            self._anchor(deadline_ns)
-        while not self._states:
-            if self._asked:
-                self._take(deadline_ns)
-            elif self._stamping:
-                self._take_stamp(deadline_ns)
-            elif self._poller.fits(deadline_ns):
-                self._clock.sleep_until_ns(self._poller.next_ns)
-                self._ask()
-            else:
-                self._clock.sleep_until_ns(deadline_ns)
-            if not self._states and self._clock.now_ns() >= deadline_ns:
-                why = (
-                    self._fault
-                    or f"check that both servos are powered, and the cable ({self.transport_errors} errors)"
-                )
-                raise TransportTimeoutError(f"cartpole: no state within {timeout_s:g} s; {why}")
-        return self._states.popleft()
-
     def _anchor(self, deadline_ns: int) -> None:
-        self._anchored = True
-        self._poller.anchor(deadline_ns)
+        super()._anchor(deadline_ns)
         self._grid.begin()
 
-    def _ask(self) -> None:
-        now_ns = self._clock.now_ns()
-        if self._armed and now_ns - self._alive_ns > round(self.watchdog_s * 1e9):
-            # Our own requests keep the servo's watchdog quiet. So this check stops the motor if a caller only
-            # reads states.
-            self.passive()
-            self._watchdog = True
-        self._asked = self._servos
-        if self._pair_misses >= _MISSES:
-            self._asked = (min(self._servos, key=lambda servo: self._turns[servo]),)
-            self._turns[self._asked[0]] += 1
-        self._poller.asked(now_ns, self.servos.ask(self._asked))
+    def _whom(self) -> tuple[int, ...]:
+        if self._pair_misses < MISSES:
+            return self._servos
+        servo = min(self._servos, key=lambda servo: self._turns[servo])
+        self._turns[servo] += 1
+        return (servo,)
+
+    def _request(self, servos: tuple[int, ...]) -> int:
+        return self.servos.ask(servos)
+
+    @property
+    def _expects(self) -> bool:
+        return bool(self._asked) or self._stamping
+
+    def _expect_nothing(self) -> None:
+        super()._expect_nothing()
+        self._stamping = False
 
     def _take_stamp(self, deadline_ns: int) -> None:
         """Receive the belt servo's clock at its newest command."""
@@ -268,6 +202,9 @@ class DynamixelCartpole(Robot):
         self._sent[-1] = sent._replace(received_ns=time_ms * 1_000_000 + 500_000)
 
     def _take(self, deadline_ns: int) -> None:
+        if not self._asked:
+            self._take_stamp(deadline_ns)
+            return
         try:
             blocks = self.servos.take(deadline_ns)
         except (TransportTimeoutError, FrameError):
@@ -288,21 +225,18 @@ class DynamixelCartpole(Robot):
         asked, self._asked = self._asked, ()
         if len(asked) == 2:
             self._pair_misses += 1
-            if self._pair_misses == _MISSES:
+            if self._pair_misses == MISSES:
                 # Until each has answered alone, neither is known to be present.
                 self._misses = dict.fromkeys(self._servos, 1)
                 self._turns = dict.fromkeys(self._servos, 0)
             return
         self._misses[asked[0]] += 1
-        if self._misses[asked[0]] > _MISSES:
+        if self._misses[asked[0]] > MISSES:
             role = "belt" if asked == self._servos[:1] else "pole"
             self._latch(
                 f"servo {asked[0]} ({role}) stopped answering: it restarted, or lost its supply or its "
                 "cable. Check both, then start again"
             )
-
-    def _latch(self, fault: str) -> None:
-        self._fault = self._fault or fault
 
     def _receive(self, blocks: Mapping[int, Block]) -> None:
         times = {
@@ -386,21 +320,19 @@ class DynamixelCartpole(Robot):
             self._sent.popleft()
 
     def _status(self, cart: Block, cart_m: float) -> Status:
-        flags = {
-            Status.ARMED: cart.torque_enable,
-            Status.HOMED: self._homed,
-            Status.HOMING: self._homing,
-            Status.WATCHDOG: self._watchdog or cart.bus_watchdog == WATCHDOG_TRIPPED,
-            Status.EFFORT_CLAMPED: self.settings.mode == "current"
-            and 0 < cart.goal_current <= abs(cart.present_current),
-            Status.SPEED_CLAMPED: cart.torque_enable and cart.moving_status & PROFILE_ONGOING,
-            Status.AT_END_STOP: self._homed and abs(cart_m) >= 0.5 * self.settings.rail_m - _AT_STOP_M,
-            Status.FAULT: self._fault,
-        }
-        status = Status.NONE
-        for flag, is_set in flags.items():
-            status |= flag if is_set else Status.NONE
-        return status
+        return status_of(
+            {
+                Status.ARMED: cart.torque_enable,
+                Status.HOMED: self._homed,
+                Status.HOMING: self._homing,
+                Status.WATCHDOG: self._watchdog or cart.bus_watchdog == WATCHDOG_TRIPPED,
+                Status.EFFORT_CLAMPED: self.settings.mode == "current"
+                and 0 < cart.goal_current <= abs(cart.present_current),
+                Status.SPEED_CLAMPED: cart.torque_enable and cart.moving_status & PROFILE_ONGOING,
+                Status.AT_END_STOP: self._homed and abs(cart_m) >= 0.5 * self.settings.rail_m - _AT_STOP_M,
+                Status.FAULT: self._fault,
+            }
+        )
 
     def send_command(self, command: JointCommand) -> JointCommand:
         """Send a position target; no register takes a velocity target or a feed-forward effort.
@@ -421,35 +353,6 @@ class DynamixelCartpole(Robot):
 
         States received before are discarded, and so is an answer that is still expected.
         """
-        self._states.clear()
-        self._armed, self._stopped = False, True
-        if self._asked or self._stamping:
-            self._asked = ()
-            self._poller.withdraw()
-        self._stamping = False
+        self._disarm()
+        self._stopped = True
         self.servos.torque_off()
-
-    @property
-    def fault(self) -> str:
-        """Fault of a servo after which the host must not continue; "" for none. Latched until armed again."""
-        return self._fault
-
-    @property
-    def last_sequence(self) -> int:
-        """Number of the last command sent; -1 before the first."""
-        return self._sequence
-
-    @property
-    def transport_errors(self) -> int:
-        """Number of corrupt or missing answers, and of commands that the servo did not show."""
-        return self._bus.errors - self._errors_before + self._lost_commands
-
-    def fileno(self) -> int:
-        """Return the descriptor of the transport."""
-        return self._transport.fileno()
-
-    def take_wire(self) -> list[Message]:
-        """Return and forget the raw messages since the last call; if many, only the newest."""
-        wire = list(self._bus.wire)
-        self._bus.wire.clear()
-        return wire
