@@ -107,7 +107,7 @@ class PopulationDemonstration:
                 "the policy's network has a memory of its own, which no recording holds, so its commands "
                 "cannot be computed from states; use a policy without"
             )
-        self._map = ActionMap(spec, description)
+        self._map = ActionMap.of_robot(spec, description)
 
     @property
     def trained_under(self) -> str:

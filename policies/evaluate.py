@@ -52,7 +52,7 @@ def evaluate_batch(
     start = home if start_position is None else start_position
     loop.restart(np.ones(count, dtype=bool), theta, latency_s, start, np.zeros_like(home), rng)
     builder = ObservationBuilder(spec, (count,))
-    mapped = ActionMap(spec, description)
+    mapped = ActionMap.of_robot(spec, description)
     positions, velocities = [], []
     lost = np.zeros(count, dtype=bool)
     for _ in range(round(seconds * description.control_rate_hz)):

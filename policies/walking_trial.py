@@ -191,7 +191,7 @@ class _Run:
         self._wanted = np.repeat(np.array(commands), ROBOTS, axis=0)
         self._count = len(self._wanted)
         self._loop = ServoLoop(description, ParameterSpace([]), self._count, threads=threads)
-        self._map = ActionMap(spec, description)
+        self._map = ActionMap.of_robot(spec, description)
         self._filter = SafetyFilter(description)
         self._ticks = round(SECONDS * description.control_rate_hz)
         self.clipped = 0.0

@@ -71,13 +71,23 @@ class ActionMap:
         centre: The target of action 0, (A,).
         scale: Change of the target by action 1, (A,).
         limit: Largest absolute action.
+
+    Args:
+        spec: The policy's spec.
+        around: The target of action 0, (A,).
+        scale: Change of the target by action 1, (A,); by default that of the spec.
     """
 
-    def __init__(self, spec: PolicySpec, description: RobotDescription) -> None:
-        self.centre = np.array(spec.action_offset) if spec.action_offset else centre(description)
-        self.scale = np.array(spec.action_scale)
+    def __init__(self, spec: PolicySpec, around: FloatArray, scale: FloatArray | None = None) -> None:
+        self.centre = around
+        self.scale = np.array(spec.action_scale) if scale is None else scale
         self.limit = spec.action_limit
         self._range = np.array(spec.target_range).T if spec.target_range else None
+
+    @classmethod
+    def of_robot(cls, spec: PolicySpec, description: RobotDescription) -> ActionMap:
+        """Return the map to the targets that a robot gets."""
+        return cls(spec, np.array(spec.action_offset) if spec.action_offset else centre(description))
 
     def action(self, answer: FloatArray) -> FloatArray:
         """Return the actions of answers, (..., A) each; NaN stays, for the safety filter to trip on."""
@@ -129,7 +139,7 @@ class PolicyBehaviour:
         self.follows_velocity = "command" in observed
         self._policy = policy
         self._observations = ObservationBuilder(spec)
-        self._map = ActionMap(spec, description)
+        self._map = ActionMap.of_robot(spec, description)
         self._template = position_command(spec, self._map.centre)
         self.action: FloatArray | None = None
 

@@ -19,6 +19,7 @@ from deal_hw.workflows.calibration.policy import NOTED_POLICY
 
 if TYPE_CHECKING:
     from deal_hw.data.table import Table
+    from deal_hw.motions.behaviours import ActionMap
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.policy import PolicySpec
     from deal_hw.sim.mjcf.describe import Sampling
@@ -214,8 +215,7 @@ def _choices(
     from deal_hw.policy import ObservationBuilder
 
     spec = policy.spec
-    centre, scale = _commands_of(spec, facts)
-    low, high = np.array(spec.target_range or ((-np.inf, np.inf),)).T
+    mapped = _commands_of(spec, facts)
     number = np.round((table.time_s - table.time_s[0]) / period_s).astype(np.int64)
     position, velocity = _states(table, every)
     sound = np.isfinite(position).all(axis=1) & np.isfinite(velocity).all(axis=1)
@@ -225,23 +225,25 @@ def _choices(
         command = np.empty((len(rows), len(spec.actuated)))
         for k, row in enumerate(rows):
             observation = builder.build(position[row], velocity[row])
-            action = np.clip(policy.act_batch(observation[None])[0], -spec.action_limit, spec.action_limit)
+            action = mapped.action(policy.act_batch(observation[None])[0])
             builder.record_action(action)
-            command[k] = np.clip(centre + scale * action, low, high)
+            command[k] = mapped.target(action)
         # Before, its memory holds states that were not recorded.
         yield _Ticks(first, rows[spec.history :], command[spec.history :])
 
 
-def _commands_of(spec: PolicySpec, facts: JointFacts) -> tuple[FloatArray, FloatArray]:
-    """Return the command at action 0 and the change of it to action 1, (A,) each, as recordings hold them."""
-    scale = np.array(spec.action_scale)
+def _commands_of(spec: PolicySpec, facts: JointFacts) -> ActionMap:
+    """Return the map from actions to commands as recordings hold them."""
+    from deal_hw.motions.behaviours import ActionMap
+
     joints = [facts.names.index(name) for name in spec.actuated]
     if not facts.servo[joints].any():
-        return np.zeros(len(joints)), scale * facts.full_effort[joints]
+        scale = np.array(spec.action_scale) * facts.full_effort[joints]
+        return ActionMap(spec, np.zeros(len(joints)), scale)
     if spec.action_offset:
-        return np.array(spec.action_offset), scale
+        return ActionMap(spec, np.array(spec.action_offset))
     places = [spec.joint_names.index(name) for name in spec.actuated]
-    return np.array(spec.default_position)[places], scale
+    return ActionMap(spec, np.array(spec.default_position)[places])
 
 
 def _earlier(table: Table, every: int) -> tuple[IntArray, FloatArray]:
