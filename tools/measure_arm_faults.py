@@ -61,11 +61,8 @@ class ArmRig(Rig):
         return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port")]
 
     def arguments(self) -> list[str]:
-        """Play a chirp, or run the case's policy."""
-        seconds = ["--seconds", str(self._seconds)]
-        if self.case.policy or self.case.dry:
-            return ["deploy", self.robot, *self.policy_arguments()[:2], *seconds]
-        return ["collect", self.robot, "--motion", "chirp", *seconds]
+        """Play a chirp."""
+        return ["collect", self.robot, "--motion", "chirp", "--seconds", str(self._seconds)]
 
     @property
     def _seconds(self) -> float:
