@@ -15,10 +15,11 @@ from deal_hw.errors import (
 from deal_hw.sim.robots.hardware_section import TICKS
 from deal_hw.sim.robots.positive import positive_directions
 from deal_hw.sim.robots.robot_file import RobotFile
+from deal_hw.sim.robots.travel import middle_zero
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.workflows.own_robot.by_hand import Hands, Turned
 from deal_hw.workflows.own_robot.dialogue import Dialogue
-from deal_hw.workflows.own_robot.fitting import STS3215_RAD_S, MeasuredServo, middle_zero, with_servos
+from deal_hw.workflows.own_robot.fitting import STS3215_RAD_S, MeasuredServo, with_servos
 
 _AGAIN: Final = "turn it from one end to the other again"
 

@@ -13,10 +13,10 @@ from deal_hw.findings import Finding, Severity
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection, ServoEntry
 from deal_hw.sim.robots.positive import positive_directions
 from deal_hw.sim.robots.robot_file import JointEntry
+from deal_hw.sim.robots.travel import angles
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.workflows.own_robot.by_hand import Hands
 from deal_hw.workflows.own_robot.dialogue import Dialogue
-from deal_hw.workflows.own_robot.fitting import angles
 from deal_hw.workflows.own_robot.lerobot import LeRobotMotor
 
 _ROUNDS: Final = 100

@@ -169,7 +169,7 @@ def with_calibration(
                 velocity_limit=STS3215_RAD_S,
                 p_gain=P_GAIN,
                 d_gain=D_GAIN,
-                travels=motor.swept,
+                measured=motor.swept,
             )
         )
     again = "calibrate it again with LeRobot"
