@@ -23,6 +23,10 @@ from deal_hw.types import FloatArray
 BRAKE: Final = 0.55
 """Damping of a motor whose terminals are joined [N·m·s/rad]: kt²/R of an STS3215 in BAM's identification."""
 
+_SENSE_TICKS: Final = 5
+"""Physics steps between two looks of the servos' protections, which take ten milliseconds and more. A request
+that comes between them is answered with what is measured then."""
+
 
 class ArmDevice:
     """An arm in device time, for a pseudo-terminal or a virtual wire.
@@ -78,14 +82,15 @@ class ArmDevice:
         self._batch.set_state(home[None], np.zeros((1, len(home))))
         self._setpoint = home.copy()
         self._wanted = home.copy()
-        self._sense()
+        self.bus.sense = self._sense
+        self._sense(0)
         for joint in self.joints:
             joint.begin()
 
     @property
     def true_position(self) -> FloatArray:
         """True positions of the joints, (J,) [rad]; never on the wire."""
-        return np.array(self._batch.position[0])
+        return np.array(self._batch.position[0] - self._batch.bias[0])
 
     def turn(self, joint: str, position: float | None) -> None:
         """Hold a joint at a position [rad] as by hand, from the next tick on; None lets it go.
@@ -139,7 +144,7 @@ class ArmDevice:
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the packets that they complete."""
         self.received_bytes += len(data)
-        self._sense()
+        self._sense(self._now_ns)
         self.bus.receive(data)
         self._take_goals(self._now_ns)
 
@@ -148,20 +153,21 @@ class ArmDevice:
         out = bytearray()
         while self.device_ns <= device_ns:
             out += self.tick()
-        self._advance_clock(device_ns)
+        self.set_time(device_ns)
         return bytes(out)
 
     def tick(self) -> bytes:
         """Run the next tick or answer; return the bytes sent."""
-        self._advance_clock(self.device_ns)
+        self.set_time(self.device_ns)
         reply_ns = self.bus.next_ns
         if reply_ns is not None and reply_ns <= self._now_ns < (self._tick + 1) * self._tick_ns:
             return self.bus.take_reply()
         self._step()
         return b""
 
-    def _advance_clock(self, now_ns: int) -> None:
-        self.bus.now_ns = self._now_ns = max(self._now_ns, now_ns)
+    def set_time(self, device_ns: int) -> None:
+        """Take the time [ns], after all ticks up to it."""
+        self.bus.now_ns = self._now_ns = max(self._now_ns, device_ns)
 
     def _step(self) -> None:
         now_ns = self._tick * self._tick_ns
@@ -172,7 +178,8 @@ class ArmDevice:
         self._batch.advance(self._setpoint[None, None, self._actuated])
         self._hold()
         self._tick += 1
-        self._sense()
+        if self._tick % _SENSE_TICKS == 0:
+            self._sense(self._now_ns)
 
     def _hold(self) -> None:
         """Leave the joints where hands hold them."""
@@ -222,13 +229,13 @@ class ArmDevice:
             self._sent = sent
             self._batch.set_sent(kp, kd, effort)
 
-    def _sense(self) -> None:
-        """Set the registers of what the servos measure now.
+    def _sense(self, now_ns: int) -> None:
+        """Set the registers of what the servos measure at a time [ns].
 
         A servo samples faster than a physics step: between two steps the joint moves on at its velocity.
         """
         d = self._description
-        since_s = 1e-9 * (self._now_ns - self._tick * self._tick_ns)
+        since_s = 1e-9 * (now_ns - self._tick * self._tick_ns)
         noise = d.sensor.noise if self._noisy else (0.0,) * len(d.joint_names)
         nothing = (0.0,) * len(d.joint_names)
         velocity = self._batch.velocity[0]

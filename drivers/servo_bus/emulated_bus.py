@@ -167,17 +167,16 @@ class EmulatedBus(ServosSide[EmulatedServo]):
                 # Each waits for the answer of the servo before it, which never comes.
                 break
             speaker = listeners[0]
+            if not fast:
+                self.sense(self._free_ns)
             error, data = speaker.read(address, size)
             if error:
                 return
             parts.append((servo, error | speaker.alert, data))
-        if speaker is None:
-            return
-        if fast:
+            if not fast:
+                self._send(packet, speaker, status(*parts[-1]))
+        if fast and speaker is not None:
             self._send(packet, speaker, fast_status(parts, sum(size + 4 for _, _, size in wanted)))
-            return
-        for part in parts:
-            self._send(packet, speaker, status(*part))
 
     def _reply(
         self,
@@ -202,8 +201,12 @@ class EmulatedBus(ServosSide[EmulatedServo]):
 
     def _send(self, packet: Packet, servo: EmulatedServo, data: bytes) -> None:
         wire_s = BITS_PER_BYTE * (packet.size + len(data)) / servo.baud_rate
-        start_ns = max(self.now_ns, self._replies[-1][0] if self._replies else 0)
-        self._replies.append((start_ns + round((wire_s + servo.return_delay_s) * 1e9), data))
+        self._replies.append((self._free_ns + round((wire_s + servo.return_delay_s) * 1e9), data))
+
+    @property
+    def _free_ns(self) -> int:
+        """When the wire is free for the next answer [ns]."""
+        return max(self.now_ns, self._replies[-1][0] if self._replies else 0)
 
     def _answer_protocol_1(self, servo: EmulatedServo, wanted: int, code: int, params: bytes) -> None:
         if wanted != servo.id or code not in (Instruction.PING, Instruction.READ):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from deal_hw.drivers.transports.virtual_wire import TickingCore, VirtualWire
 from deal_hw.transport import Message
@@ -20,13 +20,24 @@ class DeviceCore(TickingCore, Protocol):
         ...
 
 
+@runtime_checkable
+class TimedCore(Protocol):
+    """A device that also keeps the time between ticks, such as servos that measure when they are asked."""
+
+    def set_time(self, device_ns: int) -> None:
+        """Take the time [ns], after all ticks up to it."""
+        ...
+
+
 class VirtualTransport(VirtualWire[DeviceCore]):
     """A virtual wire that carries a stream of bytes."""
 
     def send(self, message: Message) -> None:
-        """Give bytes to the device; its next tick handles them."""
+        """Give bytes to the device, at the time of the clock, which may lie between two ticks."""
         self._check()
         self._catch_up()
+        if isinstance(self.device, TimedCore):
+            self.device.set_time(self._clock.now_ns() - self._origin_ns)
         self.device.receive(message.payload)
 
     def _run_tick(self, tick_ns: int) -> None:

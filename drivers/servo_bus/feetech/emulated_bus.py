@@ -1,7 +1,8 @@
 """A bus of emulated STS servos: handles requests, and answers at the time a real bus would.
 
 Assumed, as no source says it: in a sync read each servo waits for the time that the answers before its own
-take, and not for the answers themselves. So the others still answer if one is missing. A broadcast ping is
+take, and not for the answers themselves, and reads its registers then. So the others still answer if one is
+missing. A broadcast ping is
 answered in the order of the ids. An incomplete request is forgotten after 10 ms without bytes.
 """
 
@@ -149,6 +150,7 @@ class StsBus(ServosSide[StsServo]):
             return
         rate = self.host_baud_rate or BAUD_RATES[0]
         for servo in servos:
+            self.sense(max(self._free_ns, self._now_ns))
             answers = self._data(servo, address, size) if servo != BROADCAST else []
             if answers:
                 rate = answers[0][0].baud_rate
