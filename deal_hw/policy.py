@@ -40,6 +40,7 @@ Quantity = Literal[
     "target_rotation",
     "command",
     "clock",
+    "joint_target",
 ]
 Observation = npt.NDArray[np.float32]
 
@@ -94,9 +95,10 @@ class ObservationTerm:
 
     Attributes:
         quantity: The observed quantity. Positions are relative to the default pose; "action" is a former
-            action. "command" is the requested velocity of the base: x and y [m/s], z [rad/s]. "clock" is a
-            phase that turns ``clock_hz`` times a second from the first observation on. Command and clock are
-            the same at all delays, unless the spec says ``delayed_commands``.
+            action; "joint_target" is the position that a joint is to reach, relative to the default pose.
+            "command" is the requested velocity of the base: x and y [m/s], z [rad/s]. "clock" is a
+            phase that turns ``clock_hz`` times a second from the first observation on. Joint targets are
+            the same at all delays; so are command and clock, unless the spec says ``delayed_commands``.
         joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z; for the
             clock "sin" or "cos".
         scale: The factor applied to it [1/unit].
@@ -398,6 +400,7 @@ class ObservationBuilder:
         clock: Phase of the clock at the next observation, (...,) [turns]; zero at first and after a reset.
         target: The requested orientation of the base as a rotation vector around the identity, (..., 3)
             [rad]; zero at first.
+        joint_target: The positions that the joints are to reach, (..., J); the default pose at first.
     """
 
     def __init__(self, spec: PolicySpec, batch_shape: tuple[int, ...] = ()) -> None:
@@ -412,6 +415,7 @@ class ObservationBuilder:
         self._world = np.zeros((depth, *batch_shape, 2 * len(AXES)))
         self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.target: FloatArray = np.zeros((*batch_shape, len(AXES)))
+        self.joint_target: FloatArray = np.broadcast_to(self._default, (*batch_shape, J)).copy()
         self.clock: FloatArray = np.zeros(batch_shape)
         # Without delays of their own, command and clock are read as they are now.
         memory = depth if spec.delayed_commands else 1
@@ -515,6 +519,8 @@ class ObservationBuilder:
                 return self._command
             case "clock":
                 return self._clock
+            case "joint_target":
+                return np.asarray((self.joint_target - self._default)[None])
             case "place" | "target_rotation":
                 return self._world
             case "gravity" | "heading" | "angular_velocity" | "linear_velocity" | "height":
@@ -542,7 +548,8 @@ def _reads(spec: PolicySpec) -> list[_Read]:
             np.array(
                 [
                     0
-                    if quantity in ("command", "clock") and not spec.delayed_commands
+                    if quantity == "joint_target"
+                    or (quantity in ("command", "clock") and not spec.delayed_commands)
                     else spec.observation[i].delay
                     for i in found
                 ]

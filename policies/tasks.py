@@ -17,6 +17,14 @@ _BALANCE_PPO: Final = {
     "reward_scale": 0.1,
     "steps": 1_500_000,
 }
+_REACH_PPO: Final = {
+    "hidden": (64, 64),
+    "gamma": 0.9,
+    "entropy": 0.0,
+    "exploration": 0.03,
+    "reward_scale": 0.1,
+    "steps": 1_000_000,
+}
 _LEGGED_SAC: Final = {
     "hidden": (128, 128),
     "gradient_steps": 8,
@@ -130,6 +138,14 @@ GO2: Final = TrainingTask(
 )
 HUMANOID: Final = _simulated(
     "humanoid_env:HumanoidEnv", motors=21, udr_ratio=1.75, ppo=_STRIDE_PPO, members=128
+)
+SO101: Final = TrainingTask(
+    environment="deal_hw.policies.reach_env:ReachEnv",
+    trainer="ppo",
+    members={"ppo": 48, "sac": 32},
+    settings={"ppo": _REACH_PPO},
+    udr_ratio=1.75,
+    udr_latency_s=(0.0, 0.02),
 )
 OWN_TASK: Final = TrainingTask(
     environment="deal_hw.policies.own_env:OwnVectorEnv",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -107,11 +108,14 @@ class PolicyBehaviour:
 
     Attributes:
         follows_velocity: Whether it observes a requested velocity.
+        follows_targets: Whether it observes a pose that it is to reach.
 
     Args:
         policy: The policy.
         description: The robot that it will run on.
         source: The requested velocity of the base, for a policy that observes it; by default zero.
+        targets: Returns the pose to reach at a time [s], (A,), for a policy that observes it; by default the
+            robot's default pose.
 
     Raises:
         PolicyMismatchError: The policy was made for another robot, or observes a quantity that this one
@@ -120,7 +124,11 @@ class PolicyBehaviour:
     """
 
     def __init__(
-        self, policy: Policy, description: RobotDescription, source: VelocitySource | None = None
+        self,
+        policy: Policy,
+        description: RobotDescription,
+        source: VelocitySource | None = None,
+        targets: Callable[[float], FloatArray] | None = None,
     ) -> None:
         spec = policy.spec
         spec.check_fits(description)
@@ -137,6 +145,8 @@ class PolicyBehaviour:
         self._slowest, self._fastest = np.array(spec.command_range or ((-np.inf, np.inf),) * 3).T
         self._observes_base = spec.observes_base
         self.follows_velocity = "command" in observed
+        self.follows_targets = "joint_target" in observed
+        self._targets, self._actuated = targets, list(description.actuated_index)
         self._policy = policy
         self._observations = ObservationBuilder(spec)
         self._map = ActionMap.of_robot(spec, description)
@@ -153,6 +163,8 @@ class PolicyBehaviour:
         """Return the policy's command."""
         wanted = self._source.velocity(state, time_s)
         self._observations.command = np.clip(wanted, self._slowest, self._fastest)
+        if self._targets is not None:
+            self._observations.joint_target[self._actuated] = self._targets(time_s)
         observation = self._observations.build(*self._coordinates(state))
         action = np.asarray(self._policy.act(observation), dtype=float)
         if action.shape != self._map.scale.shape:

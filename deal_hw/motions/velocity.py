@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,8 +10,8 @@ from typing import Protocol
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, shown
-from deal_hw.reading import MIB, check_size, reading
+from deal_hw.errors import ConfigurationError
+from deal_hw.motions.time_script import read_script
 from deal_hw.types import FloatArray, RobotState
 
 AXES = ("x", "y", "yaw")
@@ -78,7 +77,10 @@ class ScriptVelocity:
     """
 
     def __init__(self, path: Path) -> None:
-        rows = np.array(_read_script(path))
+        lines = read_script(path, AXES)
+        for number, row in lines:
+            _checked(row[1:], f"{path}: line {number}")
+        rows = np.array([row for _, row in lines])
         self._time_s, self._velocity = rows[:, 0], rows[:, 1:]
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
@@ -236,33 +238,3 @@ def _checked(values: Sequence[float], where: str) -> FloatArray:
         if not abs(value) <= most:
             raise ConfigurationError(f"{where}: {axis} is {value!r}, allowed: -{most:g} to {most:g}")
     return np.array(values, dtype=float)
-
-
-def _read_script(path: Path) -> list[list[float]]:
-    names = ["time_s", *AXES]
-    with reading(f"the script {path}", "CSV", error=ConfigurationError):
-        check_size(path, MIB)
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.reader(file)
-            head = next(reader, [])
-            lines = [(reader.line_num, line) for line in reader if line]
-    if [name.strip() for name in head] != names:
-        raise ConfigurationError(
-            f"{path}: its first line is {shown(','.join(head))}, expected {','.join(names)}"
-        )
-    rows: list[list[float]] = []
-    for number, line in lines:
-        try:
-            row = [float(part) for part in line]
-        except ValueError:
-            row = []
-        if len(row) != len(names) or not math.isfinite(row[0]) or (rows and row[0] <= rows[-1][0]):
-            raise ConfigurationError(
-                f"{path}: line {number} is {shown(','.join(line))}; expected four numbers, with increasing "
-                "times"
-            )
-        _checked(row[1:], f"{path}: line {number}")
-        rows.append(row)
-    if not rows:
-        raise ConfigurationError(f"{path} contains no line after its header; add lines of time_s,x,y,yaw")
-    return rows

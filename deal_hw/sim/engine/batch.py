@@ -151,6 +151,11 @@ class ServoBatch:
         factor = self._acting[kind] / np.where(scalable, default, 1.0)
         return np.where(scalable, factor, 1.0)
 
+    @property
+    def bias(self) -> FloatArray:
+        """Each member's encoder biases, (N, J): reported minus true joint positions."""
+        return self._bias
+
     def lag_s(self, latency_s: FloatArray) -> FloatArray:
         """Return the delay of commands: the latency, plus each actuator's command delay.
 

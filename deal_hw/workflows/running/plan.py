@@ -17,6 +17,7 @@ from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.motions.excitation.level import with_excitation_level
+from deal_hw.motions.joint_targets import make_targets
 from deal_hw.motions.planned_end import PlannedEnd
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.motions.velocity import (
@@ -61,6 +62,8 @@ class RunPlan:
             `deal-hw design-excitation`.
         port: The robot's port, for transports without a descriptor to inherit.
         wire: Options of a transport of topics.
+        target: Poses that an arm's policy is to reach; see
+        :func:`deal_hw.motions.joint_targets.make_targets`.
         velocity: Source of a walking policy's requested velocity; see
         :func:`deal_hw.motions.velocity.make_source`.
         stand: Whether to stand up first and to lie down at the end; not counted in ``seconds``.
@@ -91,6 +94,7 @@ class RunPlan:
     excite: str = ""
     port: str = ""
     wire: WireOptions = field(default_factory=WireOptions)
+    target: str = ""
     velocity: str = "0,0,0"
     stand: bool = False
     posture: PostureConfig = field(default_factory=PostureConfig)
@@ -290,7 +294,7 @@ def _inner_behaviour(
         config = dataclasses.replace(config, duration_s=plan.seconds)
         balance = PolicyBehaviour(policy(), description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)
-    return PolicyBehaviour(policy(), description, source)
+    return PolicyBehaviour(policy(), description, source, make_targets(plan.target, description).at)
 
 
 def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:
