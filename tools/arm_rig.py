@@ -93,7 +93,9 @@ class Rig:
         space = default_space(self.description)
         values = {**space.known, **{p.name: p.nominal for p in space.parameters}}
         truth = SimulatedTruth(parameters=values, latency_s=0.0, seed=0)
-        self.device: ArmDevice = arm_device(device_file or self.file, self.description, truth, noisy=False)
+        hardware = (device_file or self.file).hardware
+        assert hardware is not None
+        self.device: ArmDevice = arm_device(hardware, self.description, space, truth, noisy=False)
         self.virtual = VirtualTransport(self.device, self.clock)
         self.robot = ServoArm(
             wrap(self.virtual), self.clock, self.description, self.file.hardware, FAMILIES[bus]()

@@ -51,6 +51,7 @@ from deal_hw.drivers.cartpole.wire.odrive_frames import (
     Command,
 )
 from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
+from deal_hw.drivers.so101.emulator import homed, limits_of
 from deal_hw.errors import TransportError
 from deal_hw.robots import recorded_description
 from deal_hw.workflows.emulation.process import EmulatorProcess
@@ -164,6 +165,17 @@ def write_files(client: Client, folder: Path) -> None:
         calibration.write_text(json.dumps(motors))
         mjcf = recorded_description("so101").mjcf
         new_robot(mjcf, lerobot=calibration, out=folder / "robot.yaml", name="my so101")
+    if "homed" in client.files:
+        motors = {
+            servo.joint: {
+                "id": servo.id,
+                "drive_mode": 0,
+                "homing_offset": 0,
+                **dict(zip(("range_min", "range_max"), limits_of(servo), strict=True)),
+            }
+            for servo in homed().servos
+        }
+        (folder / "so101.json").write_text(json.dumps(motors))
 
 
 def prepare(client: Client, port: str) -> None:

@@ -20,7 +20,7 @@ from PIL import Image
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
-from deal_hw.robots.so101.description import DESCRIPTION as SO101
+from deal_hw.drivers.so101.description import DESCRIPTION as SO101
 
 SIZE = (400, 340)
 """Width and height of a robot [px]."""

@@ -145,7 +145,7 @@ def _stiffness(mjcf: str) -> dict[str, float]:
 
 
 def _so101(ask: _Ask) -> FilesSettings:
-    from deal_hw.robots.so101.description import DESCRIPTION
+    from deal_hw.drivers.so101.description import DESCRIPTION
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
     held_out = ("step_response", "slow_precision")

@@ -1,7 +1,7 @@
 """``deal-hw demo``: all five jobs on an emulated robot with hidden physics.
 
-The part of each robot is in :mod:`deal_hw.cli.demo_cartpole` and :mod:`deal_hw.cli.demo_go2`. This module has
-stages, summary and tables.
+The part of each robot is in :mod:`deal_hw.cli.demo_cartpole`, :mod:`deal_hw.cli.demo_go2` and
+:mod:`deal_hw.cli.demo_so101`. This module has stages, summary and tables.
 """
 
 from __future__ import annotations
@@ -43,10 +43,11 @@ class Demo(Checked):
     """Record, calibrate, retrain, deploy and compare on an emulated robot."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """cartpole balances its pole, go2 walks."""
+    """cartpole balances its pole, go2 walks, so101 reaches poses."""
 
     out: Path | None = None
-    """Run folder, by default runs/demo (go2: runs/demo_go2). A former demo in it is deleted."""
+    """Run folder, by default runs/demo (go2: runs/demo_go2, so101: runs/demo_so101). A former demo in it is
+    deleted."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """Sensor effects of the emulated robot, as for `deal-hw emulate`."""
@@ -55,11 +56,11 @@ class Demo(Checked):
     """Seed of the hidden truth, the motion, the search and the training."""
 
     episodes: Annotated[int | None, Range(1, 1000)] = None
-    """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s."""
+    """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s. SO-101: 1 of 16 s."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps. Cart-pole: by default as many as for the shipped UDR policy. Go2: 300,000, starting
-    from the shipped policy."""
+    from the shipped policy. SO-101: 500,000."""
 
     @property
     def folder(self) -> Path:
@@ -89,9 +90,15 @@ class DemoGo2(Demo):
     """Calibrate from a recording with the body on a stand instead of from the walk."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class DemoSo101(Demo):
+    """Record, calibrate, retrain, deploy and compare on an emulated SO-101, which reaches poses."""
+
+
 _TABLE = {
     "cartpole": InputKind(DemoCartpole, example="cartpole --out runs/demo"),
     "go2": InputKind(DemoGo2, example="go2 --out runs/demo_go2"),
+    "so101": InputKind(DemoSo101, example="so101 --out runs/demo_so101"),
 }
 KINDS = Kinds(
     noun="robot",
@@ -311,7 +318,10 @@ def _median_errors(done: Demonstrated) -> dict[str, float]:
     """Return the median relative error of the parameters that have a value, by estimate."""
     result, beside = done.found.result, done.beside
     has_value = [v != "not identifiable" for v in result.verdicts]
-    rows = [k for k, p in enumerate(result.space) if p.name in done.truth and has_value[k]]
+    # A bias around 0 has no relative error.
+    rows = [
+        k for k, p in enumerate(result.space) if p.name in done.truth and has_value[k] and p.scale == "log"
+    ]
     if not rows:
         return {}
     truth = np.array([done.truth[result.space.names[k]] for k in rows])

@@ -167,8 +167,21 @@ HUMANOID: Final = RobotEntry(
 SO101: Final = RobotEntry(
     name="so101",
     api_version=API_VERSION,
-    description="deal_hw.robots.so101.description:DESCRIPTION",
-    spaces="deal_hw.robots.so101.description:SPACES",
+    wires=(
+        WireEntry(
+            name="serial",
+            transport="serial",
+            driver="deal_hw.drivers.so101.robot:so101_robot",
+            opens_port=True,
+            emulator="deal_hw.robots.file_emulator:emulate_so101",
+        ),
+    ),
+    description="deal_hw.drivers.so101.description:DESCRIPTION",
+    recorded="deal_hw.drivers.so101.description:DRIVEN",
+    spaces="deal_hw.drivers.so101.description:SPACES",
+    task="deal_hw.policies.tasks:SO101",
+    environment="deal_hw/SO101-v0",
+    policy="deal_hw.policies:assets/so101_udr.onnx",
 )
-ROBOTS: Final = (CARTPOLE, GO2, GO2_ON_STAND, ALLEGRO, ANT, GO2_SUSPENDED, HUMANOID, SO101)
+ROBOTS: Final = (CARTPOLE, GO2, GO2_ON_STAND, SO101, ALLEGRO, ANT, GO2_SUSPENDED, HUMANOID)
 """Those with a driver first: messages list them in this order."""

@@ -1,11 +1,15 @@
-"""``deal-hw emulate robot.yaml``: the robot's servos on a pseudo-terminal, with hidden physics."""
+"""Emulated arms of servos on a pseudo-terminal, with hidden physics: of a robot.yaml, and the SO-101."""
 
 from __future__ import annotations
 
 from typing import Final
 
 from deal_hw.description import RobotDescription
+from deal_hw.drivers.servo_arm.connect import section_of
 from deal_hw.drivers.servo_arm.emulator import arm_device
+from deal_hw.drivers.so101.description import emulated_space
+from deal_hw.drivers.so101.emulator import so101_device
+from deal_hw.parameters import ParameterSpace
 from deal_hw.robots.emulation import Emulation, EmulatorRequest, on_pseudo_terminal
 from deal_hw.schema import from_values
 from deal_hw.sim.robots.robot_file import RobotFile
@@ -18,23 +22,32 @@ LATENCY_S: Final = 0.005
 
 
 def emulate_arm(file: RobotFile, description: RobotDescription, request: EmulatorRequest) -> Emulation:
-    """Return an emulated arm behind a pseudo-terminal.
+    """Return an emulated arm of a robot.yaml behind a pseudo-terminal.
 
     Args:
         file: The robot, with its section ``hardware``.
         description: Its description.
         request: What was asked for.
     """
-    truth = _truth(description, request)
-    device = arm_device(file, description, truth, noisy=request.profile != "ideal")
+    space = default_space(description)
+    truth = truth_of(space, request)
+    noisy = request.profile != "ideal"
+    device = arm_device(section_of(file), description, space, truth, noisy=noisy)
     return on_pseudo_terminal(device, request, truth.to_json())
 
 
-def _truth(description: RobotDescription, request: EmulatorRequest) -> SimulatedTruth:
+def emulate_so101(request: EmulatorRequest) -> Emulation:
+    """Return an emulated SO-101 behind a pseudo-terminal; its servos keep LeRobot's calibration."""
+    truth = truth_of(emulated_space(), request)
+    device = so101_device(truth, noisy=request.profile != "ideal")
+    return on_pseudo_terminal(device, request, truth.to_json())
+
+
+def truth_of(space: ParameterSpace, request: EmulatorRequest) -> SimulatedTruth:
+    """Return the hidden values that a request asks for: given ones, the nominal ones, or drawn ones."""
     if request.truth is not None:
         names = ("parameters", "latency_s", "seed")
         return from_values(SimulatedTruth, {name: request.truth.get(name) for name in names})
-    space = default_space(description)
     latency_s = 0.0 if request.profile == "ideal" else LATENCY_S
     if request.nominal:
         values = {**space.known, **{p.name: p.nominal for p in space.parameters}}

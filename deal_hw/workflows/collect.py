@@ -12,7 +12,6 @@ from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.motions.excitation.level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.ranges import Range
 from deal_hw.workflows.options import FROM_PYTHON, File, RunSeconds, Seed, from_settings, given, refuse
-from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
@@ -29,7 +28,7 @@ from deal_hw.workflows.running.settings import (
 )
 from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import balancing_policy, stands_alone
 
 EXCITATION_FILE = "excitation.json"
 """File of the excitation of `--excite optimal`, in the run folder."""
@@ -148,7 +147,7 @@ def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> Ru
     _refuse_ignored(config)
     if isinstance(config, CollectSimulatedSettings):
         return _rehearse(config, view)
-    policy = config.policy or shipped_policy(config.robot)
+    policy = config.policy or balancing_policy(config.robot)
     excite, seconds = _excitation(config, view)
     if seconds * config.episodes < SHORT_S:
         view.note(
@@ -162,7 +161,7 @@ def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> Ru
         policy=str(policy or ""),
         seconds=seconds,
         seed=config.seed,
-        rich=config.rich if policy or not is_user_robot(config.robot) else without_balance(config.rich),
+        rich=config.rich if policy or not stands_alone(config.robot) else without_balance(config.rich),
         excitation_level=config.excitation_level,
         excite=excite,
     )

@@ -69,6 +69,15 @@ class DeployCartpoleSettings(CartpoleRunOptions, DeploySettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DeploySo101Settings(DeploySettings):
+    """Run a policy on an SO-101 behind the safety filter, and record it."""
+
+    target: str = ""
+    """Pose to reach: the joints' positions [rad], such as 0.2,-0.5,0.4,0,0,0; or a script: a CSV file with
+    time_s and a column for each joint. By default the start pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DeployLeggedSettings(DeploySettings):
     """Run a policy on a robot with legs behind the safety filter, and record it."""
 
@@ -82,7 +91,7 @@ class DeployGo2Settings(Go2RunOptions, DeployLeggedSettings):
 
 
 DEPLOY = robot_kinds(
-    {"cartpole": DeployCartpoleSettings, "go2": DeployGo2Settings},
+    {"cartpole": DeployCartpoleSettings, "go2": DeployGo2Settings, "so101": DeploySo101Settings},
     plain=DeploySettings,
     legged=DeployLeggedSettings,
     example="--port {port} --policy runs/first/policies/policy.onnx",
@@ -116,6 +125,7 @@ def run(config: DeploySettings, view: RunView) -> RunReport:
         **plan_options(config.robot, config.link, legs_of(config)),
         motion="balance",
         policy=str(policy or ""),
+        target=config.target if isinstance(config, DeploySo101Settings) else "",
         seconds=config.seconds,
         seed=config.seed,
         dry_run=config.dry_run,

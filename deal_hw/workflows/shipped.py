@@ -23,6 +23,18 @@ def shipped_policy(robot: str) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
+def stands_alone(robot: str) -> bool:
+    """Return whether a robot cannot fall: it has no pole to balance, no legs, and its base is fixed."""
+    entry = robot_entry(robot)
+    facts = entry.model_description()
+    return not (entry.balance or facts.rest_position or facts.floating_base)
+
+
+def balancing_policy(robot: str) -> Path | None:
+    """Return the shipped policy by which a robot is kept from falling; None if it needs none."""
+    return None if stands_alone(robot) else shipped_policy(robot)
+
+
 def required_policy(robot: str) -> Path:
     """Return the policy that is shipped for a robot.
 
@@ -39,13 +51,13 @@ def required_policy(robot: str) -> Path:
 
 
 def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
-    """Return a function that makes a robot's balancing behaviour; None if the robot has no policy.
+    """Return a function that makes a robot's balancing behaviour; None if there is no policy for it.
 
     Raises:
         MissingExtraError: onnxruntime is not installed.
         PolicyError: The policy must not run on this robot.
     """
-    path = policy or shipped_policy(description.name)
+    path = policy or balancing_policy(description.name)
     return None if path is None else _tried(path, description)
 
 
@@ -54,7 +66,7 @@ def shipped_balancer(description: RobotDescription) -> Callable[[], Behaviour] |
 
     Calibration needs it for advice alone, and runs without onnxruntime.
     """
-    path = shipped_policy(description.name)
+    path = balancing_policy(description.name)
     if path is None:
         return None
     make = functools.cache(lambda: _tried(path, description))

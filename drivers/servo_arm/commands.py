@@ -39,11 +39,17 @@ class CommandCodec:
     Args:
         description: The robot; all its joints are actuated, in any order.
         hardware: Its servos.
+        limits: Lowest and highest position that a servo takes as its goal, by id [ticks]; none by default.
     """
 
-    def __init__(self, description: RobotDescription, hardware: HardwareSection) -> None:
+    def __init__(
+        self,
+        description: RobotDescription,
+        hardware: HardwareSection,
+        limits: Mapping[int, tuple[int, int]] | None = None,
+    ) -> None:
         by_joint = {servo.joint: servo for servo in hardware.servos}
-        self._description = description
+        self._description, self._limits = description, dict(limits or {})
         self._nominal = {one.id: LoopGains(one.p_gain, one.i_gain, one.d_gain) for one in hardware.servos}
         self._most_gain = MOST_GAIN[hardware.bus]
         self.joints: tuple[ServoEntry, ...] = tuple(by_joint[name] for name in description.joint_names)
@@ -57,9 +63,11 @@ class CommandCodec:
 
     def goals(self, position: FloatArray) -> dict[int, int]:
         """Return the servos' goals for joint positions, (J,) [rad]."""
-        return {
-            servo.id: clipped(servo.ticks(float(at))) for servo, at in zip(self.joints, position, strict=True)
-        }
+        return {servo.id: self._goal(servo, at) for servo, at in zip(self.joints, position, strict=True)}
+
+    def _goal(self, servo: ServoEntry, position: float) -> int:
+        low, high = self._limits.get(servo.id, (0, TICKS - 1))
+        return min(max(servo.ticks(float(position)), low), high)
 
     def positions(self, samples: Mapping[int, ServoSample]) -> FloatArray:
         """Return the joints' positions, (J,) [rad]."""
@@ -86,7 +94,7 @@ class CommandCodec:
         self._check(command)
         goals, gains, shares = {}, {}, {}
         for a, servo in enumerate(self._actuated):
-            goals[servo.id] = clipped(servo.ticks(float(command.position_target[a])))
+            goals[servo.id] = self._goal(servo, command.position_target[a])
             nominal = self._nominal[servo.id]
             gains[servo.id] = LoopGains(
                 self._gain(nominal.p, command.stiffness[a], d.stiffness[a]),

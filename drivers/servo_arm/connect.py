@@ -9,6 +9,7 @@ from deal_hw.drivers.servo_arm.robot import ServoArm
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import ConfigurationError
+from deal_hw.sim.robots.hardware_section import HardwareSection
 from deal_hw.sim.robots.robot_file import RobotFile
 from deal_hw.transport import Transport
 
@@ -35,13 +36,29 @@ def servo_arm(
     Raises:
         ConfigurationError: The file names no bus.
     """
-    hardware = file.hardware
-    if hardware is None:
-        raise ConfigurationError(f"robot {file.name!r} has no section `hardware` in its robot.yaml")
+    hardware = section_of(file)
+    link = bus_link(hardware, port, clock, fd, can_send=can_send)
+    return ServoArm(link, clock, description, hardware, FAMILIES[hardware.bus]())
+
+
+def bus_link(
+    hardware: HardwareSection, port: str, clock: Clock, fd: int | None, *, can_send: bool
+) -> Transport:
+    """Return the byte stream of a bus, not opened; arguments as :func:`servo_arm`."""
     link: Transport
     if fd is None:
         link = SerialTransport(port, hardware.baud_rate, clock)
     else:
         link = SerialTransport.from_fd(fd, clock, port, hardware.baud_rate)
-    family = FAMILIES[hardware.bus]()
-    return ServoArm(link if can_send else listen_only(link), clock, description, hardware, family)
+    return link if can_send else listen_only(link)
+
+
+def section_of(file: RobotFile) -> HardwareSection:
+    """Return the section ``hardware`` of a robot.
+
+    Raises:
+        ConfigurationError: It has none.
+    """
+    if file.hardware is None:
+        raise ConfigurationError(f"robot {file.name!r} has no section `hardware` in its robot.yaml")
+    return file.hardware

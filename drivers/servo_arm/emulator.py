@@ -1,36 +1,34 @@
-"""Makes an emulated arm from its robot.yaml."""
+"""Makes an emulated arm of servos."""
 
 from __future__ import annotations
 
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.device import ArmDevice
 from deal_hw.drivers.servo_arm.emulated_families import EMULATED
-from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.robots.robot_file import RobotFile
-from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
+from deal_hw.sim.robots.hardware_section import HardwareSection
+from deal_hw.sim.robots.simulated import SimulatedTruth
 
 
 def arm_device(
-    file: RobotFile, description: RobotDescription, truth: SimulatedTruth, *, noisy: bool = True
+    hardware: HardwareSection,
+    description: RobotDescription,
+    space: ParameterSpace,
+    truth: SimulatedTruth,
+    *,
+    noisy: bool = True,
 ) -> ArmDevice:
     """Return an emulated arm.
 
     Args:
-        file: The robot, with its section ``hardware``.
-        description: Its description.
-        truth: Hidden parameters.
+        hardware: Its servos.
+        description: The robot.
+        space: The parameters of the truth.
+        truth: Their hidden values.
         noisy: Whether positions have the noise of the description.
-
-    Raises:
-        ConfigurationError: The file names no bus.
     """
-    hardware = file.hardware
-    if hardware is None:
-        raise ConfigurationError(f"robot {file.name!r} has no section `hardware` in its robot.yaml")
     by_joint = {servo.joint: servo for servo in hardware.servos}
-    joints, bus = EMULATED[hardware.bus](
-        [by_joint[name] for name in description.joint_names], hardware.baud_rate
-    )
-    robot, space = load_model(description), default_space(description)
-    return ArmDevice(hardware, robot, space, truth, joints, bus, noisy=noisy)
+    servos = [by_joint[name] for name in description.joint_names]
+    joints, bus = EMULATED[hardware.bus](servos, hardware.baud_rate)
+    return ArmDevice(hardware, load_model(description), space, truth, joints, bus, noisy=noisy)

@@ -49,6 +49,7 @@ class ArmExamination:
         hardware: The servos.
         description: The robot.
         where: The port, for messages.
+        source: Where ids and models stand, for messages.
     """
 
     def __init__(
@@ -58,18 +59,23 @@ class ArmExamination:
         hardware: HardwareSection,
         description: RobotDescription,
         where: str,
+        source: str = "robot.yaml",
     ) -> None:
         self._bus, self._family, self._hardware = bus, family, hardware
-        self._description, self._where = description, where
+        self._description, self._where, self._source = description, where, source
 
     def run(self) -> ArmInfo:
-        """Return what was found.
+        """Return what was found; raises as :meth:`presence` and :meth:`settings`."""
+        return self.settings(self.presence())
+
+    def presence(self) -> dict[int, Answer]:
+        """Return the servos' answers to a ping, by id.
 
         Raises:
             TransportTimeoutError: A servo is silent.
             WrongDeviceError: A servo is of another model.
             VersionMismatchError: A servo's protocol or firmware is too old.
-            ConfigurationError: A servo has other settings, or the bus is too slow; the message says which.
+            ConfigurationError: The bus is too slow.
         """
         self._check_speed()
         found: dict[int, Answer] = {}
@@ -82,11 +88,31 @@ class ArmExamination:
         missing = [servo for servo in self._hardware.servos if servo.id not in found]
         if missing:
             raise self._absent(missing, found)
+        for servo in self._hardware.servos:
+            self._check_model(servo, found[servo.id])
+        return found
+
+    def settings(
+        self, found: Mapping[int, Answer], limits: Mapping[int, tuple[int, int]] | None = None
+    ) -> ArmInfo:
+        """Check the servos' settings.
+
+        Args:
+            found: Their answers.
+            limits: Lowest and highest goal of a servo, by id [ticks], where it is narrower than the
+                description's.
+
+        Raises:
+            TransportTimeoutError: A servo fell silent.
+            ConfigurationError: A servo has other settings; the message says which.
+        """
         phrases = []
         for servo in self._hardware.servos:
-            model = self._check_model(servo, found[servo.id])
             low, high = sorted(servo.ticks(angle) for angle in self._range(servo))
-            self._surely(servo, partial(self._checked, servo.id, low, high))
+            least, most = (limits or {}).get(servo.id, (low, high))
+            checked = partial(self._checked, servo.id, max(low, least), min(high, most))
+            self.surely(servo, checked)
+            model = self._family.model_name(found[servo.id].model)
             phrases.append(f"{servo.joint}: servo {servo.id}, {model}, firmware {found[servo.id].firmware}")
         return ArmInfo("; ".join(phrases))
 
@@ -98,7 +124,7 @@ class ArmExamination:
             raise ConfigurationError(
                 f"at {self._hardware.baud_rate} baud one state of {count} servos and a command take "
                 f"{1e3 * need_s:.1f} ms, more than half of the {1e3 * period_s:g} ms between two states; "
-                "raise baud_rate (on the servos, too), or lower state_rate_hz in robot.yaml"
+                f"raise baud_rate (on the servos, too), or lower state_rate_hz ({self._source})"
             )
 
     def _checked(self, servo: int, low: int, high: int) -> bool:
@@ -114,25 +140,24 @@ class ArmExamination:
         if not there:
             return TransportTimeoutError(
                 f"{self._where}: no servo answers at {self._hardware.baud_rate} baud; check the servos' "
-                "supply, the adapter's cable, the port, and baud_rate in robot.yaml"
+                f"supply, the adapter's cable, the port, and the baud rate ({self._source})"
             )
         listed = ", ".join(f"{i} ({self._family.model_name(one.model)})" for i, one in sorted(there.items()))
         return TransportTimeoutError(
             f"{self._where}: servo {absent} does not answer; these do: {listed}. Check the cable between the "
-            "servos, and the ids in robot.yaml; of two servos with one id neither can be read"
+            f"servos, and the ids ({self._source}); of two servos with one id neither can be read"
         )
 
-    def _check_model(self, servo: ServoEntry, answer: Answer) -> str:
+    def _check_model(self, servo: ServoEntry, answer: Answer) -> None:
         model = self._family.model_name(answer.model)
         known = servo.model.lower()
         if problem := self._family.unknown_model(answer.model):
             raise WrongDeviceError(f"{self._where}: servo {servo.id} ({servo.joint}) {problem}")
         if known and known != model:
             raise WrongDeviceError(
-                f"{self._where}: servo {servo.id} ({servo.joint}) is a {model}, robot.yaml says {known}; "
-                "check id and model there"
+                f"{self._where}: servo {servo.id} ({servo.joint}) is a {model}, {self._source} says "
+                f"{known}; check id and model there"
             )
-        return model
 
     def _try(self, request: Callable[[], T]) -> T | None:
         for _ in range(_TRIES):
@@ -142,7 +167,7 @@ class ArmExamination:
                 continue
         return None
 
-    def _surely(self, servo: ServoEntry, request: Callable[[], T]) -> T:
+    def surely(self, servo: ServoEntry, request: Callable[[], T]) -> T:
         """Return an answer of a servo that is known to be there.
 
         Raises:

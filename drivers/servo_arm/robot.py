@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -58,6 +58,7 @@ class ServoArm(PolledRobot[ServoBus]):
 
     Attributes:
         info: What the servos report; None before ``connect``.
+        source: Where ids, zeros and directions stand, for messages.
 
     Args:
         transport: A byte stream at the bus' baud rate.
@@ -68,6 +69,7 @@ class ServoArm(PolledRobot[ServoBus]):
     """
 
     stopped_by = "the servos' supply switch"
+    source: ClassVar[str] = "robot.yaml"
     info: ArmInfo | None
 
     def __init__(
@@ -81,9 +83,8 @@ class ServoArm(PolledRobot[ServoBus]):
         bus = family.bus(transport, clock, hardware.baud_rate, hardware.answer_ms * 1e-3)
         super().__init__(transport, clock, bus, description.state_rate_hz, "the servos' supply and cable")
         self.description = description  # type: ignore[misc]  # A user's robot is known at run time.
-        self._hardware, self._family = hardware, family
-        self._codec = CommandCodec(description, hardware)
-        self._servos = self._codec.joints
+        self._family = family
+        self._take_hardware(hardware)
         self._ids = tuple(servo.id for servo in self._servos)
         self._rest = tuple(servo.rest for servo in self._servos)
         self.lowers = None not in self._rest  # type: ignore[misc]
@@ -91,6 +92,14 @@ class ServoArm(PolledRobot[ServoBus]):
         fastest = max((v for v in description.limits.trip_velocity if np.isfinite(v)), default=np.inf)
         self._reach = _REACH * fastest / RAD
         self._forget()
+
+    def _take_hardware(
+        self, hardware: HardwareSection, limits: Mapping[int, tuple[int, int]] | None = None
+    ) -> None:
+        """Take the servos' facts and, by id, the range of their goals [ticks]."""
+        self._hardware = hardware
+        self._codec = CommandCodec(self.description, hardware, limits)
+        self._servos = self._codec.joints
 
     def _forget(self) -> None:
         super()._forget()
@@ -106,7 +115,12 @@ class ServoArm(PolledRobot[ServoBus]):
 
     def _examine(self) -> ArmInfo:
         """Find all servos, and check their models and settings; nothing is changed."""
-        return ArmExamination(self._bus, self._family, self._hardware, self.description, self._where).run()
+        return self._examination().run()
+
+    def _examination(self) -> ArmExamination:
+        return ArmExamination(
+            self._bus, self._family, self._hardware, self.description, self._where, self.source
+        )
 
     # Motion to the start pose, and torque.
 
@@ -202,7 +216,7 @@ class ServoArm(PolledRobot[ServoBus]):
                 raise SafetyError(
                     f"{self.description.name}: joint {servo.joint} is at {at:.2f} rad, outside {low:.2f} "
                     f"to {high:.2f}: move it by hand (without torque: deal-hw stop), or check zero and "
-                    "direction of its servo in robot.yaml"
+                    f"direction of its servo ({self.source})"
                 )
 
     def _move(self, start: FloatArray, end: FloatArray, end_ns: int) -> None:

@@ -19,9 +19,9 @@ from deal_hw.control.process.channel import Outcome
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
+from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.motions.excitation.plan import ExcitationBehaviour, read_plan
-from deal_hw.robots.so101.description import DESCRIPTION as ARM
 from deal_hw.workflows.collect import _excitation
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour

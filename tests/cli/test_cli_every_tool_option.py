@@ -302,7 +302,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr("deal_hw.workflows.policy._tried", tried)
     experiment = types.SimpleNamespace(afresh=note("afresh"), space=None, refused=0)
-    demos = [importlib.import_module(f"deal_hw.cli.demo_{robot}") for robot in ("cartpole", "go2")]
+    demos = [importlib.import_module(f"deal_hw.cli.demo_{robot}") for robot in ("cartpole", "go2", "so101")]
     emulated = contextlib.nullcontext(types.SimpleNamespace(port="p"))
     files = {"distribution.json": Path("distribution.json")}
     for demo in demos:

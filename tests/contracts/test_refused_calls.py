@@ -127,9 +127,9 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
         "--episodes 0: give at least 1",
     ),
     (
-        lambda: train_policy("so101", udr_distribution("cartpole"), Path("p.onnx")),
+        lambda: train_policy("go2_suspended", udr_distribution("cartpole"), Path("p.onnx")),
         UnknownNameError,
-        "unknown robot with a training environment 'so101'; known: allegro, ant, cartpole, go2, humanoid",
+        "unknown robot with a training environment 'go2_suspended'; known: allegro, ant, cartpole, go2",
     ),
     (lambda: make_behaviour(PLAN, DESCRIPTION), PolicyError, "give --policy FILE"),
     (lambda: EmulatorProcess("cartpole").pid, TransportError, "the emulator is not running"),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from deal_hw.control.safety.filter import SafetyFilter
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.motions.behaviours import HoldBehaviour, centre
 from deal_hw.motions.excitation.limits import fit_to_limits, predicted_effort, room
@@ -27,7 +28,6 @@ from deal_hw.motions.excitation.plan import (
     read_plan,
 )
 from deal_hw.motions.excitation.waveforms import Tones
-from deal_hw.robots.so101.description import DESCRIPTION as ARM
 from deal_hw.types import FloatArray, RobotState, Status
 
 DESIGNS = st.builds(

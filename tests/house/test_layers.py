@@ -49,9 +49,10 @@ The package names its workflows and their settings, and loads them on use."""
 ROOMS = {
     "control": ({"process", "safety"}, {"loop"}),
     "motions": (
-        {"planned_end", "velocity"},
+        {"planned_end", "time_script"},
+        {"velocity"},
         {"behaviours", "scores"},
-        {"excitation", "posture"},
+        {"excitation", "joint_targets", "posture"},
     ),
     "calib": (
         {"data"},
@@ -60,7 +61,7 @@ ROOMS = {
         {"design"},
         {"pipeline", "report"},
     ),
-    "drivers": ({"command_echo", "servo_bus", "transports"}, {"cartpole", "go2", "servo_arm"}),
+    "drivers": ({"command_echo", "servo_bus", "transports"}, {"cartpole", "go2", "servo_arm"}, {"so101"}),
     "drivers.cartpole": (
         {"description"},
         {"wire", "plant"},

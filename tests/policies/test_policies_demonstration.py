@@ -80,7 +80,7 @@ def test_shipped_policies_fit_their_robots_and_their_records(robot: str) -> None
 def test_there_is_no_policy_for_every_robot() -> None:
     """The message lists those that have one."""
     with pytest.raises(UnknownNameError, match="cartpole"):
-        demonstration_policy("so101")
+        demonstration_policy("go2_suspended")
 
 
 @pytest.mark.parametrize("robot", FLOATING)

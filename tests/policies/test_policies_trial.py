@@ -24,6 +24,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
+from deal_hw.drivers.so101.description import DESCRIPTION as SO101
 from deal_hw.errors import MissingExtraError, PolicyError, PolicyMismatchError
 from deal_hw.install import install_line
 from deal_hw.motions.behaviours import PolicyBehaviour
@@ -34,7 +35,6 @@ from deal_hw.policies.trial import TrialPolicy, TrialSettings, check_policy
 from deal_hw.policies.trial_states import ProbeStates
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.robots.ant.description import DESCRIPTION as ANT
-from deal_hw.robots.so101.description import DESCRIPTION as SO101
 from deal_hw.workflows.running.plan import RunPlan, check_plan, make_behaviour
 from deal_hw.workflows.shipped import balancer, shipped_balancer, shipped_policy
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from deal_hw.data.importing.columns import parse_column_map
-from deal_hw.robots.so101.description import DESCRIPTION, RANGE_RAD
+from deal_hw.drivers.so101.description import DESCRIPTION, RANGE_RAD
 
 
 def test_travel_of_the_jaw_lies_in_the_models_range() -> None:

@@ -54,7 +54,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("import_policy", {**IMPORT, "policy": "none.onnx"}, "no such file: none.onnx"),
     ("import_policy", {**IMPORT, "robot": "go3"}, "unknown robot 'go3'; known: "),
     ("import_policy", {**IMPORT, "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 1 to 1000 Hz"),
-    ("deploy", {**CARTPOLE, "robot": "so101"}, "so101"),
+    ("deploy", {**CARTPOLE, "robot": "go2_suspended"}, "go2_suspended"),
     ("deploy", {**CARTPOLE, "policy": "none.onnx"}, "none.onnx"),
     ("deploy", {**CARTPOLE, "episodes": 0}, "--episodes 0: allowed are 1 to 10000"),
     ("deploy", CARTPOLE, "no-port"),
@@ -90,7 +90,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("inspect", {"episode": "none.mcap"}, "none.mcap cannot be read"),
     ("inspect", {"episode": "none.mcap", "window": 0.0}, "--window 0.0 s: allowed are 0.001 to 600 s"),
     ("doctor", {"robot": "go2", "port": "lo", "seconds": 0.0}, "--seconds 0.0 s: allowed are 0.5 to 600 s"),
-    ("emulate", {"robot": "so101"}, "unknown robot to emulate 'so101'; known: cartpole, go2"),
+    ("emulate", {"robot": "ant"}, "unknown robot to emulate 'ant'; known: cartpole, go2"),
     (
         "emulate",
         {"robot": "go2", "transport": "can"},

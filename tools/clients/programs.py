@@ -32,8 +32,8 @@ class Client:
         own_python: Whether the user must name its Python, because no environment can be made for it here.
         prepare: What the user does before: "velocity" sets an ODrive to velocity control, "factory" resets
             servos, except id and rate.
-        files: Files in its working folder: "endpoints" and "config" of the emulated ODrive, and "so101", an
-            SO-101's robot.yaml and LeRobot's calibration of it.
+        files: Files in its working folder: "endpoints" and "config" of the emulated ODrive; "so101", an
+            SO-101's robot.yaml and LeRobot's calibration of it; "homed", that of the emulated SO-101.
         servo_rate: Baud rate of the servos.
         keys: Pairs: what is printed, and the keys to press then; each once, in this order.
         must: Regular expressions that its output must contain.
@@ -52,7 +52,7 @@ class Client:
     packages: tuple[str, ...] = ()
     own_python: bool = False
     prepare: Literal["", "velocity", "factory"] = ""
-    files: tuple[Literal["endpoints", "config", "so101"], ...] = ()
+    files: tuple[Literal["endpoints", "config", "so101", "homed"], ...] = ()
     servo_rate: int = 57_600
     keys: tuple[tuple[str, str], ...] = ()
     must: tuple[str, ...] = ()
@@ -192,6 +192,27 @@ CLIENTS: Final = (
             r"off by at most [0-3]\.",
             "connected: False",
         ),
+    ),
+    Client(
+        name="SO101Follower",
+        source="lerobot/src/lerobot/robots",
+        command=("{tools}/so_follower.py", "{port}", "{folder}"),
+        emulator=("so101", "--profile", "ideal", "--nominal"),
+        paths=("lerobot/src",),
+        packages=(
+            "torchvision",
+            "deepdiff",
+            "tqdm",
+            "draccus",
+            "accelerate",
+            "datasets",
+            "av",
+            "einops",
+            "opencv-python-headless",
+            "feetech-servo-sdk",
+        ),
+        files=("homed",),
+        must=("calibrated: True", r"off by at most [0-7]\.", "connected: False"),
     ),
     _feetech("ping.py", must=(r"\[ID:001\] ping Succeeded. SCServo model number : 777",)),
     _feetech(

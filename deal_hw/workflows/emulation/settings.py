@@ -97,7 +97,7 @@ class EmulateSettings(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Hidden parameters lie within this factor of the nominal ones; by default 5 for the cart-pole, 2 for the
-    Go2."""
+    Go2, 1.5 for an arm."""
 
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
@@ -247,9 +247,16 @@ class EmulateGo2Settings(EmulateSettings):
 _SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettings, "go2": EmulateGo2Settings}
 
 
+_HELP = {
+    "so101": "Emulate an SO-101 in real time on a port of its own: its servos' bytes, with hidden physics."
+}
+
+
 def _table() -> dict[str, InputKind]:
     found = {
-        name: InputKind(_SETTINGS.get(name, EmulatePlugInSettings), example=f"{name} --seed 0")
+        name: InputKind(
+            _SETTINGS.get(name, EmulatePlugInSettings), _HELP.get(name, ""), example=f"{name} --seed 0"
+        )
         for name in emulated_robots()
     }
     what = "Emulate the robot of a robot.yaml: its servos' bytes on a port of its own, with hidden physics."

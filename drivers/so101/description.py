@@ -5,7 +5,9 @@ Joint names are those of mujoco_menagerie and LeRobot.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +15,8 @@ from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
 from deal_hw.parameters import Parameter, ParameterSpace
 
 JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+WEIGHTED: Final = ("shoulder_lift", "elbow_flex", "wrist_flex")
+"""The joints that carry weight."""
 RANGE_RAD: Final = (
     (-1.91986, 1.91986),
     (-1.7453293, 1.7453293),
@@ -28,6 +32,8 @@ FRICTIONLOSS_NM: Final = 0.052
 ARMATURE_KGM2: Final = 0.028
 EFFORT_LIMIT_NM: Final = 2.94
 ENCODER_BIAS_RAD: Final = 0.15
+EMULATED_BIAS_RAD: Final = 0.05
+"""Largest error of an emulated arm's calibrated middle (assumed): 3 degrees, 33 ticks."""
 
 DESCRIPTION: Final = RobotDescription(
     name="so101",
@@ -74,6 +80,28 @@ DESCRIPTION: Final = RobotDescription(
     },
 )
 
+TARGET_RAD_S: Final = 3.6
+"""Largest speed of targets: 0.7 of the 5.2 rad/s (3400 ticks/s) that an STS3215 turns at 7.4 V."""
+TRIP_RAD_S: Final = 8.0
+"""A loaded joint that falls is faster than its motor drives it."""
+DRIVEN: Final = dataclasses.replace(
+    DESCRIPTION,
+    state_rate_hz=100.0,
+    limits=dataclasses.replace(
+        DESCRIPTION.limits,
+        target_step=(TARGET_RAD_S / DESCRIPTION.control_rate_hz,) * 6,
+        trip_velocity=(TRIP_RAD_S,) * 6,
+        stiffness=(2 * STIFFNESS_NM_RAD,) * 6,
+        damping=(0.0,) * 6,
+    ),
+    sources={
+        **DESCRIPTION.sources,
+        "state_rate_hz": "own choice: a sample of six servos and a command take 2 ms of the bus",
+        "limits": "as there; targets slower than the servo turns; twice the gain is the factory's P of 32",
+    },
+)
+"""The arm on its own wire, as deal-hw drives and records it."""
+
 
 def _rows() -> list[Parameter]:
     rows = (
@@ -90,16 +118,14 @@ def _rows() -> list[Parameter]:
 
 
 def parameter_space() -> ParameterSpace:
-    """Return 30 parameters: servo stiffness, damping, frictionloss, armature and encoder bias of each joint.
+    """Return 27 parameters: servo stiffness, damping, frictionloss, armature, and the bias of three joints.
 
     Frictionloss, damping and armature start from the published model, whose authors call them guesses.
     Gravity has no effect at shoulder_pan and wrist_roll. There the recordings determine only the ratios of
     these and the stiffness well; the links' own inertia adds little. The bias is the calibrated zero (middle
-    of the travel)
-    minus the model's.
+    of the travel) minus the model's. It shows only where a joint carries weight.
     """
-    biases = [Parameter.encoder_bias(joint, ENCODER_BIAS_RAD) for joint in JOINTS]
-    return ParameterSpace([*_rows(), *biases])
+    return ParameterSpace([*_rows(), *_biases(WEIGHTED, ENCODER_BIAS_RAD)])
 
 
 def unbiased_space() -> ParameterSpace:
@@ -107,5 +133,19 @@ def unbiased_space() -> ParameterSpace:
     return ParameterSpace(_rows())
 
 
-SPACES: Final = {"default": parameter_space, "unbiased": unbiased_space}
+def biased_space() -> ParameterSpace:
+    """Return 30 parameters, with the encoder bias of each joint, also where no recording shows it."""
+    return ParameterSpace([*_rows(), *_biases(JOINTS, ENCODER_BIAS_RAD)])
+
+
+def emulated_space() -> ParameterSpace:
+    """Return the parameters of an emulated arm: those of the set "biased", with smaller biases."""
+    return ParameterSpace([*_rows(), *_biases(JOINTS, EMULATED_BIAS_RAD)])
+
+
+def _biases(joints: Iterable[str], most: float) -> list[Parameter]:
+    return [Parameter.encoder_bias(joint, most) for joint in joints]
+
+
+SPACES: Final = {"default": parameter_space, "unbiased": unbiased_space, "biased": biased_space}
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""
