@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +31,8 @@ class ImportSettings(Checked):
     """Settings of :func:`import_recordings`."""
 
     paths: tuple[Path, ...]
-    """Recordings of one robot: CSV, NPZ or MCAP files, folders of LeRobot datasets or ROS 2 bags, episodes
-    and datasets of deal-hw."""
+    """Recordings of one robot: CSV, NPZ, MCAP or db3 files, folders of LeRobot datasets or ROS 2 bags,
+    episodes and datasets of deal-hw."""
     out: Path
     """The dataset to make, or to add to."""
     columns: Path | None = None
@@ -86,16 +87,21 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         ConfigurationError: The column map, model or description cannot be used.
     """
     from deal_hw.data.importing.channels import digest_of_file
-    from deal_hw.data.importing.columns import read_column_map
+    from deal_hw.data.importing.columns import ColumnMap, read_column_map
     from deal_hw.data.importing.grid import common_period, to_trajectories
-    from deal_hw.data.importing.load import load_tables
+    from deal_hw.data.importing.load import MapOf, load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
     from deal_hw.data.recording.episode_info import verdict_json
     from deal_hw.data.table import table_of
+    from deal_hw.workflows.ros2_columns import columns_of_robot
 
     _refuse_ignored(config)
-    columns = None if config.columns is None else read_column_map(config.columns)
+    columns: ColumnMap | MapOf | None = None
+    if config.columns is not None:
+        columns = read_column_map(config.columns)
     robot = None if config.robot is None else load_robot(config.robot)
+    if columns is None and robot is not None and robot.file.ros2 is not None:
+        columns = functools.partial(columns_of_robot, robot.file, robot.file.ros2)
     facts = _joint_facts(config.model if robot is None else robot.mjcf, say)
     described = None if config.description is None else _description(config.description)
     joints = None if facts is None else facts.names

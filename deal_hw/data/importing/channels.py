@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -114,6 +115,13 @@ def digest_of_file(path: Path) -> str:
         return sha256_of(path).hexdigest()
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def digest_of_files(paths: Sequence[Path]) -> str:
+    """Return the SHA-256 of a file, or that of the digests of several; errors as :func:`digest_of_file`."""
+    if len(paths) == 1:
+        return digest_of_file(paths[0])
+    return hashlib.sha256("".join(map(digest_of_file, paths)).encode()).hexdigest()
 
 
 def as_floats(values: object) -> FloatArray:

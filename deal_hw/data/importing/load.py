@@ -24,6 +24,8 @@ from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
 
 Say = Callable[[str], None]
+MapOf = Callable[[Channels], ColumnMap | None]
+"""Returns the column map of a file's channels; None: it is guessed."""
 _CSV = "deal_hw.data.importing.csv_source:read_csv"
 _READERS = {
     ".csv": _CSV,
@@ -31,6 +33,7 @@ _READERS = {
     ".txt": _CSV,
     ".npz": "deal_hw.data.importing.npz_source:read_npz",
     ".mcap": "deal_hw.data.importing.mcap_source:read_mcap",
+    ".db3": "deal_hw.data.importing.bag_source:read_bag",
 }
 """MODULE:FUNCTION that reads a file, imported on use, by the end of its name."""
 _HEAD_BYTES = 1 << 20
@@ -49,10 +52,6 @@ def read_channels(path: Path) -> list[Channels]:
         return _read_folder(path)
     if not path.exists():
         raise DatasetError(f"{path} does not exist; check its name")
-    if path.suffix.lower() == ".db3":
-        raise DatasetError(
-            f"{path} is a ROS 2 bag in SQLite; write it as MCAP (`ros2 bag convert` with storage_id: mcap)"
-        )
     if is_episode(path):
         return [read_own(path)]
     reader = _READERS.get(path.suffix.lower())
@@ -75,20 +74,20 @@ def _read_folder(path: Path) -> list[Channels]:
 
         dataset = Dataset.open(path, lambda text: None)
         return [read_own(dataset.path(index)) for index in range(len(dataset.episodes))]
-    bags = sorted(path.glob("*.mcap")) if (path / "metadata.yaml").is_file() else []
-    if len(bags) == 1:
-        from deal_hw.data.importing.mcap_source import read_mcap
+    if (path / "metadata.yaml").is_file():
+        from deal_hw.data.importing.bag_source import bag_files, read_bag
 
-        return [read_mcap(bags[0])]
+        if bags := bag_files(path):
+            return [read_bag(bags[0] if len(bags) == 1 else path, bags)]
     raise DatasetError(
-        f"{path} is a folder, but not a dataset, a LeRobot dataset (meta/info.json) or a ROS 2 bag of "
-        "one MCAP file (metadata.yaml); name a file"
+        f"{path} is a folder, but not a dataset, a LeRobot dataset (meta/info.json) or a ROS 2 bag "
+        "(metadata.yaml beside .mcap or .db3 files); name a file"
     )
 
 
 def load_tables(
     path: Path,
-    columns: ColumnMap | None = None,
+    columns: ColumnMap | MapOf | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
     printed: dict[str, str] | None = None,
@@ -99,7 +98,7 @@ def load_tables(
     Args:
         path: A CSV, NPZ or MCAP file, our own episode, or the folder of our own dataset, of LeRobot's or of a
             ROS 2 bag.
-        columns: Meaning of its channels; None: guessed from their names.
+        columns: Meaning of its channels, or what returns it; None: guessed from their names.
         joints: Names of the model's joints; None: those of the map, or of the file.
         say: Called with sentences on guesses and omissions.
         printed: Guessed maps that were printed already, each with the recording's name; a new one is added.
@@ -119,7 +118,7 @@ def load_tables(
 
 def tables_of(
     recordings: Sequence[Channels],
-    columns: ColumnMap | None = None,
+    columns: ColumnMap | MapOf | None = None,
     joints: Sequence[str] | None = None,
     say: Say | None = None,
     printed: dict[str, str] | None = None,
@@ -128,11 +127,12 @@ def tables_of(
     """Interpret channels, as :func:`load_tables` does for a file."""
     tables = []
     for number, channels in enumerate(recordings):
-        used = columns or _guess(channels, joints, say)
+        mapped = columns(channels) if callable(columns) else columns
+        used = mapped or _guess(channels, joints, say)
         if kinds is not None:
             used = used.for_model(kinds)
         if say is not None:
-            _tell(say, channels, used, joints, columns is None and number == 0, printed)
+            _tell(say, channels, used, joints, mapped is None and number == 0, printed)
         table = build_table(channels, used, joints)
         if unsaid := _unsaid(table, used):
             table.source["unsaid"] = unsaid

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import lz4.frame
 import numpy as np
@@ -21,6 +21,7 @@ from deal_hw.errors import DatasetError, short
 from deal_hw.reading import MIB, NAMES, NUMBERS, RECORDING_BYTES, check_size, reading
 from deal_hw.types import FloatArray
 
+BagMessage: TypeAlias = tuple[Schema | None, Channel, Message]
 STAMP_FIELDS = ("log_time", "header.stamp")
 """Times of each topic [s]: the recorder's time of receipt, and the sender's time."""
 MAGIC = b"\x89MCAP0\r\n"
@@ -69,17 +70,28 @@ def read_mcap(path: Path) -> Channels:
             raise ValueError(f"it begins with {begin!r}, MCAP with {MAGIC!r}: it is another kind of file")
         digest = digest_of_file(path)
         try:
-            return _channels(path, digest)
+            return channels_of(path, digest, messages(path))
         except struct.error as error:
             raise ValueError("it ends, or is damaged, in the middle of a record") from error
 
 
-def _channels(path: Path, digest: str) -> Channels:
+def channels_of(
+    path: Path, digest: str, bag: Iterable[BagMessage], left_out: Mapping[str, str] | None = None
+) -> Channels:
+    """Return the channels of the messages of a bag; to be called inside :func:`~deal_hw.reading.reading`.
+
+    Args:
+        path: The bag.
+        digest: Digest of its bytes.
+        bag: Its messages, each with schema and channel.
+        left_out: Topics whose messages are not in ``bag``, and why; it may grow as that is read.
+    """
     topics: dict[str, list[dict[str, Any]]] = {}
     types: dict[str, str] = {}
-    factory, notes = DecoderFactory(), {}
+    factory = DecoderFactory()
+    notes: dict[str, str] = {}
     budget = NUMBERS
-    for schema, channel, message in _messages(path):
+    for schema, channel, message in bag:
         if channel.topic not in notes:
             notes[channel.topic] = _reason_to_leave_out(schema)
             types[channel.topic] = "" if schema is None else schema.name
@@ -112,13 +124,14 @@ def _channels(path: Path, digest: str) -> Channels:
                 arrays[f"{topic}.{field}"] = values
                 if names and values.ndim == 2 and values.shape[1] == len(names):
                     labels[f"{topic}.{field}"] = names
-    left_out = tuple(f"{short(topic, 60)} is left out: {why}" for topic, why in notes.items() if why)
+    reasons = {**(left_out or {}), **notes}
+    said = tuple(f"{short(topic, 60)} is left out: {why}" for topic, why in reasons.items() if why)
     return Channels(
-        path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels, types=types, notes=left_out
+        path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels, types=types, notes=said
     )
 
 
-def _messages(path: Path) -> Iterator[tuple[Schema | None, Channel, Message]]:
+def messages(path: Path) -> Iterator[BagMessage]:
     """Yield the messages of a file in its own order, checksums compared."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}

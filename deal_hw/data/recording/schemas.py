@@ -80,8 +80,12 @@ class RosMessageType:
                     out += value
         return _HEADER + out
 
-    def decode(self, data: bytes) -> tuple[Any, ...]:
+    def decode(self, data: bytes, *, whole: bool = False) -> tuple[Any, ...]:
         """Return the values of one message in the order of the fields; float64[] as read-only arrays.
+
+        Args:
+            data: The bytes with their 4-byte header.
+            whole: Whether nothing but padding may follow the message.
 
         Raises:
             ProtocolError: The bytes are not such a message.
@@ -90,7 +94,10 @@ class RosMessageType:
             raise ProtocolError(f"{self.name}: not little-endian CDR, it starts with {data[:4]!r}")
         cursor = _Reader(data[4:])
         try:
-            return tuple(cursor.value(kind) for kind, _ in self.fields)
+            values = tuple(cursor.value(kind) for kind, _ in self.fields)
+            if whole:
+                cursor.check_end()
+            return values
         except (struct.error, ValueError) as error:
             raise ProtocolError(
                 f"{self.name}: {len(data)} bytes do not contain the message: {error}"
@@ -148,6 +155,11 @@ class _Reader:
         if count:
             self._offset += -self._offset % 8
         return np.frombuffer(self._take(8 * count), dtype="<f8")
+
+    def check_end(self) -> None:
+        """Check that at most padding to whole words is left."""
+        if (left := len(self._data) - self._offset) > 3:
+            raise ValueError(f"{left} bytes are left at its end")
 
     def _scalar(self, layout: struct.Struct) -> Any:
         self._offset += -self._offset % layout.size
@@ -253,6 +265,30 @@ JOINT_STATE = RosMessageType(
     "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
     + _HEADER_TEXT,
 )
+FLOAT64_MULTI_ARRAY = RosMessageType(
+    "std_msgs/msg/Float64MultiArray",
+    (*_of("uint32", "dimensions data_offset"), ("float64[]", "data")),
+    "std_msgs/MultiArrayLayout layout\nfloat64[] data\n"
+    f"{_SECTION}std_msgs/MultiArrayLayout\nstd_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n"
+    f"{_SECTION}std_msgs/MultiArrayDimension\nstring label\nuint32 size\nuint32 stride\n",
+)
+"""An array without a layout: ``dimensions``, the length of that list, is 0."""
+JOINT_TRAJECTORY = RosMessageType(
+    "trajectory_msgs/msg/JointTrajectory",
+    (
+        *_STAMP,
+        ("string", "frame_id"),
+        ("string[]", "joint_names"),
+        ("uint32", "points"),
+        *_of("float64[]", "positions velocities accelerations effort"),
+        *_STAMP,
+    ),
+    "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points\n"
+    f"{_SECTION}trajectory_msgs/JointTrajectoryPoint\nfloat64[] positions\nfloat64[] velocities\n"
+    "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start\n"
+    f"{_SECTION}builtin_interfaces/Duration\nint32 sec\nuint32 nanosec\n" + _HEADER_TEXT,
+)
+"""A trajectory of one point: ``points``, the length of that list, is 1."""
 LOG = RosMessageType(
     "foxglove_msgs/msg/Log",
     (
