@@ -198,6 +198,25 @@ class WireOptions(NetworkOptions):
         return from_values(cls, values)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicEnd:
+    """A writer or reader of a topic in another program, as the network's discovery shows it.
+
+    Attributes:
+        who: Its program, for messages.
+        writes: Whether it writes the topic; else it reads it.
+        type_name: DDS name of the topic's type there; "" if it is not shown.
+        type_hash: ROS 2's hash of that type; "" if it is not shown.
+        ours: Whether it is a deal-hw that commands robots from this computer.
+    """
+
+    who: str
+    writes: bool
+    type_name: str = ""
+    type_hash: str = ""
+    ours: bool = False
+
+
 class TopicTransport(Transport):
     """A transport of messages with topics: publish and subscribe, without a specific peer.
 
@@ -225,6 +244,10 @@ class TopicTransport(Transport):
 
         A transport that cannot know them (Zenoh) returns nothing; for certainty, listen to the topic as well.
         """
+
+    def ends(self, topic: str) -> tuple[TopicEnd, ...] | None:
+        """Return the writers and readers of a declared topic in other programs; None: it cannot know them."""
+        return None
 
     @property
     def stream(self) -> int | None:

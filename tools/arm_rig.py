@@ -86,19 +86,19 @@ class Rig:
     ) -> None:
         self.file = arm_file(folder, bus, **section)
         self.description = file_description(self.file, folder / "arm.xml")
-        assert self.file.hardware is not None
+        assert self.file.servo_bus is not None
         self.clock = VirtualClock()
         self.phases: list[str] = []
         self.loop: Any = None
         space = default_space(self.description)
         values = {**space.known, **{p.name: p.nominal for p in space.parameters}}
         truth = SimulatedTruth(parameters=values, latency_s=0.0, seed=0)
-        hardware = (device_file or self.file).hardware
+        hardware = (device_file or self.file).servo_bus
         assert hardware is not None
         self.device: ArmDevice = arm_device(hardware, self.description, space, truth, noisy=False)
         self.virtual = VirtualTransport(self.device, self.clock)
         self.robot = ServoArm(
-            wrap(self.virtual), self.clock, self.description, self.file.hardware, FAMILIES[bus]()
+            wrap(self.virtual), self.clock, self.description, self.file.servo_bus, FAMILIES[bus]()
         )
 
     @property

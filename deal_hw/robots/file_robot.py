@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.data.files import dataset_of
 from deal_hw.description import RobotDescription
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 WIRE = "serial"
 """The wire of a servo bus: an adapter on a serial port."""
+ROS2_PORTS: Final = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
+"""The wires of a robot of ros2_control, and where its emulator is by default: on this machine only."""
 
 
 def is_robot_file(robot: str) -> bool:
@@ -60,7 +62,7 @@ def file_entry(robot: str) -> RobotEntry:
     return RobotEntry(
         name=robot,
         api_version=API_VERSION,
-        wires=(_wire(path, file),) if file.hardware is not None else (),
+        wires=_wires(path, file),
         recorded=lambda: driven_description(path, file),
         machine=machine_of(robot),
     )
@@ -92,29 +94,46 @@ def _read(path: Path) -> RobotFile:
 
 def no_driver(robot: str) -> str:
     """Return what to do with a robot.yaml that names no hardware."""
-    how = page("how-to/servo-arm.md")
+    how = page("reference/robot-file.md")
     return (
-        f"{robot}: deal-hw has no driver for this robot. If its servos are on a bus, write the section "
-        f"`hardware` into its robot.yaml ({how}); or record its simulation with --simulated, or import "
-        "recordings of it: deal-hw data import"
+        f"{robot}: deal-hw has no driver for this robot. If its servos are on a bus, or ros2_control moves "
+        f"it, write the section `hardware` into its robot.yaml ({how}); or record its simulation with "
+        "--simulated, or import recordings of it: deal-hw data import"
     )
 
 
-def _wire(path: Path, file: RobotFile) -> WireEntry:
-    return WireEntry(
-        name=WIRE,
-        transport=WIRE,
-        driver=_of_file("deal_hw.drivers.servo_arm.connect:servo_arm", path, file),
-        opens_port=True,
-        emulator=_of_file("deal_hw.robots.file_emulator:emulate_arm", path, file),
+def _wires(path: Path, file: RobotFile) -> tuple[WireEntry, ...]:
+    if file.ros2 is not None:
+        return tuple(
+            WireEntry(
+                name=name,
+                transport=name,
+                driver=_of_file("deal_hw.robots.file_ros2:ros2_driver", path, file, name),
+                opens_port=True,
+                emulator=_of_file("deal_hw.robots.file_ros2:emulate_ros2", path, file),
+                emulator_port=port,
+                examine=_of_file("deal_hw.robots.file_ros2:examine_ros2", path, file, name),
+            )
+            for name, port in ROS2_PORTS.items()
+        )
+    if file.servo_bus is None:
+        return ()
+    return (
+        WireEntry(
+            name=WIRE,
+            transport=WIRE,
+            driver=_of_file("deal_hw.drivers.servo_arm.connect:servo_arm", path, file),
+            opens_port=True,
+            emulator=_of_file("deal_hw.robots.file_emulator:emulate_arm", path, file),
+        ),
     )
 
 
-def _of_file(reference: str, path: Path, file: RobotFile) -> Callable[[], Any]:
-    """Return a reference to a function that also gets the robot's file and its description."""
+def _of_file(reference: str, path: Path, file: RobotFile, *more: object) -> Callable[[], Any]:
+    """Return a reference to a function that also gets the robot's file, its description, and more."""
 
     def made() -> Any:
         function = load(reference, f"robot {file.name!r}")
-        return functools.partial(function, file, driven_description(path, file))
+        return functools.partial(function, file, driven_description(path, file), *more)
 
     return made

@@ -59,6 +59,6 @@ def section_of(file: RobotFile) -> HardwareSection:
     Raises:
         ConfigurationError: It has none.
     """
-    if file.hardware is None:
-        raise ConfigurationError(f"robot {file.name!r} has no section `hardware` in its robot.yaml")
-    return file.hardware
+    if file.servo_bus is None:
+        raise ConfigurationError(f"robot {file.name!r} has no bus of servos in its robot.yaml")
+    return file.servo_bus

@@ -80,6 +80,7 @@ class DdsEndpoint:
         type_hash: Complete XTypes hash of that type in hexadecimal; "" if it is not reported.
         writes: Whether it writes the topic.
         peer: The participant that it belongs to.
+        ros_hash: ROS 2's hash of that type, from its user data; "" without (Humble and older, no ROS).
     """
 
     key: uuid.UUID
@@ -88,6 +89,7 @@ class DdsEndpoint:
     type_hash: str
     writes: bool
     peer: DdsPeer
+    ros_hash: str = ""
 
     @property
     def shown_hash(self) -> str:
@@ -162,8 +164,8 @@ class Discovery:
         self._update()
         return tuple(self._peers.values())
 
-    def endpoints(self) -> tuple[DdsEndpoint, ...]:
-        """Return the writers and readers of other participants."""
+    def endpoints(self, topic: str = "") -> tuple[DdsEndpoint, ...]:
+        """Return the writers and readers of other participants, of one topic or of all."""
         self._update()
         return tuple(
             DdsEndpoint(
@@ -173,8 +175,10 @@ class Discovery:
                 type_hash=hash_text(sample.type_id),
                 writes=writes,
                 peer=self._peers.get(owner, DdsPeer(owner, _vendor(owner))),
+                ros_hash=_ros_hash(_user_data(sample.qos.asdict())),
             )
             for key, (owner, writes, sample) in self._endpoints.items()
+            if topic in ("", sample.topic_name)
         )
 
     def survey(self, types: Mapping[str, str]) -> DdsSurvey:
@@ -209,7 +213,7 @@ def _peer(sample: Any) -> DdsPeer:
     def word(key: str) -> str:
         return str(settings.get(f"Property<{key}>", {}).get("value", ""))
 
-    note = base64.b64decode(settings.get("Userdata", {}).get("data", ""))
+    note = _user_data(settings)
     pid = word("__Pid")
     return DdsPeer(
         key=sample.key,
@@ -220,6 +224,24 @@ def _peer(sample: Any) -> DdsPeer:
         addresses=_unicast(word("__NetworkAddresses")),
         deal_hw=note.startswith(OUR_NOTE),
     )
+
+
+def ros_user_data(type_hash: str) -> bytes:
+    """Return the user data by which ROS 2 announces a type's hash (rmw_cyclonedds, rmw_fastrtps)."""
+    return f"typehash={type_hash};".encode()
+
+
+def _ros_hash(user_data: bytes) -> str:
+    """Return the hash in user data such as ``typehash=RIHS01_...;``; "" if there is none."""
+    for entry in user_data.decode("ascii", "replace").split(";"):
+        name, _, value = entry.partition("=")
+        if name == "typehash":
+            return value
+    return ""
+
+
+def _user_data(settings: Mapping[str, Any]) -> bytes:
+    return base64.b64decode(settings.get("Userdata", {}).get("data", ""))
 
 
 def _unicast(locators: str) -> tuple[str, ...]:

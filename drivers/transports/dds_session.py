@@ -64,6 +64,8 @@ class DdsSession:
         topics: Topic -> whether it is written, whether it is read.
         types: Topic -> class of cyclonedds.
         clock: Gives the stamps.
+        announced: Topic -> user data of its writer and reader.
+        note: User data of the participant.
 
     Attributes:
         writers: Topic -> handle for ``write``.
@@ -72,7 +74,13 @@ class DdsSession:
     """
 
     def __init__(
-        self, domain: int, topics: Mapping[str, tuple[bool, bool]], types: Mapping[str, Any], clock: Clock
+        self,
+        domain: int,
+        topics: Mapping[str, tuple[bool, bool]],
+        types: Mapping[str, Any],
+        clock: Clock,
+        announced: Mapping[str, bytes] | None = None,
+        note: bytes = OUR_NOTE,
     ) -> None:
         # These two are private to cyclonedds. Its public calls build a Python object of each message, at ten
         # times the cost. The extra `dds` pins the version, and a test tells when they change.
@@ -91,6 +99,7 @@ class DdsSession:
         self._queue: deque[Message] = deque()
         self._last_ns: int | None = None
         self._arrivals = ArrivalClock()
+        self._announced, self._note = announced or {}, note
         try:
             self._build(domain, topics, types)
         except BaseException:
@@ -163,11 +172,11 @@ class DdsSession:
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
 
-        participant = self._keep(DomainParticipant(domain, qos=Qos(Policy.Userdata(OUR_NOTE))))
+        participant = self._keep(DomainParticipant(domain, qos=Qos(Policy.Userdata(self._note))))
         self.discovery = Discovery(participant)
         self._entities += self.discovery.entities
-        writer_qos = Qos(Policy.Reliability.Reliable(MAX_BLOCKING_NS), Policy.History.KeepLast(1))
-        reader_qos = Qos(
+        writing = (Policy.Reliability.Reliable(MAX_BLOCKING_NS), Policy.History.KeepLast(1))
+        reading = (
             Policy.Reliability.BestEffort,
             Policy.History.KeepLast(READER_DEPTH),
             Policy.IgnoreLocal.Participant,
@@ -175,10 +184,11 @@ class DdsSession:
         conditions = []
         for name, (writes, reads) in topics.items():
             topic = self._keep(Topic(participant, name, types[name]))
+            more = (Policy.Userdata(self._announced[name]),) if name in self._announced else ()
             if writes:
-                self.writers[name] = self._keep(DataWriter(participant, topic, qos=writer_qos))._ref
+                self.writers[name] = self._keep(DataWriter(participant, topic, qos=Qos(*writing, *more)))._ref
             if reads:
-                reader = self._keep(DataReader(participant, topic, qos=reader_qos))
+                reader = self._keep(DataReader(participant, topic, qos=Qos(*reading, *more)))
                 conditions.append(self._keep(ReadCondition(reader, self._mask)))
                 self._readers.append((name, reader))
         # Made last, so deleted first: it detaches its conditions.

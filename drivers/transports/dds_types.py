@@ -205,11 +205,10 @@ def build_types(structs: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
     except ImportError as error:
         raise MissingExtraError("cyclonedds", "dds") from error
     types: Any = idl.types
-    plain = ("int16", "int32", "int64", "uint8", "uint16", "uint32", "float32")
+    plain = ("int16", "int32", "int64", "uint8", "uint16", "uint32", "float32", "float64")
     known: dict[str, Any] = {name: getattr(types, name) for name in plain}
     # `octet` is types.byte, never types.uint8: see the top of this file.
     known |= {"octet": types.byte, "boolean": bool, "string": str}
-    known |= {f"sequence<{name}>": types.sequence[known[name]] for name in ("octet", "uint8")}
     for name, fields in structs.items():
         made = {field: _field(types, known, text) for field, text in fields.items()}
         known[name] = idl.make_idl_struct(name.rpartition("::")[2], name.replace("::", "."), made)
@@ -217,6 +216,8 @@ def build_types(structs: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
 
 
 def _field(types: Any, known: Mapping[str, Any], text: str) -> Any:
+    if text.startswith("sequence<"):
+        return types.sequence[known[text.removeprefix("sequence<").removesuffix(">")]]
     element, _, size = text.rstrip("]").partition("[")
     return types.array[known[element], int(size)] if size else known[element]
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import NoReturn
 
 from deal_hw.errors import SafetyError
-from deal_hw.transport import Message, TopicTransport, Transport, TransportWrapper
+from deal_hw.transport import Message, TopicEnd, TopicTransport, Transport, TransportWrapper
 
 
 class ListenOnly(TransportWrapper):
@@ -45,6 +45,10 @@ class ListenOnlyTopics(ListenOnly, TopicTransport):
     def writers(self, topic: str) -> tuple[str, ...]:
         """Return a description of each other participant that is known to write a topic."""
         return self._topics.writers(topic)
+
+    def ends(self, topic: str) -> tuple[TopicEnd, ...] | None:
+        """Return the writers and readers of a topic in other programs; None: unknown."""
+        return self._topics.ends(topic)
 
 
 def listen_only(transport: Transport) -> Transport:

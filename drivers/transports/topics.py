@@ -7,6 +7,7 @@ unitree_sdk2_python @ 37116c5 and unitree_ros2 @ eea2719.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 from deal_hw.errors import UnknownNameError
@@ -66,3 +67,18 @@ TYPES: Final[Mapping[str, str]] = {
     **{response(service): "unitree_api::msg::dds_::Response_" for service in SERVICES},
 }
 """Topic -> name of its DDS type."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TypedTopics:
+    """Topics of ROS 2, of which a transport knows nothing by itself.
+
+    Attributes:
+        types: Topic, as on the wire of DDS -> DDS name of its type.
+        structs: Struct -> field -> type, as in :mod:`dds_types`; a struct comes after those that it contains.
+        hashes: DDS name of a type -> ROS 2's hash of it, which writers and readers announce.
+    """
+
+    types: Mapping[str, str]
+    structs: Mapping[str, Mapping[str, str]]
+    hashes: Mapping[str, str] = field(default_factory=dict)

@@ -8,7 +8,7 @@ from typing import Protocol
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.transports.virtual_wire import TickingCore, VirtualWire
 from deal_hw.errors import ConfigurationError
-from deal_hw.transport import Message, TopicTransport
+from deal_hw.transport import Message, TopicEnd, TopicTransport
 
 
 class TopicCore(TickingCore, Protocol):
@@ -24,7 +24,11 @@ class TopicCore(TickingCore, Protocol):
 
 
 class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
-    """A virtual wire that carries messages with topics, to the only host on it."""
+    """A virtual wire that carries messages with topics, to the only host on it.
+
+    Attributes:
+        discovered: What discovery shows of other programs, by topic; None: nothing is known.
+    """
 
     port = "virtual"
 
@@ -32,6 +36,7 @@ class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
         super().__init__(device, clock, queue_size)
         self._publish: frozenset[str] = frozenset()
         self._subscribe: frozenset[str] = frozenset()
+        self.discovered: dict[str, tuple[TopicEnd, ...]] | None = None
 
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
         """Declare the topics to use."""
@@ -41,6 +46,15 @@ class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
     def writers(self, topic: str) -> tuple[str, ...]:
         """Return nothing: other writers are unknown."""
         return ()
+
+    def ends(self, topic: str) -> tuple[TopicEnd, ...] | None:
+        """Return what :attr:`discovered` has."""
+        return None if self.discovered is None else self.discovered.get(topic, ())
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        """Let another program publish a message now."""
+        self._catch_up()
+        self._arrive(topic, payload, self._clock.now_ns())
 
     def send(self, message: Message) -> None:
         """Give a message to the device; its next tick handles it.

@@ -8,7 +8,7 @@ import json
 import re
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.transports import zenoh_session
@@ -174,7 +174,7 @@ class ZenohTransport(TopicTransport):
                 )
             if self._lost:
                 raise self._gone()
-            attachment = message.attachment or (self._echoes.next() if self._echoes else None)
+            attachment = message.attachment or self._next_attachment(message.channel)
             try:
                 publisher.put(message.payload, attachment=attachment)
             except Exception as error:  # Zenoh raises an error of its own, which is not imported here.
@@ -248,16 +248,50 @@ class ZenohTransport(TopicTransport):
             self._start(self._follow_links, "zenoh links", events, self._arrived)
         for topic in sorted(self._subscribe):
             # Handlers, never callbacks: a callback's thread prevents the interpreter's end.
-            subscriber = session.declare_subscriber(topic, _ring(), allowed_origin=zenoh.Locality.REMOTE)
+            subscriber = session.declare_subscriber(
+                self._subscribed_key(topic), _ring(), allowed_origin=zenoh.Locality.REMOTE
+            )
             self._start(self._read, f"zenoh {topic}", topic, subscriber, self._arrived)
         for topic in sorted(self._publish):
-            self._publishers[topic] = session.declare_publisher(
-                topic,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.REAL_TIME,
-                express=True,
-                allowed_destination=zenoh.Locality.REMOTE,
-            )
+            self._publishers[topic] = self._publisher(session, self._published_key(topic))
+        self._declare_more(session)
+
+    def _publisher(self, session: zenoh.Session, key: str) -> zenoh.Publisher:
+        import zenoh
+
+        return session.declare_publisher(
+            key,
+            encoding=self._encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+
+    # What another use of Zenoh does in its own way.
+
+    _encoding: ClassVar[str | None] = None
+    """Encoding of the messages; None: none is said."""
+
+    def _published_key(self, topic: str) -> str:
+        """Return the key under which a topic is published."""
+        return topic
+
+    def _subscribed_key(self, topic: str) -> str:
+        """Return the keys, with wildcards, that are a topic's."""
+        return topic
+
+    def _next_attachment(self, topic: str) -> bytes | None:
+        """Return the attachment of the next message on a topic; None for none."""
+        return self._echoes.next() if self._echoes else None
+
+    def _heed(self, attachment: bytes) -> None:
+        """Take the attachment of a received message."""
+        if self._echoes is not None:
+            self._echoes.hear(attachment)
+
+    def _declare_more(self, session: zenoh.Session) -> None:
+        """Declare what else belongs to the session, such as liveliness tokens."""
 
     def _start(self, run: Callable[..., None], name: str, *arguments: object) -> None:
         thread = threading.Thread(target=run, name=name, args=arguments, daemon=True)
@@ -272,8 +306,8 @@ class ZenohTransport(TopicTransport):
     ) -> None:
         for sample in _until_closed(subscriber.recv):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            if attachment and self._echoes is not None:
-                self._echoes.hear(attachment)
+            if attachment:
+                self._heed(attachment)
             self._heard_ns = now_ns = self._clock.now_ns()
             arrived.put(Message(topic, sample.payload.to_bytes(), now_ns, attachment))
 

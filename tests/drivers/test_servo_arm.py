@@ -116,7 +116,7 @@ def test_both_directions_of_mounting(rig: Rig) -> None:
     # The arm's weight bends the shoulder by 0.02 rad.
     np.testing.assert_allclose(true, 0.3, atol=0.03)
     np.testing.assert_allclose(states[-1].position, true, atol=2e-3)
-    assert rig.servos[0].get(GOAL[rig.file.hardware.bus]) == 2048 - round(0.3 * 4096 / (2 * np.pi))  # type: ignore[union-attr]
+    assert rig.servos[0].get(GOAL[rig.file.servo_bus.bus]) == 2048 - round(0.3 * 4096 / (2 * np.pi))  # type: ignore[union-attr]
 
 
 def test_states_stand_on_a_regular_grid(rig: Rig) -> None:
@@ -399,7 +399,7 @@ def test_after_passive_no_goal_is_written(rig: Rig, bus: str) -> None:
 
 def lowered(tmp_path: Path, bus: str) -> Rig:
     """Return an arm with a rest pose."""
-    servos = Rig(tmp_path, bus).file.hardware
+    servos = Rig(tmp_path, bus).file.servo_bus
     assert servos is not None
     rests = tuple(
         dataclasses.replace(servo, rest=at) for servo, at in zip(servos.servos, (1.0, -0.5), strict=True)
@@ -479,7 +479,7 @@ def test_a_missing_servo_is_named_with_those_that_answer(rig: Rig) -> None:
 def test_a_servo_of_another_model_is_refused(tmp_path: Path, bus: str) -> None:
     """robot.yaml names one model, the servo says another."""
     rig = Rig(tmp_path, bus)
-    section = rig.file.hardware
+    section = rig.file.servo_bus
     assert section is not None
     other = {"dynamixel": "xm430-w350", "feetech": "sts3250"}[bus]
     servos = tuple(dataclasses.replace(servo, model=other) for servo in section.servos)

@@ -61,7 +61,11 @@ ROOMS = {
         {"design"},
         {"pipeline", "report"},
     ),
-    "drivers": ({"command_echo", "servo_bus", "transports"}, {"cartpole", "go2", "servo_arm"}, {"so101"}),
+    "drivers": (
+        {"command_echo", "servo_bus", "transports"},
+        {"cartpole", "go2", "ros2", "servo_arm"},
+        {"so101"},
+    ),
     "drivers.cartpole": (
         {"description"},
         {"wire", "plant"},

@@ -247,7 +247,7 @@ def test_a_message_of_the_wheel_names_a_page_that_can_be_opened(unpacked: Path, 
     done = run_elsewhere(code, unpacked, tmp_path)
     assert done.returncode == 2, done.stderr
     (named,) = re.findall(r"(/\S+\.md)", done.stderr)
-    assert Path(named) == unpacked / "deal_hw/docs/how-to/servo-arm.md" and Path(named).is_file()
+    assert Path(named) == unpacked / "deal_hw/docs/reference/robot-file.md" and Path(named).is_file()
 
 
 @pytest.mark.slow

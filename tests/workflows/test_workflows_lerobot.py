@@ -56,7 +56,7 @@ def test_an_so101(tmp_path: Path) -> None:
         recorded_description("so101").mjcf, lerobot=file, out=tmp_path / "robot.yaml", name="mine"
     )
     robot = read_robot_file(path)
-    section = robot.hardware
+    section = robot.servo_bus
     assert section is not None and (section.bus, section.baud_rate) == ("feetech", 1_000_000)
     assert [servo.joint for servo in section.servos] == list(SO101_MOTORS)
     assert {(s.model, s.p_gain, s.d_gain, s.i_gain, s.direction) for s in section.servos} == {
@@ -82,25 +82,25 @@ def test_zero_2048_is_the_pose_of_homing(tmp_path: Path) -> None:
     middle = made(tmp_path, TWO)
     (tmp_path / "robot.yaml").unlink()
     homed = made(tmp_path, TWO, zero="2048")
-    assert middle.hardware is not None and homed.hardware is not None
-    assert [servo.zero for servo in middle.hardware.servos] == [2000, 2050]
-    assert [servo.zero for servo in homed.hardware.servos] == [2048, 2048]
+    assert middle.servo_bus is not None and homed.servo_bus is not None
+    assert [servo.zero for servo in middle.servo_bus.servos] == [2000, 2050]
+    assert [servo.zero for servo in homed.servo_bus.servos] == [2048, 2048]
     assert homed.joints[0].position_range == pytest.approx((-1.5, 952 * RAD), abs=1e-4)
 
 
 def test_an_inverted_motor_counts_the_other_way(tmp_path: Path) -> None:
     """drive_mode 1 is the direction -1."""
     robot = made(tmp_path, TWO | {"elbow": motor(2, 1100, 3000, drive_mode=1)})
-    assert robot.hardware is not None
-    assert [servo.direction for servo in robot.hardware.servos] == [1, -1]
+    assert robot.servo_bus is not None
+    assert [servo.direction for servo in robot.servo_bus.servos] == [1, -1]
 
 
 def test_other_names_are_mapped(tmp_path: Path) -> None:
     """A motor that is not named keeps its name."""
     motors = {"base": TWO["shoulder"], "elbow": TWO["elbow"]}
     robot = made(tmp_path, motors, joint_names=("base=shoulder",))
-    assert robot.hardware is not None
-    assert [(servo.joint, servo.id) for servo in robot.hardware.servos] == [("shoulder", 1), ("elbow", 2)]
+    assert robot.servo_bus is not None
+    assert [(servo.joint, servo.id) for servo in robot.servo_bus.servos] == [("shoulder", 1), ("elbow", 2)]
 
 
 REFUSED: list[tuple[Any, dict[str, Any], str]] = [

@@ -118,7 +118,7 @@ def rig(tmp_path: Path, bus: str) -> Rig:
 
 def survey(rig: Rig) -> Survey:
     """Return the questions to an arm's bus, open."""
-    section = rig.file.hardware
+    section = rig.file.servo_bus
     assert section is not None
     family = FAMILIES[section.bus]()
     rig.virtual.open()
@@ -140,7 +140,7 @@ def opened(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
 
 def new(rig: Rig, person: Person, folder: Path) -> Path:
     """Return the robot.yaml that the verb writes."""
-    section = rig.file.hardware
+    section = rig.file.servo_bus
     assert section is not None
     return deal_hw.new_robot(
         folder / "arm.xml",
@@ -159,10 +159,10 @@ def test_each_joint_is_found_with_direction_zero_and_range(opened: Rig, bus: str
         # Writes to the EEPROM would be lost: nothing is written there.
         assert {servo.get(f.LOCK) for servo in opened.servos} == {f.LOCKED}
     made = read_robot_file(new(opened, person, tmp_path))
-    assert made.hardware is not None and made.hardware.bus == bus
-    built = opened.file.hardware
+    assert made.servo_bus is not None and made.servo_bus.bus == bus
+    built = opened.file.servo_bus
     assert built is not None
-    for one, true in zip(made.hardware.servos, built.servos, strict=True):
+    for one, true in zip(made.servo_bus.servos, built.servos, strict=True):
         assert (one.joint, one.id, one.direction) == (true.joint, true.id, true.direction)
         assert abs(one.zero - true.zero) <= 1
         assert one.p_gain > 1 and one.model in FAMILIES[bus].models.values()
@@ -176,8 +176,8 @@ def test_a_pose_gives_the_zeros(opened: Rig, tmp_path: Path) -> None:
     """The travel is not symmetric, as where a table is in the way; the MJCF's range becomes narrower."""
     person = Person(opened, answers=["p"], ends=(-1.2, 1.5))
     made = read_robot_file(new(opened, person, tmp_path))
-    assert made.hardware is not None
-    assert [abs(one.zero - true) <= 1 for one, true in zip(made.hardware.servos, (2048, 2000), strict=True)]
+    assert made.servo_bus is not None
+    assert [abs(one.zero - true) <= 1 for one, true in zip(made.servo_bus.servos, (2048, 2000), strict=True)]
     for joint in made.joints:
         assert joint.position_range == pytest.approx((-1.2, 1.5), abs=2 * RAD)
 
@@ -320,7 +320,7 @@ def failures(findings: Sequence[Finding]) -> str:
 
 def written(rig: Rig, folder: Path, servo: int, **changes: Any) -> None:
     """Write the arm's robot.yaml with other values of a servo; with another joint both are exchanged."""
-    section = rig.file.hardware
+    section = rig.file.servo_bus
     assert section is not None
     servos = list(section.servos)
     servos[servo] = dataclasses.replace(servos[servo], **changes)

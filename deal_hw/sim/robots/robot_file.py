@@ -7,16 +7,16 @@ A joint has the names, units and gains of the MJCF. The file may be stricter tha
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import yaml
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import NAMES, read_yaml, reading
-from deal_hw.schema import FINITE, from_values, refusal
+from deal_hw.schema import FINITE, Tagged, from_values, refusal
 from deal_hw.sim.robots.hardware_section import (
     HEAD,
     HardwareJoint,
@@ -24,6 +24,7 @@ from deal_hw.sim.robots.hardware_section import (
     hardware_problems,
     section_lines,
 )
+from deal_hw.sim.robots.ros2_section import ROS2_HEAD, Ros2Section, ros2_lines, ros2_problems
 
 FILE_NAME: Final = "robot.yaml"
 ADVICE: Final = "`deal-hw robot new robot.xml` writes one"
@@ -111,7 +112,8 @@ class RobotFile:
         state_rate_hz: State samples per second; a whole multiple of ``control_rate_hz``.
         joints: The joints, in the order that every array follows.
         physics_step: The MJCF's timestep [s], so that the robot is driven without MuJoCo; None: not noted.
-        hardware: The bus and the servos by which it is driven; None: it is not.
+        hardware: The bus and the servos, or the controller of ros2_control, by which it is driven; None: it
+            is not.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -126,7 +128,7 @@ class RobotFile:
     floating_base: str | None = None
     feet: tuple[str, ...] = ()
     physics_step: float | None = None
-    hardware: HardwareSection | None = None
+    hardware: Annotated[HardwareSection | Ros2Section, Tagged("bus")] | None = None
 
     def __post_init__(self) -> None:
         if not 0 < len(self.name) <= _LONGEST_NAME or not self.name.isprintable() or "/" in self.name:
@@ -154,6 +156,16 @@ class RobotFile:
             raise refusal("physics_step", self.physics_step, "the MJCF's timestep, 1e-6 to 1 s, or null")
         self._check_hardware()
 
+    @property
+    def servo_bus(self) -> HardwareSection | None:
+        """The bus of its servos; None if it has none."""
+        return self.hardware if isinstance(self.hardware, HardwareSection) else None
+
+    @property
+    def ros2(self) -> Ros2Section | None:
+        """Its controller of ros2_control; None if it has none."""
+        return self.hardware if isinstance(self.hardware, Ros2Section) else None
+
     def _check_hardware(self) -> None:
         if self.hardware is None:
             return
@@ -162,7 +174,11 @@ class RobotFile:
             for j in self.joints
         ]
         floating = self.floating_base is not None
-        problems = hardware_problems(self.hardware, joints, actuation=self.actuation, floating=floating)
+        problems: Iterator[str]
+        if isinstance(self.hardware, Ros2Section):
+            problems = ros2_problems(self.hardware, joints, actuation=self.actuation, floating=floating)
+        else:
+            problems = hardware_problems(self.hardware, joints, actuation=self.actuation, floating=floating)
         if found := list(problems):
             raise ConfigurationError(f"hardware: {'; '.join(found)}")
 
@@ -222,7 +238,12 @@ def write_robot_file(robot: RobotFile) -> str:
     ]
     for joint in robot.joints:
         lines += _joint_lines(joint)
-    if robot.hardware is not None:
+    if isinstance(robot.hardware, Ros2Section):
+        lines += [ROS2_HEAD, "hardware:\n"]
+        lines += [
+            _line(name, value, comment, indent) for indent, name, value, comment in ros2_lines(robot.hardware)
+        ]
+    elif robot.hardware is not None:
         lines += [HEAD, "hardware:\n"]
         for indent, name, value, comment in section_lines(robot.hardware):
             lines.append("  servos:\n" if name == "servos" else _line(name, value, comment, indent))

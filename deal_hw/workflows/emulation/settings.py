@@ -212,9 +212,12 @@ class EmulatePlugInSettings(PseudoTerminalSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        entry = None if is_user_robot(self.robot) else robot_entry(self.robot)
-        name = self.transport or ("serial" if entry is None else entry.emulated_on[0])
-        if entry is not None and entry.wire(name).emulator_port:
+        if is_user_robot(self.robot) and not has_hardware(self.robot):
+            # What is wrong with the file is said by its reader.
+            return
+        entry = robot_entry(self.robot)
+        name = self.transport or entry.emulated_on[0]
+        if entry.wire(name).emulator_port:
             refuse(
                 given(self, EmulatePlugInSettings, ["link", "vanish_after_s", "return_after_s"]),
                 f"the emulator of {self.robot!r} on {name} listens at --port, it has no pseudo-terminal",
@@ -259,7 +262,7 @@ def _table() -> dict[str, InputKind]:
         )
         for name in emulated_robots()
     }
-    what = "Emulate the robot of a robot.yaml: its servos' bytes on a port of its own, with hidden physics."
+    what = "Emulate the robot of a robot.yaml: its bytes on a port of its own, with hidden physics."
     return {**found, FILE: InputKind(EmulatePlugInSettings, what, example=f"{FILE} --seed 0")}
 
 

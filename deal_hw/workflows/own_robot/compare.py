@@ -70,14 +70,19 @@ def hardware_of(robot: UserRobot) -> HardwareSection:
     """Return the section ``hardware`` of a robot.
 
     Raises:
-        ConfigurationError: It has none.
+        ConfigurationError: It has no servos.
     """
-    if robot.file.hardware is None:
+    if robot.file.ros2 is not None:
+        raise ConfigurationError(
+            f"robot {robot.file.name!r} is driven by ros2_control, and has no bus of servos to compare; "
+            "`deal-hw doctor robot.yaml --port PORT` listens to its topics"
+        )
+    if robot.file.servo_bus is None:
         raise ConfigurationError(
             f"robot {robot.file.name!r} has no section `hardware` to compare with a port; `deal-hw robot new "
             "arm.xml --bus feetech --port PORT` writes it"
         )
-    return robot.file.hardware
+    return robot.file.servo_bus
 
 
 def _present(section: HardwareSection, answers: Mapping[int, Answer], survey: Survey) -> Iterator[Finding]:

@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-from typing import Any, Final
-
-from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.clock import Clock
 from deal_hw.drivers.go2.emulator.device import PUBLISHED, SUBSCRIBED, Go2Device
-from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
-from deal_hw.transport import Message, TopicTransport
-
-STALL_NS: Final = 50_000_000
-"""If the process is behind by more than this, device time stands still instead of catching up."""
-LATE_NS: Final = 1_000_000
-_MOST_MESSAGES: Final = 200
-"""Most messages taken at a tick: a flood must not stop the robot's time."""
+from deal_hw.drivers.transports.topic_emulator import TopicEmulator
+from deal_hw.transport import TopicTransport
 
 
-class Go2Emulator:
-    """Runs a device core behind a transport; device time follows the clock, tick by tick.
-
-    Attributes:
-        slips: How often this process stalled and device time stood still.
-        late: Ticks that began more than a millisecond late.
-        latest_ns: Largest delay of them [ns].
-        unsent: Messages that the transport did not take.
+class Go2Emulator(TopicEmulator):
+    """Runs an emulated Go2 behind a transport.
 
     Args:
         device: The device.
@@ -33,62 +18,5 @@ class Go2Emulator:
     """
 
     def __init__(self, device: Go2Device, transport: TopicTransport, clock: Clock | None = None) -> None:
-        self.slips = self.late = self.latest_ns = self.unsent = 0
-        self._device = device
-        self._transport = transport
-        self._clock = clock or MonotonicClock()
-        self._origin_ns = 0
-
-    def open(self) -> None:
-        """Open the wire and start device time.
-
-        Raises:
-            TransportError: The wire cannot be opened.
-        """
-        published = PUBLISHED if self._device.sport_on_wire else PUBLISHED[:-1]
-        self._transport.declare(publish=published, subscribe=SUBSCRIBED)
-        self._transport.open()
-        self._origin_ns = self._device.host_origin_ns = self._clock.now_ns() - self._device.device_ns
-
-    def close(self) -> None:
-        """Close the wire."""
-        self._transport.close()
-
-    def step(self) -> None:
-        """Sleep until the next tick is due, take received messages, and run every tick that is due."""
-        due_ns = self._origin_ns + self._device.device_ns
-        self._clock.sleep_until_ns(due_ns)
-        self._take()
-        now_ns = self._clock.now_ns()
-        late_ns = now_ns - due_ns
-        if late_ns > LATE_NS:
-            self.late += 1
-            self.latest_ns = max(self.latest_ns, late_ns)
-        if late_ns > STALL_NS:
-            # If it caught up, it would send a burst of states, which no robot does.
-            self._origin_ns += late_ns
-            self._device.host_origin_ns = self._origin_ns
-            self.slips += 1
-        for topic, payload in self._device.advance_to(now_ns - self._origin_ns):
-            try:
-                self._transport.send(Message(topic, payload, now_ns))
-            except (TransportError, FrameError):
-                # DDS checks the CDR header, which a fault may have changed: such a message is lost.
-                self.unsent += 1
-
-    def report(self) -> dict[str, Any]:
-        """Return the device's report and the timing, as plain JSON values."""
-        return {
-            **self._device.report(),
-            "origin_host_ns": self._origin_ns,
-            "slips": self.slips,
-            "late_ticks": self.late,
-            "latest_ms": self.latest_ns / 1e6,
-            "unsent": self.unsent,
-        }
-
-    def _take(self) -> None:
-        with contextlib.suppress(TransportTimeoutError):
-            for _ in range(_MOST_MESSAGES):
-                message = self._transport.receive(0.0)
-                self._device.receive(message.channel, message.payload, message.stamp_ns)
+        published = PUBLISHED if device.sport_on_wire else PUBLISHED[:-1]
+        super().__init__(device, transport, published, SUBSCRIBED, clock)

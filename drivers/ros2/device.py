@@ -1,0 +1,237 @@
+"""An emulated robot of ros2_control: joint_state_broadcaster, controller, and the joints that it moves."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.ros2.messages import (
+    JointStates,
+    decode_point,
+    decode_positions,
+    encode_joint_states,
+)
+from deal_hw.drivers.ros2.topics import topics_of
+from deal_hw.errors import FrameError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import reported
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.robots.ros2_section import Ros2Section
+from deal_hw.sim.robots.simulated import SimulatedTruth
+from deal_hw.testing.faults import FaultRates, FrameFaults
+from deal_hw.types import FloatArray
+
+EPOCH_NS: Final = 1_700_000_000_000_000_000
+"""Stamp of device time 0 [ns]: ROS counts from 1970, and no clock here does."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Move:
+    """Where the controller brings the set-point, from when to when [ticks]."""
+
+    begin: FloatArray
+    end: FloatArray
+    from_tick: int
+    to_tick: int
+
+
+class Ros2Device:
+    """A robot of ros2_control in device time.
+
+    Each tick is a physics step. The controller_manager updates at the robot's state rate: it publishes the
+    joint states, all joints in alphabetic order, and its controller takes the newest command. A command acts
+    after the truth's latency. A forward controller applies it at once and for ever; a joint trajectory
+    controller goes to the point on a straight line in the point's time, and stays there.
+
+    Attributes:
+        active: Whether the controller is active; an inactive one receives commands and ignores them.
+        host_origin_ns: Host clock at device time 0, for the log [ns].
+        changes: What happened: device time [ms], host time [ns] and the event.
+        accepted: Commands that the controller took.
+        refused: Commands that it could not use.
+
+    Args:
+        section: The controller and the topics.
+        robot: The model.
+        space: The parameters of the truth.
+        truth: Hidden values.
+        noisy: Whether positions have the noise of the robot's description.
+        rates: Faults of the joint states on the wire.
+    """
+
+    def __init__(
+        self,
+        section: Ros2Section,
+        robot: RobotModel,
+        space: ParameterSpace,
+        truth: SimulatedTruth,
+        *,
+        noisy: bool = True,
+        rates: FaultRates | None = None,
+    ) -> None:
+        d: RobotDescription = robot.description
+        self.active, self.host_origin_ns = True, 0
+        self.changes: list[tuple[int, int, str]] = []
+        self.accepted = self.refused = self.sent = 0
+        self._last_refusal = ""
+        self._description, self._section, self._truth = d, section, truth
+        self._topics = topics_of(section)
+        self._actuated = np.array(d.actuated_index)
+        joints = section.joints or d.actuated
+        self._command_names = [section.ros_name(joint) for joint in joints]
+        self._place = np.array([d.actuated.index(joint) for joint in joints])
+        ros = [section.ros_name(joint) for joint in d.joint_names]
+        self._order = sorted(range(len(ros)), key=ros.__getitem__)
+        self._names = tuple(ros[j] for j in self._order)
+        self._noise = d.sensor.noise if noisy else (0.0,) * len(ros)
+        self._step_of_sensor = d.sensor.resolution
+        self._batch = ServoBatch(robot, space, 1, threads=1)
+        self._batch.set_parameters(np.array([[truth.parameters[name] for name in space.names]]))
+        self._batch.set_sent(np.array(d.stiffness), np.array(d.damping), np.array(d.effort_limit))
+        self._effort = self._batch.batch.bind("qfrc_actuator")
+        self._dofs = list(robot.qvel)
+        self._rng = np.random.default_rng((truth.seed, 3))
+        self._faults = FrameFaults(rates or FaultRates(), np.random.default_rng((truth.seed, 4)), None)
+        self._tick_ns = round(1e9 / d.device_rate_hz)
+        self._stride = max(round(d.device_rate_hz / d.state_rate_hz), 1)
+        self._latency_ns = round(1e9 * truth.latency_s)
+        self._tick = self._cut_end = 0
+        self._frozen = False
+        self._freeze_tick: int | None = None
+        self._coming: deque[tuple[int, FloatArray, int]] = deque()
+        self.place(np.array(d.default_position))
+
+    def place(self, position: FloatArray) -> None:
+        """Put the joints somewhere at rest, (J,) [rad or m], and let the drives hold them there."""
+        self._batch.set_state(position[None], np.zeros((1, len(position))))
+        at = position[self._actuated]
+        self._move = _Move(at, at, 0, 0)
+
+    @property
+    def true_position(self) -> FloatArray:
+        """True positions of the joints, (J,) [rad or m]; never on the wire."""
+        return np.array(self._batch.position[0])
+
+    @property
+    def device_ns(self) -> int:
+        """Device time of the next tick [ns]."""
+        return self._tick * self._tick_ns
+
+    def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
+        """Take a message from the host."""
+        if topic != self._topics.commands or self._is_cut:
+            return
+        try:
+            target, after_s = self._decode(payload)
+        except FrameError as error:
+            self.refused += 1
+            self._last_refusal = str(error)
+            return
+        if not self.active:
+            return
+        self.accepted += 1
+        if self.accepted == 1:
+            self._note("first command", stamp_ns)
+        due = math.ceil((self.device_ns + self._latency_ns) / self._tick_ns - 1e-6)
+        # The controller reads commands at the manager's updates.
+        due = -(-due // self._stride) * self._stride
+        self._coming.append((due, target, max(round(after_s * 1e9 / self._tick_ns), 0)))
+
+    def advance_to(self, device_ns: int) -> list[tuple[str, bytes]]:
+        """Run every tick up to and including a time [ns]; return the messages sent meanwhile."""
+        out: list[tuple[str, bytes]] = []
+        while self.device_ns <= device_ns:
+            out += self.tick()
+        return out
+
+    def tick(self) -> list[tuple[str, bytes]]:
+        """Run one tick; return the messages sent in it."""
+        out: list[tuple[str, bytes]] = []
+        if not self._frozen and self._tick % self._stride == 0:
+            while self._coming and self._coming[0][0] <= self._tick:
+                _, target, ticks = self._coming.popleft()
+                self._move = _Move(self._setpoint(), target, self._tick, self._tick + ticks)
+            out = self._states()
+        self._batch.advance(self._setpoint()[None, None])
+        self._tick += 1
+        if self._freeze_tick is not None and self._tick >= self._freeze_tick:
+            self._frozen = True
+        return [] if self._is_cut else out
+
+    def cut(self, seconds: float) -> None:
+        """Let nothing pass in either direction for a while [s]."""
+        self._cut_end = self._tick + round(seconds * 1e9 / self._tick_ns)
+        self._note(f"cut for {seconds:g} s", 0)
+
+    def freeze(self, after_s: float) -> None:
+        """Stop the controller_manager after a time [s]; the drives hold their set-point."""
+        self._freeze_tick = self._tick + round(after_s * 1e9 / self._tick_ns)
+
+    def report(self) -> dict[str, Any]:
+        """Return the truth and what happened, as plain JSON values."""
+        return {
+            **self._truth.to_json(),
+            "states_sent": self.sent,
+            "commands_accepted": self.accepted,
+            "commands_refused": self.refused,
+            "last_refusal": self._last_refusal,
+            "wire_faults": {
+                name: getattr(self._faults, name) for name in ("corrupted", "dropped", "duplicated")
+            },
+            "changes": [list(change) for change in self.changes],
+        }
+
+    @property
+    def _is_cut(self) -> bool:
+        return self._tick < self._cut_end
+
+    def _note(self, event: str, stamp_ns: int) -> None:
+        stamp_ns = stamp_ns or self.host_origin_ns + self.device_ns
+        self.changes.append((self.device_ns // 1_000_000, stamp_ns, event))
+
+    def _decode(self, payload: bytes) -> tuple[FloatArray, float]:
+        """Return a command's targets in the order of the actuated joints, (A,), and its time [s]."""
+        if self._section.command == "trajectory":
+            point = decode_point(payload)
+            names, position, after_s = list(point.names), point.position, point.after_s
+            if sorted(names) != sorted(self._command_names):
+                raise FrameError(f"JointTrajectory of {names}, the controller has {self._command_names}")
+            position = position[[names.index(name) for name in self._command_names]]
+        else:
+            position, after_s = decode_positions(payload), 0.0
+            if len(position) != len(self._command_names):
+                raise FrameError(f"{len(position)} values for {len(self._command_names)} joints")
+        if not np.isfinite(position).all():
+            raise FrameError(f"values that are not finite: {position}")
+        target = np.zeros(len(position))
+        target[self._place] = position
+        return target, after_s
+
+    def _setpoint(self) -> FloatArray:
+        move = self._move
+        if self._tick >= move.to_tick:
+            return move.end
+        share = (self._tick - move.from_tick) / (move.to_tick - move.from_tick)
+        return np.asarray(move.begin + share * (move.end - move.begin))
+
+    def _states(self) -> list[tuple[str, bytes]]:
+        position = reported(self._batch.position[0], self._noise, self._step_of_sensor, self._rng)
+        payload = encode_joint_states(
+            JointStates(
+                stamp_ns=EPOCH_NS + self.device_ns,
+                names=self._names,
+                position=position[self._order],
+                velocity=self._batch.velocity[0][self._order],
+                effort=self._effort[0, self._dofs][self._order],
+            )
+        )
+        arriving = self._faults.apply(payload)
+        self.sent += 1
+        size = len(payload)
+        return [(self._topics.states, arriving[k : k + size]) for k in range(0, len(arriving), size)]
