@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from deal_hw.workflows.policy import import_policy as import_policy
     from deal_hw.workflows.replay import replay as replay
     from deal_hw.workflows.running.report import RunReport as RunReport
+    from deal_hw.workflows.running.settings import CraneOptions as CraneOptions
+    from deal_hw.workflows.running.settings import G1LinkOptions as G1LinkOptions
     from deal_hw.workflows.running.settings import Go2LinkOptions as Go2LinkOptions
     from deal_hw.workflows.running.settings import LegOptions as LegOptions
     from deal_hw.workflows.running.settings import LinkOptions as LinkOptions
@@ -62,7 +64,14 @@ _EXPORTS = {
     "workflows.own_robot.check": ("check_robot", "RobotCheck"),
     "workflows.own_robot.new": ("new_robot",),
     "workflows.running.report": ("RunReport",),
-    "workflows.running.settings": ("LinkOptions", "Go2LinkOptions", "LegOptions", "SimulationOptions"),
+    "workflows.running.settings": (
+        "LinkOptions",
+        "Go2LinkOptions",
+        "G1LinkOptions",
+        "LegOptions",
+        "CraneOptions",
+        "SimulationOptions",
+    ),
     "workflows.stop": ("stop", "StopReport"),
     "workflows.train": ("train", "Training"),
     "transport": ("WireOptions",),

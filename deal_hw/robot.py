@@ -32,6 +32,12 @@ class Robot(abc.ABC):
     lowers: ClassVar[bool] = False
     """Whether :meth:`lower` brings it to a pose in which it may go limp."""
 
+    condition: ClassVar[str] = ""
+    """What an operator must see to before the robot is commanded, as a sentence that no sensor confirms; "":
+    nothing."""
+    condition_setting: ClassVar[str] = ""
+    """Name of the driver's setting by which the operator confirms the condition."""
+
     notice: ClassVar[str] = ""
     """A note to the operator before a run of an unusual device; "": none."""
 

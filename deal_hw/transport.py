@@ -249,6 +249,15 @@ class TopicTransport(Transport):
         """Return the writers and readers of a declared topic in other programs; None: it cannot know them."""
         return None
 
+    def name_types(self, types: Mapping[str, str]) -> None:
+        """Name the DDS types of topics that have another type than usual; call it before ``open``.
+
+        Does nothing on a transport that needs no types.
+
+        Args:
+            types: Topic -> name of its type.
+        """
+
     @property
     def stream(self) -> int | None:
         """Number of the stream of our messages, by which a bridge identifies us; None if there is none."""

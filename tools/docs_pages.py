@@ -36,11 +36,12 @@ ALARM_FOLDERS = ("calib", "deal_hw")
 API_NAMES = {
     "Calibrate": ("calibrate", "Calibration", "design_excitation"),
     "Run a robot": ("collect", "deploy"),
-    "Replay and options of a run": (
-        "replay",
-        "RunReport",
+    "Replay a recording": ("replay", "RunReport"),
+    "Options of a run": (
         "LinkOptions",
         "Go2LinkOptions",
+        "G1LinkOptions",
+        "CraneOptions",
         "LegOptions",
         "SimulationOptions",
         "WireOptions",

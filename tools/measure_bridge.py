@@ -42,7 +42,7 @@ from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.errors import DealHwError, TransportError
 from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.emulation.go2 import free_port
+from deal_hw.workflows.emulation.topics import free_port
 
 SIDES: Final = Path(__file__).with_name("bridge_sides.py")
 HOSTS: Final = "10.97.43.1", "10.97.43.2"

@@ -28,9 +28,9 @@ from fault_table import main
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.emulator.command_log import DAMPING, OFF, STIFF
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.transports.topics import LOW_COMMAND
+from deal_hw.drivers.unitree.command_log import DAMPING, OFF, STIFF
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions

@@ -28,7 +28,7 @@ from deal_hw.cli.show import seconds_bar
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.ranges import Range, check_ranges
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.emulation.go2 import free_port
+from deal_hw.workflows.emulation.topics import free_port
 
 SIDES: Final = Path(__file__).with_name("go2_transport_sides.py")
 _START_S: Final = 30.0

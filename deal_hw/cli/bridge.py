@@ -28,7 +28,7 @@ from deal_hw.robots.connect import claim_name
 from deal_hw.signals import reason, taken
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.common import run_until
-from deal_hw.workflows.emulation.go2 import free_port
+from deal_hw.workflows.emulation.topics import free_port
 from deal_hw.workflows.options import given, refuse
 
 ROBOTS = ("go2",)

@@ -107,7 +107,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             config="KINDS",
             example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
             function="collect_and_say_next",
-            common="port out motion policy seconds transport velocity stand quiet",
+            common="port out motion policy seconds transport velocity stand hung_on_crane quiet",
         ),
         "calibrate": _verb(
             "calibrate",
@@ -134,7 +134,8 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             config="KINDS",
             example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/policy.onnx",
             extra="deploy",
-            common="port out policy seconds task transport velocity stand trust_calibration dry_run quiet",
+            common="port out policy seconds task transport velocity stand hung_on_crane trust_calibration "
+            "dry_run quiet",
         ),
         "inspect": _verb(
             "inspect",

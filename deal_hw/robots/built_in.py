@@ -55,8 +55,23 @@ def _go2_wires(emulator: str = "") -> tuple[WireEntry, ...]:
             transport=name,
             emulator=emulator,
             emulator_port=port if emulator else "",
-            claim="deal_hw.drivers.go2.claim:WireClaim",
+            claim="deal_hw.drivers.unitree.claim:WireClaim",
             doctor="deal_hw.drivers.go2.doctor:Go2Doctor",
+        )
+        for name, port in (("dds", "127.0.0.1"), ("zenoh", "tcp/127.0.0.1:7447"))
+    )
+
+
+def _g1_wires() -> tuple[WireEntry, ...]:
+    """Return the wires of a G1."""
+    return tuple(
+        WireEntry(
+            name=name,
+            transport=name,
+            emulator="deal_hw.drivers.unitree.emulator:UnitreeEmulator",
+            emulator_port=port,
+            claim="deal_hw.drivers.g1.robot:G1Claim",
+            doctor="deal_hw.drivers.g1.doctor:G1Doctor",
         )
         for name, port in (("dds", "127.0.0.1"), ("zenoh", "tcp/127.0.0.1:7447"))
     )
@@ -109,7 +124,7 @@ GO2: Final = RobotEntry(
     name="go2",
     api_version=API_VERSION,
     driver="deal_hw.drivers.go2.robot:Go2Robot",
-    wires=_go2_wires("deal_hw.drivers.go2.emulator.emulator:Go2Emulator"),
+    wires=_go2_wires("deal_hw.drivers.unitree.emulator:UnitreeEmulator"),
     # On the floor it is simulated at other rates than its wire has.
     description="deal_hw.drivers.go2.descriptions.floor:DESCRIPTION",
     spaces="deal_hw.drivers.go2.descriptions.floor:SPACES",
@@ -129,6 +144,25 @@ GO2_ON_STAND: Final = RobotEntry(
     spaces="deal_hw.drivers.go2.descriptions.on_stand:SPACES",
     simulators={"unitree_mujoco": "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot"},
     machine="go2",
+)
+G1: Final = RobotEntry(
+    name="g1",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.g1.robot:G1Robot",
+    wires=_g1_wires(),
+    recorded="deal_hw.drivers.g1.description:DESCRIPTION",
+    spaces="deal_hw.drivers.g1.description:SPACES",
+    motors="deal_hw.drivers.g1.joints:JOINTS_29",
+)
+G1_23DOF: Final = RobotEntry(
+    name="g1_23dof",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.g1.robot:G1Dof23Robot",
+    wires=_g1_wires(),
+    recorded="deal_hw.drivers.g1.description:DESCRIPTION_23",
+    spaces="deal_hw.drivers.g1.description:SPACES_23",
+    machine="g1",
+    motors="deal_hw.drivers.g1.joints:JOINTS_23",
 )
 ALLEGRO: Final = RobotEntry(
     name="allegro",
@@ -183,5 +217,5 @@ SO101: Final = RobotEntry(
     environment="deal_hw/SO101-v0",
     policy="deal_hw.policies:assets/so101_udr.onnx",
 )
-ROBOTS: Final = (CARTPOLE, GO2, GO2_ON_STAND, SO101, ALLEGRO, ANT, GO2_SUSPENDED, HUMANOID)
+ROBOTS: Final = (CARTPOLE, GO2, GO2_ON_STAND, G1, G1_23DOF, SO101, ALLEGRO, ANT, GO2_SUSPENDED, HUMANOID)
 """Those with a driver first: messages list them in this order."""

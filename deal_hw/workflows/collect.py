@@ -17,11 +17,13 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import (
     CartpoleRunOptions,
+    G1RunOptions,
     Go2RunOptions,
     LegOptions,
     RecordOptions,
     RunOptions,
     SimulationOptions,
+    crane_of,
     legs_of,
     plan_options,
     require_simulation,
@@ -99,6 +101,14 @@ class CollectGo2Settings(Go2RunOptions, CollectLeggedSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CollectG1Settings(G1RunOptions, CollectSettings):
+    """Record a G1 that hangs on a crane during an informative motion."""
+
+    seconds: RunSeconds = 10.0
+    """Length of an episode; the first 3 s lead into the motion [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CollectSimulatedSettings(MotionOptions):
     """Record your own robot in simulation, during an informative motion."""
 
@@ -114,7 +124,7 @@ class CollectSimulatedSettings(MotionOptions):
 
 
 COLLECT = robot_kinds(
-    {"cartpole": CollectCartpoleSettings, "go2": CollectGo2Settings},
+    {"cartpole": CollectCartpoleSettings, "go2": CollectGo2Settings, "g1": CollectG1Settings},
     plain=CollectSettings,
     legged=CollectLeggedSettings,
     simulated=CollectSimulatedSettings,
@@ -156,7 +166,7 @@ def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> Ru
         )
     walks = config.motion == "balance" and not excite
     plan = RunPlan(
-        **plan_options(config.robot, config.link, legs_of(config), walks=walks),
+        **plan_options(config.robot, config.link, legs_of(config), crane=crane_of(config), walks=walks),
         motion="excite" if excite else config.motion,
         policy=str(policy or ""),
         seconds=seconds,

@@ -13,9 +13,11 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import (
     CartpoleRunOptions,
+    G1RunOptions,
     Go2RunOptions,
     LegOptions,
     RunOptions,
+    crane_of,
     legs_of,
     plan_options,
     refuse_unrecorded,
@@ -90,8 +92,21 @@ class DeployGo2Settings(Go2RunOptions, DeployLeggedSettings):
     """Run a policy on a Go2 behind the safety filter, and record it."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class DeployG1Settings(G1RunOptions, DeploySettings):
+    """Run a policy on a G1 that hangs on a crane behind the safety filter, and record it.
+
+    It moves the limbs in the air. Walking is not supported: the robot stays on the crane to the end.
+    """
+
+
 DEPLOY = robot_kinds(
-    {"cartpole": DeployCartpoleSettings, "go2": DeployGo2Settings, "so101": DeploySo101Settings},
+    {
+        "cartpole": DeployCartpoleSettings,
+        "go2": DeployGo2Settings,
+        "g1": DeployG1Settings,
+        "so101": DeploySo101Settings,
+    },
     plain=DeploySettings,
     legged=DeployLeggedSettings,
     example="--port {port} --policy runs/first/policies/policy.onnx",
@@ -122,7 +137,7 @@ def run(config: DeploySettings, view: RunView) -> RunReport:
     """Run the policy, as :func:`deploy`, and show it."""
     policy = config.policy or shipped_policy(config.robot)
     plan = RunPlan(
-        **plan_options(config.robot, config.link, legs_of(config)),
+        **plan_options(config.robot, config.link, legs_of(config), crane=crane_of(config)),
         motion="balance",
         policy=str(policy or ""),
         target=config.target if isinstance(config, DeploySo101Settings) else "",

@@ -23,11 +23,13 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import (
     CartpoleRunOptions,
+    G1RunOptions,
     Go2RunOptions,
     RecordOptions,
     RunOptions,
     SimulationOptions,
     StandOptions,
+    crane_of,
     legs_of,
     plan_options,
     refuse_unrecorded,
@@ -79,6 +81,11 @@ class ReplayGo2Settings(Go2RunOptions, ReplayLeggedSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplayG1Settings(G1RunOptions, ReplaySettings):
+    """Send a recording's commands to a G1 that hangs on a crane again, and record what happens."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReplaySimulatedSettings(ReplayOptions):
     """Send a recording's commands to your own robot in simulation, and record what happens."""
 
@@ -87,7 +94,7 @@ class ReplaySimulatedSettings(ReplayOptions):
 
 
 _ROBOTS = robot_kinds(
-    {"cartpole": ReplayCartpoleSettings, "go2": ReplayGo2Settings},
+    {"cartpole": ReplayCartpoleSettings, "go2": ReplayGo2Settings, "g1": ReplayG1Settings},
     plain=ReplaySettings,
     legged=ReplayLeggedSettings,
     simulated=ReplaySimulatedSettings,
@@ -182,7 +189,7 @@ def run(config: ReplaySettings | ReplaySimulatedSettings, view: RunView) -> RunR
         refuse(["--stand"] if legs.stand else [], "the recording stands up and lies down itself")
         legs = dataclasses.replace(legs, stand=False)
     plan = RunPlan(
-        **plan_options(robot, config.link, legs, walks=False),
+        **plan_options(robot, config.link, legs, crane=crane_of(config), walks=False),
         motion="replay",
         recording=str(path.resolve()),
         seconds=behaviour.duration_s,

@@ -107,8 +107,24 @@ class StopGo2Settings(StopSettings):
     """Network options. Over a bridge with certificates, that of a controller."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class StopG1Settings(StopSettings):
+    """Make a G1 passive at once, from any terminal: damping. Nothing is asked. On the floor it falls.
+
+    A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
+    program then does it. It sends nothing while another program or the robot's own controller has the robot.
+    The exit code is 0 only if the robot confirmed that it is passive.
+    """
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """Transport to the G1."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options."""
+
+
 STOP = robot_kinds(
-    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings},
+    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings, "g1": StopG1Settings},
     plain=StopSettings,
     legged=StopSettings,
     example="--port {port}",
@@ -186,7 +202,7 @@ def _transport(settings: StopSettings) -> str:
 
 
 def _wire(settings: StopSettings) -> WireOptions:
-    return settings.wire if isinstance(settings, StopGo2Settings) else WireOptions()
+    return settings.wire if isinstance(settings, StopGo2Settings | StopG1Settings) else WireOptions()
 
 
 def _claim(settings: StopSettings) -> str:

@@ -1,53 +1,24 @@
-"""Checks of a Go2 and the connection to it: listens, and asks which mode is active; no motor command.
-
-Works over every transport of topics; over DDS it also reads the domain's discovery.
-"""
+"""Checks of a Go2 and the connection to it: listens, and asks which mode is active; no motor command."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
-from typing import Final
+from typing import ClassVar
 
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.control.safety.leg_checks import tilt
-from deal_hw.data.checks.clock_rate import judge_clock
-from deal_hw.documentation import page
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
-from deal_hw.drivers.go2.messages.remote import decode_remote
 from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_simulated
-from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, ServiceClient
-from deal_hw.drivers.go2.state_stream import PERIOD_MS
-from deal_hw.drivers.transports import topics
-from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
+from deal_hw.drivers.go2.wording import WORDING
+from deal_hw.drivers.unitree.doctor import Received, UnitreeDoctor
+from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Message, TopicTransport
 
-ROUND_TRIPS: Final = 20
-_STATE_HZ: Final = 1000.0 / PERIOD_MS
-_SLOW_ROUND_TRIP_S: Final = 0.02
-_ANSWER_S: Final = 1.0
-_LATE_S: Final = 0.01
-_FEW_REFUSED: Final = 0.01
 
-
-@dataclass(slots=True)
-class _Received:
-    """Messages received while listening."""
-
-    stamps: list[int] = field(default_factory=list)
-    ticks: list[int] = field(default_factory=list)
-    last: LowStateFrame | None = None
-    refused: Refusals = field(default_factory=Refusals)
-    commands: int = 0
-    repeated: int = 0
-
-
-class Go2Doctor:
+class Go2Doctor(UnitreeDoctor[LowStateFrame]):
     """Listens to a Go2 and asks its motion switcher.
 
     Args:
@@ -58,6 +29,14 @@ class Go2Doctor:
         simulator: Name of a simulator in place of the robot; None for a robot.
     """
 
+    wording: ClassVar[Wording] = WORDING
+    kind: ClassVar[str] = "Go2"
+    controller: ClassVar[str] = "sport mode"
+    released: ClassVar[str] = (
+        "deal-hw releases it when it arms, after the robot has lain down; keep the robot on the floor"
+    )
+    level: ClassVar[str] = "set it down level"
+
     def __init__(
         self,
         link: TopicTransport,
@@ -66,268 +45,43 @@ class Go2Doctor:
         state_check: StateCheck = "strict",
         simulator: Simulator = "none",
     ) -> None:
-        self._link, self._clock, self._seconds = link, clock, seconds
+        super().__init__(link, clock, seconds)
         self._strict, self._simulated = state_check == "strict", simulator != "none"
 
-    def run(self) -> Iterator[Finding]:
-        """Yield findings; the transport is closed at the end.
+    def _make_refusals(self) -> Refusals:
+        return Refusals()
 
-        Raises:
-            TransportError: It cannot be opened.
-        """
-        if not isinstance(self._link, TopicTransport):
-            raise TransportError(f"{type(self._link).__name__} carries no topics")
-        self._link.declare(
-            publish=[topics.request(SWITCHER)],
-            subscribe=[topics.LOW_STATE, topics.LOW_COMMAND, topics.response(SWITCHER)],
-        )
-        with self._link:
-            yield Finding("link", Severity.OK, "the transport is open")
-            received = self._listen()
-            yield from self._discovery()
-            if self._simulated:
-                yield Finding("states", Severity.NOTE, NOTICE.removeprefix("note: "))
-            if not self._strict:
-                yield Finding(
-                    "states",
-                    Severity.WARN,
-                    "head and checksum of the states are not checked",
-                    "leave --state-check out if the robot's head and checksum are as deal-hw expects",
-                )
-            yield from _judge_states(received, self._seconds)
-            mode = "" if self._simulated else (yield from self._ask_mode())
-            yield from _judge_commands(received, self._link.writers(topics.LOW_COMMAND), mode)
-            if received.last is not None:
-                if not self._simulated:
-                    yield from _judge_supply(received.last)
-                yield from _judge_robot(received.last)
+    def _decode(self, payload: bytes) -> LowStateFrame:
+        return decode_simulated(payload) if self._simulated else decode_low_state(payload, self._strict)
 
-    def _listen(self) -> _Received:
-        received = _Received()
-        end_ns = self._clock.now_ns() + round(self._seconds * 1e9)
-        while (left_ns := end_ns - self._clock.now_ns()) > 0:
-            try:
-                self._take(received, self._link.receive(left_ns * 1e-9))
-            except TransportTimeoutError:
-                break
-        return received
-
-    def _take(self, received: _Received, message: Message) -> None:
-        if message.channel == topics.LOW_COMMAND:
-            received.commands += 1
-        if message.channel != topics.LOW_STATE:
-            return
-        try:
-            if self._simulated:
-                frame = decode_simulated(message.payload)
-            else:
-                frame = decode_low_state(message.payload, self._strict)
-        except FrameError as error:
-            received.refused.add(message.payload, error)
-            return
-        if self._simulated and received.last is not None and received.last.payload == frame.payload:
-            received.repeated += 1
-            return
-        received.stamps.append(message.stamp_ns)
+    def _keep(self, received: Received[LowStateFrame], message: Message, frame: LowStateFrame) -> None:
         if not self._simulated:
-            received.ticks.append(frame.tick_ms)
-        received.last = frame
+            super()._keep(received, message, frame)
+        elif received.last is not None and received.last.payload == frame.payload:
+            received.repeated += 1
+        else:
+            received.stamps.append(message.stamp_ns)
+            received.last = frame
 
-    def _discovery(self) -> Iterator[Finding]:
-        survey = getattr(self._link, "survey", None)
-        if survey is None:
-            return
-        seen = survey()
-        if not seen.peers:
+    def _beforehand(self) -> Iterator[Finding]:
+        if self._simulated:
+            yield Finding("states", Severity.NOTE, NOTICE.removeprefix("note: "))
+        if not self._strict:
             yield Finding(
-                "dds",
-                Severity.FAIL,
-                "no other participant is on the domain",
-                "is the robot on, is this its network (192.168.123.x), is the domain 0, does a firewall "
-                "block UDP 7400 to 7500?",
-            )
-        for peer in seen.peers:
-            yield Finding("dds", Severity.OK, str(peer))
-        for complaint in seen.complaints:
-            yield Finding("dds", Severity.FAIL, complaint, f"see {page('how-to/go2-dds.md')}")
-        typed: dict[str, set[str]] = {}
-        for end in seen.endpoints:
-            if end.topic in topics.TYPES:
-                typed.setdefault(end.shown_hash, set()).add(end.topic)
-        for shown, names in typed.items():
-            yield Finding("dds", Severity.OK, f"{', '.join(sorted(names))}: {shown}")
-
-    def _ask_mode(self) -> Generator[Finding, None, str | None]:
-        """Yield the motion switcher's answer; return the active mode's name, None without an answer."""
-        services = ServiceClient(
-            self._send, lambda timeout_s: services.take(self._link.receive(timeout_s)), self._clock
-        )
-        times: list[float] = []
-        name = None
-        for _ in range(ROUND_TRIPS):
-            begun_ns = self._clock.now_ns()
-            try:
-                name = str(services.ask(SWITCHER, CHECK_MODE, {}, _ANSWER_S).get("name", ""))
-            except TransportTimeoutError:
-                break
-            except (RefusedError, FrameError) as error:
-                yield Finding("services", Severity.WARN, str(error), "restart the robot if it persists")
-                return None
-            times.append((self._clock.now_ns() - begun_ns) * 1e-9)
-        if name is None:
-            yield Finding(
-                "services",
+                "states",
                 Severity.WARN,
-                f"the service {SWITCHER} does not answer",
-                "older firmware has the service robot_state instead; deal-hw tries that one, too",
+                "head and checksum of the states are not checked",
+                "leave --state-check out if the robot's head and checksum are as deal-hw expects",
             )
-            return None
-        p50, most = float(np.median(times)), max(times)
-        text = (
-            f"round trip of a request: {p50 * 1e3:.2f} ms median, {most * 1e3:.2f} ms longest of {len(times)}"
-        )
-        remedy = "use a cable instead of wireless; stop other load on network and computer"
-        yield Finding.judged("link", p50 > _SLOW_ROUND_TRIP_S, text, remedy)
-        yield _judge_mode(name)
-        return name
 
-    def _send(self, topic: str, payload: bytes) -> None:
-        self._link.send(Message(topic, payload, self._clock.now_ns()))
+    def _asked_mode(self) -> Generator[Finding, None, str | None]:
+        return "" if self._simulated else (yield from super()._asked_mode())
 
-
-def _judge_states(received: _Received, seconds: float) -> Iterator[Finding]:
-    if received.refused.count:
-        yield _judge_refused(received.refused, len(received.stamps))
-        if not received.stamps:
+    def _judge_motors(self, frame: LowStateFrame) -> Iterator[Finding]:
+        if self._simulated:
             return
-    if len(received.stamps) < 2 and received.repeated:
-        yield Finding(
-            "states",
-            Severity.FAIL,
-            f"states arrive, but do not change: {received.repeated} times the same",
-            "let the simulation run: it is paused",
-        )
-        return
-    if len(received.stamps) < 2:
-        yield Finding(
-            "states",
-            Severity.FAIL,
-            f"no states came on {topics.LOW_STATE} within {seconds:g} s",
-            "check that the robot is on and has started up (one minute), the interface or end point, and "
-            "the firewall",
-        )
-        return
-    gaps = np.diff(received.stamps) * 1e-9
-    rate = (len(received.stamps) - 1) / ((received.stamps[-1] - received.stamps[0]) * 1e-9)
-    text = (
-        f"{rate:.0f} states a second; time between two: {np.median(gaps) * 1e3:.2f} ms median, "
-        f"{np.percentile(gaps, 99) * 1e3:.2f} ms p99, {gaps.max() * 1e3:.2f} ms longest"
-    )
-    sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
-    remedy = "use a cable instead of wireless, or a faster or less busy computer"
-    yield Finding.judged("states", sparse or late, text, remedy)
-    if not received.ticks:
-        return
-    ticks = np.diff(np.array(received.ticks, dtype=np.int64).astype(np.uint32))
-    steps = ticks.astype(np.int32)
-    if (steps == 0).all():
-        yield Finding("states", Severity.FAIL, "the robot's clock (tick) stands still", "restart the robot")
-        return
-    missing = int(np.sum(np.maximum(steps // PERIOD_MS - 1, 0)))
-    back = int(np.sum(steps <= 0))
-    if missing or back:
-        yield Finding(
-            "states",
-            Severity.NOTE,
-            f"{missing} states lost and {back} repeated or out of order of {len(received.ticks)}",
-        )
-    device_ms = np.concatenate(((0,), np.cumsum(steps.astype(np.int64))))
-    yield judge_clock(np.array(received.stamps), 1_000_000 * device_ms)
-
-
-def _judge_refused(refused: Refusals, sound: int) -> Finding:
-    """Return one finding about all refused states, given the number of valid ones."""
-    share = refused.count / (refused.count + sound)
-    text = (
-        f"{refused.count} of {refused.count + sound} messages on {topics.LOW_STATE} ({share:.1%}) are no Go2 "
-        f"states; the first: {refused.first}"
-    )
-    if sound:
-        remedy = (
-            "states are corrupted on the way: use another cable, not wireless; check for a second program "
-            "that sends them"
-        )
-    else:
-        remedy = refused.remedy
-    return Finding("states", Severity.FAIL if share > _FEW_REFUSED else Severity.WARN, text, remedy)
-
-
-def _judge_commands(received: _Received, writers: tuple[str, ...], mode: str | None) -> Iterator[Finding]:
-    if received.commands and mode is None:
-        yield Finding(
-            "commands",
-            Severity.WARN,
-            f"{received.commands} motor commands came; the robot did not report whether its sport mode "
-            "sends them",
-            "look for other programs that command the motors; an observer's certificate may not ask the "
-            "robot: run doctor with a controller's",
-        )
-    elif received.commands and mode:
-        yield Finding(
-            "commands",
-            Severity.NOTE,
-            f"{received.commands} motor commands came while sport mode {mode!r} is active, probably its own",
-            "run doctor again after the release: then no program may command the motors",
-        )
-    elif received.commands:
-        who = f" ({'; '.join(writers)})" if writers else ""
-        yield Finding(
-            "commands",
-            Severity.FAIL,
-            f"another program commands the motors: {received.commands} messages{who}",
-            "stop that program",
-        )
-    elif writers:
-        yield Finding(
-            "commands",
-            Severity.WARN,
-            f"silent writers of {topics.LOW_COMMAND}: {'; '.join(writers)}",
-            "stop them if they are not deal-hw's own",
-        )
-    else:
-        yield Finding("commands", Severity.OK, "nobody else commands the motors")
-
-
-def _judge_supply(frame: LowStateFrame) -> Iterator[Finding]:
-    charge = frame.battery_percent
-    text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
-    yield Finding.judged("robot", charge < 20, text, "charge it")
-    hottest = int(np.max(frame.temperature))
-    yield Finding.judged("robot", hottest > 70, f"hottest motor {hottest} °C", "let it cool down")
-
-
-def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
-    lean = math.degrees(tilt(frame.orientation))
-    tilted = not lean < 30.0 or not abs(float(frame.orientation @ frame.orientation) - 1.0) < 0.01
-    yield Finding.judged("robot", tilted, f"the body leans by {lean:.0f} degrees", "set it down level")
-    remote = decode_remote(frame.remote)
-    if remote is None:
-        yield Finding(
-            "robot",
-            Severity.NOTE,
-            "no remote is heard: L2+B cannot stop the robot",
-            "switch the remote on and pair it before you arm",
-        )
-    else:
-        yield Finding("robot", Severity.OK, "the remote is heard: L2+B makes the robot passive")
-
-
-def _judge_mode(name: str) -> Finding:
-    if not name:
-        return Finding("services", Severity.OK, "no sport mode is active: the low level is free")
-    return Finding(
-        "services",
-        Severity.NOTE,
-        f"sport mode {name!r} is active",
-        "deal-hw releases it when it arms, after the robot has lain down; keep the robot on the floor",
-    )
+        charge = frame.battery_percent
+        text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
+        yield Finding.judged("robot", charge < 20, text, "charge it")
+        hottest = int(np.max(frame.temperature))
+        yield Finding.judged("robot", hottest > 70, f"hottest motor {hottest} °C", "let it cool down")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.transports.dds_discovery import OUR_NOTE, DdsSurvey, ros_user_data
@@ -56,7 +56,7 @@ class DdsTransport(TopicTransport):
     ) -> None:
         self.port = port
         self._typed, self._note = typed, note
-        self._types = TYPES if typed is None else typed.types
+        self._types: Mapping[str, str] = TYPES if typed is None else typed.types
         self._clock = clock
         self._domain = (options or WireOptions()).domain
         self._topics: dict[str, tuple[bool, bool]] = {}
@@ -69,6 +69,10 @@ class DdsTransport(TopicTransport):
                 raise UnknownNameError("DDS topic", topic, self._types)
             writes, reads = self._topics.get(topic, (False, False))
             self._topics[topic] = (writes or topic in publish, reads or topic in subscribe)
+
+    def name_types(self, types: Mapping[str, str]) -> None:
+        """Name the types of topics whose type is not the Go2's, from the next ``open`` on."""
+        self._types = {**self._types, **types}
 
     def open(self) -> None:
         """Join the domain.

@@ -1,4 +1,4 @@
-"""DDS types of the Go2, and a check that they equal the robot's.
+"""DDS types of Unitree's robots, and a check that they equal the robots'.
 
 XTypes gives each type a hash, and peers compare the hashes during discovery. There are three reasons to check
 them before a domain is opened:
@@ -25,6 +25,7 @@ from deal_hw.errors import MissingExtraError, VersionMismatchError
 from deal_hw.install import install_line
 
 _GO: Final = "unitree_go::msg::dds_::"
+_HG: Final = "unitree_hg::msg::dds_::"
 _API: Final = "unitree_api::msg::dds_::"
 
 _FRAME: Final = {
@@ -120,6 +121,45 @@ STRUCTS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             **dict.fromkeys(("lx", "ly", "rx", "ry"), "float32"),
             "keys": "uint16",
         },
+        f"{_HG}MotorCmd_": {
+            "mode": "octet",
+            **dict.fromkeys(("q", "dq", "tau", "kp", "kd"), "float32"),
+            "reserve": "uint32",
+        },
+        f"{_HG}LowCmd_": {
+            "mode_pr": "octet",
+            "mode_machine": "octet",
+            "motor_cmd": f"{_HG}MotorCmd_[35]",
+            "reserve": "uint32[4]",
+            "crc": "uint32",
+        },
+        f"{_HG}IMUState_": {
+            "quaternion": "float32[4]",
+            "gyroscope": "float32[3]",
+            "accelerometer": "float32[3]",
+            "rpy": "float32[3]",
+            "temperature": "int16",
+        },
+        f"{_HG}MotorState_": {
+            "mode": "octet",
+            **dict.fromkeys(("q", "dq", "ddq", "tau_est"), "float32"),
+            "temperature": "int16[2]",
+            "vol": "float32",
+            "sensor": "uint32[2]",
+            "motorstate": "uint32",
+            "reserve": "uint32[4]",
+        },
+        f"{_HG}LowState_": {
+            "version": "uint32[2]",
+            "mode_pr": "octet",
+            "mode_machine": "octet",
+            "tick": "uint32",
+            "imu_state": f"{_HG}IMUState_",
+            "motor_state": f"{_HG}MotorState_[35]",
+            "wireless_remote": "octet[40]",
+            "reserve": "uint32[4]",
+            "crc": "uint32",
+        },
         f"{_API}RequestIdentity_": {"id": "int64", "api_id": "int64"},
         f"{_API}RequestLease_": {"id": "int64"},
         f"{_API}RequestPolicy_": {"priority": "int32", "noreply": "boolean"},
@@ -151,6 +191,8 @@ MINIMAL: Final[Mapping[str, str]] = MappingProxyType(
     {
         f"{_GO}LowCmd_": "832876ceec9737d69f6ed62a3f63",
         f"{_GO}LowState_": "853a99e23d0daa1610b65c526b40",
+        f"{_HG}LowCmd_": "6569fc15f0d47aa8600b9e91fbbc",
+        f"{_HG}LowState_": "2f38296b52aa0230b92d378b1e39",
         f"{_GO}SportModeState_": "9fa6ccdc5cafdeaab8a762e31044",
         f"{_GO}WirelessController_": "d8dc69fff5d75961cd0e3fc049cb",
         f"{_API}Request_": "cba4dc965d393ada76b4de081925",
@@ -163,6 +205,8 @@ COMPLETE: Final[Mapping[str, str]] = MappingProxyType(
     {
         f"{_GO}LowCmd_": "52cc8eb0d427d692aa2b20a90540",
         f"{_GO}LowState_": "08f239c471d3a27e67e7c7723184",
+        f"{_HG}LowCmd_": "42b0283aa7e1bb592ec898a0dbed",
+        f"{_HG}LowState_": "2be9706c9587e8d8afd8bfc6de7b",
         f"{_GO}SportModeState_": "e59749630fff75cc170afb238783",
         f"{_GO}WirelessController_": "e9686fe76f7b08f92cb24943ac72",
         f"{_API}Request_": "c47a4429fcbf539486498753c48f",
@@ -175,6 +219,8 @@ UINT8: Final[Mapping[str, str]] = MappingProxyType(
     {
         f"{_GO}LowCmd_": "12da99179559f14db8b7ab23acdd",
         f"{_GO}LowState_": "ef1819d05896c24741d6dbde9167",
+        f"{_HG}LowCmd_": "ef636a54656de1d49ca65377b07c",
+        f"{_HG}LowState_": "860cfa7cbdcd87fbdb066de53c1d",
         f"{_GO}SportModeState_": "4014d13a03d68f246f38f1449cb2",
     }
 )

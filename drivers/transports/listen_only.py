@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import NoReturn
 
 from deal_hw.errors import SafetyError
@@ -41,6 +41,10 @@ class ListenOnlyTopics(ListenOnly, TopicTransport):
     def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
         """Declare the topics to receive; those to publish are left out."""
         self._topics.declare(subscribe=subscribe)
+
+    def name_types(self, types: Mapping[str, str]) -> None:
+        """Name the types of topics that have another type than usual."""
+        self._topics.name_types(types)
 
     def writers(self, topic: str) -> tuple[str, ...]:
         """Return a description of each other participant that is known to write a topic."""

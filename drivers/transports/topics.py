@@ -1,4 +1,4 @@
-"""Topics of the Go2, and their types.
+"""Topics of Unitree's robots, and their types; where robots differ, the Go2's.
 
 Names are those of DDS, without a leading slash; zenoh-bridge-dds uses them as keys unchanged. Source:
 unitree_sdk2_python @ 37116c5 and unitree_ros2 @ eea2719.
@@ -82,3 +82,11 @@ class TypedTopics:
     types: Mapping[str, str]
     structs: Mapping[str, Mapping[str, str]]
     hashes: Mapping[str, str] = field(default_factory=dict)
+
+
+HUMANOID_TYPES: Final[Mapping[str, str]] = {
+    LOW_COMMAND: "unitree_hg::msg::dds_::LowCmd_",
+    LOW_STATE: "unitree_hg::msg::dds_::LowState_",
+    LOW_STATE_SLOW: "unitree_hg::msg::dds_::LowState_",
+}
+"""The same for the G1 where it differs."""

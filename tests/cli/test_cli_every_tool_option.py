@@ -28,6 +28,7 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import robot_entry
 from deal_hw.workflows.emulation import common as emulation
 from deal_hw.workflows.emulation import go2 as emulated_go2
+from deal_hw.workflows.emulation import topics as emulated_topics
 from deal_hw.workflows.train import udr_distribution
 
 MJCF = """<mujoco model="arm"><compiler angle="radian"/><option timestep="0.005" integrator="implicitfast"/>
@@ -60,6 +61,8 @@ LINES = (
     "emulate cartpole --transport dynamixel",
     "emulate go2",
     "emulate go2 --transport zenoh --port tcp/127.0.0.1:7447",
+    "emulate g1",
+    "emulate g1 --transport zenoh --port tcp/127.0.0.1:7447",
     "bridge go2 --port lo",
     "bridge go2 --port lo --listen tls/127.0.0.1:7447"
     " --ca made_keys/ca.pem --certificate made_keys/robot.pem --key made_keys/robot.key",
@@ -115,6 +118,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "free": ("shoulder.damping",),
     "generations": ("7",),
     "holdout": ("hold.csv",),
+    "fault_joint": ("left_elbow_joint",),
     "hot_joint": ("FL_hip_joint",),
     "joint_names": ("motor=shoulder",),
     "known": ("shoulder.damping", "0.3"),
@@ -334,21 +338,24 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     for wire in robot_entry("cartpole").wires:
         monkeypatch.setattr(str(wire.emulator).replace(":", "."), note("emulator", emulator))
     from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
+    from deal_hw.drivers.g1.emulator.truth import nominal_truth as nominal_g1
     from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
 
     for target, truth in (
         ("cartpole.emulator.oracle", nominal_cartpole),
         ("go2.emulator.truth", nominal_go2),
+        ("g1.emulator.truth", nominal_g1),
     ):
         drawn = note("drawn", truth("sensor", 0))
         monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
     monkeypatch.setattr("deal_hw.drivers.go2.emulator.device.Go2Device", note("device", device))
-    monkeypatch.setattr("deal_hw.drivers.go2.emulator.emulator.Go2Emulator", note("go2", emulator))
-    monkeypatch.setattr(emulated_go2, "make_topic_transport", note("transport"))
-    monkeypatch.setattr(emulated_go2, "summary", lambda report: [])
+    monkeypatch.setattr("deal_hw.drivers.g1.emulator.device.G1Device", note("device", device))
+    monkeypatch.setattr("deal_hw.drivers.unitree.emulator.UnitreeEmulator", note("go2", emulator))
+    monkeypatch.setattr(emulated_topics, "make_topic_transport", note("transport"))
+    monkeypatch.setattr(emulated_topics, "summary", lambda report: [])
     monkeypatch.setattr(emulated_go2, "tracking", nothing("tracking"))
-    for module in (emulation, emulated_go2):
+    for module in (emulation, emulated_topics):
         for name in ("run_until", "reveal"):
             monkeypatch.setattr(module, name, note(name))
         monkeypatch.setattr(module, "happenings", nothing("happenings"))

@@ -18,6 +18,8 @@ from deal_hw.calibration import CalibrationResult
 from deal_hw.control.loop.timing import LoopTimingReport, Spread
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
+from deal_hw.drivers.g1.emulator.truth import G1Truth
+from deal_hw.drivers.g1.emulator.truth import draw_truth as draw_g1
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.emulator.truth import draw_truth as draw_go2
 from deal_hw.errors import ConfigurationError
@@ -78,6 +80,10 @@ DOCUMENTS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "truth of a cart-pole": (
         nominal_cartpole("realistic", 3, sensing_ticks=2).to_json(),
         lambda values: CartpoleTruth.from_json(values).to_json(),
+    ),
+    "truth of a G1": (
+        draw_g1("realistic", 5).to_json(),
+        lambda values: G1Truth.from_json(values).to_json(),
     ),
     "truth of a Go2": (
         draw_go2("realistic", 5).to_json(),

@@ -21,13 +21,13 @@ from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
-from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import nominal_truth as go2_truth
 from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.drivers.unitree.command_log import DAMPING, STIFF
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.transport import Message

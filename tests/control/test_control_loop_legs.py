@@ -19,7 +19,6 @@ from deal_hw.control.safety.safety import CycleInput, Safety, SafetyDecision
 from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
-from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF, kind_of
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
@@ -28,6 +27,7 @@ from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state, e
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.unitree.command_log import DAMPING, STIFF, kind_of
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.transport import Message

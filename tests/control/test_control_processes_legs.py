@@ -20,7 +20,7 @@ from fakes.logind import FakeLogind
 from deal_hw.cli.show import Terminal
 from deal_hw.control.process.channel import RUNNING, Beat, Outcome
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.drivers.unitree.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError
 from deal_hw.motions.planned_end import ENDING_EVENT
 from deal_hw.motions.posture import PostureConfig

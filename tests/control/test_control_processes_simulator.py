@@ -19,7 +19,7 @@ from deal_hw.errors import SafetyError, TransportTimeoutError, VersionMismatchEr
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions
-from deal_hw.workflows.emulation.go2 import free_port
+from deal_hw.workflows.emulation.topics import free_port
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.supervised import run_episodes
 from deal_hw.workflows.running.view import RunView

@@ -23,6 +23,7 @@ from deal_hw.drivers.transports.dds_session import ArrivalClock
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import load_types
 from deal_hw.drivers.transports.interfaces import Interface
+from deal_hw.drivers.transports.topics import HUMANOID_TYPES
 from deal_hw.errors import (
     ConfigurationError,
     FrameError,
@@ -260,6 +261,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from deal_hw.drivers.transports.dds_domain import acquire_domain
 from deal_hw.drivers.transports.dds_types import load_types
+from deal_hw.drivers.transports.topics import HUMANOID_TYPES
 from deal_hw.drivers.transports.interfaces import find_interface
 domain = int(sys.argv[1])
 acquire_domain(domain, find_interface("lo"))
@@ -356,3 +358,49 @@ def test_a_failing_library_is_an_error_not_silence(domain: int) -> None:
         wire._live._take = lambda *_: -1
         with pytest.raises(TransportError, match="rt/lowstate"):
             wire.receive(0.1)
+
+
+def humanoid(domain: int, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> DdsTransport:
+    """Return a transport on loopback for a G1's topics."""
+    wire = make(domain, publish=publish, subscribe=subscribe)
+    wire.name_types(HUMANOID_TYPES)
+    return wire
+
+
+def test_a_g1s_topics_have_its_own_types(domain: int) -> None:
+    """1004 bytes arrive where both name the type; the Go2's command is then no message of it."""
+    frame = HEADER + bytes(1000)
+    with (
+        humanoid(domain, publish=("rt/lowcmd",)) as near,
+        humanoid(domain, subscribe=("rt/lowcmd",)) as far,
+    ):
+        heard: list[bytes] = []
+
+        def act() -> None:
+            near.send(Message("rt/lowcmd", frame, 0))
+            with suppress(TransportTimeoutError):
+                heard.append(far.receive(0.05).payload)
+
+        patiently(far, lambda: heard, act)
+        assert heard[0] == frame
+        with pytest.raises(FrameError, match=r"unitree_hg::msg::dds_::LowCmd_"):
+            near.send(Message("rt/lowcmd", payload("rt/lowcmd", 1), 0))
+
+
+def test_a_go2_and_a_g1_do_not_hear_each_other(domain: int) -> None:
+    """One topic with two types: no message passes, and the survey says which type the other has."""
+    with (
+        humanoid(domain, publish=("rt/lowstate",)) as g1,
+        make(domain, subscribe=("rt/lowstate",)) as go2,
+    ):
+        patiently(go2, lambda: go2.survey().complaints, lambda: g1.send(_hg_state()))
+        (complaint,) = go2.survey().complaints
+        assert (
+            "unitree_hg::msg::dds_::LowState_, not unitree_go" in complaint and "another robot" in complaint
+        )
+        with pytest.raises(TransportTimeoutError):
+            go2.receive(0.05)
+
+
+def _hg_state() -> Message:
+    return Message("rt/lowstate", HEADER + bytes(2088), 0)

@@ -39,6 +39,10 @@ SIZES = {
     ("cartpole", "k9"): 9,
     ("cartpole", "k11"): 11,
     ("cartpole", "paper"): 11,
+    ("g1", "default"): 116,
+    ("g1", "biased"): 145,
+    ("g1_23dof", "default"): 92,
+    ("g1_23dof", "biased"): 115,
     ("go2", "default"): 24,
     ("go2", "paper"): 24,
     ("go2", "walk"): 29,
@@ -323,7 +327,9 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
     for name in (entry.name for entry in ENTRIES if not entry.driven):
         with pytest.raises(ConfigurationError, match=f"{name!r}.*no driver yet.*cartpole"):
             make_robot(name, "serial", "x", MonotonicClock())
-    with pytest.raises(UnknownNameError, match=r"cartpole, go2, go2_on_stand, so101, allegro, ant"):
+    with pytest.raises(
+        UnknownNameError, match=r"cartpole, go2, go2_on_stand, g1, g1_23dof, so101, allegro, ant"
+    ):
         robot_description("gotwo")
     with pytest.raises(UnknownNameError, match="go2_suspended"):
         parameter_spaces("gotwo")

@@ -25,9 +25,9 @@ from deal_hw.drivers.go2.bridge.limits import CommandLimits
 from deal_hw.drivers.go2.bridge.robot_side import ASK_NS, SILENCE_NS
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.rpc import Request, encode_request
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Echo, Stamp
+from deal_hw.drivers.unitree.rpc import Request, encode_request
 from deal_hw.transport import Message
 
 pytestmark = pytest.mark.real_time

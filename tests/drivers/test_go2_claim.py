@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers.go2 import claim as module
-from deal_hw.drivers.go2.claim import ASKING, HELD, RELEASED, WireClaim
-from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, Request, encode_request, read_note
 from deal_hw.drivers.transports.interfaces import list_interfaces
 from deal_hw.drivers.transports.topics import CLAIM
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
+from deal_hw.drivers.unitree import claim as module
+from deal_hw.drivers.unitree.claim import ASKING, HELD, RELEASED, WireClaim
+from deal_hw.drivers.unitree.rpc import CLAIM_TEXTS, Request, encode_request, read_note
 from deal_hw.errors import PortBusyError, TransportLostError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport, WireOptions
 
@@ -244,7 +244,7 @@ def test_a_text_nested_too_deep_is_no_claim() -> None:
 
 def test_over_zenoh_the_second_run_is_refused() -> None:
     """Two clients of one end point, as two runs against one bridge; free again after the release."""
-    from deal_hw.workflows.emulation.go2 import free_port
+    from deal_hw.workflows.emulation.topics import free_port
 
     port = free_port("tcp/127.0.0.1:0")
     with ZenohTransport(port, CLOCK, WireOptions(listen=True)):

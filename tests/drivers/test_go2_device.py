@@ -168,7 +168,8 @@ def test_bad_commands_are_not_obeyed(make_go2: Any, what: str) -> None:
 
 
 def _with_nan(payload: bytes) -> bytes:
-    from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
+    from deal_hw.drivers.go2.messages.wire import low_command_image
+    from deal_hw.drivers.unitree.cdr import words_crc
 
     changed = bytearray(payload)
     changed[28:32] = np.float32(np.nan).tobytes()

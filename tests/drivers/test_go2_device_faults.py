@@ -15,8 +15,8 @@ from deal_hw.drivers.go2.emulator.faults import MOMENTS, FaultPlan
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
 from deal_hw.drivers.go2.messages.low_command import LowCommand
-from deal_hw.drivers.go2.messages.remote import Remote, button_mask, decode_remote, decode_wireless
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.remote import Remote, button_mask, decode_remote, decode_wireless
 from deal_hw.types import FloatArray
 
 ZERO = np.zeros(12)

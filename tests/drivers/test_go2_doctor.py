@@ -19,10 +19,10 @@ from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
-from deal_hw.drivers.go2.messages.rpc import decode_response, encode_response
 from deal_hw.drivers.go2.messages.simulated import Simulator
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.unitree.rpc import decode_response, encode_response
 from deal_hw.errors import TransportError
 from deal_hw.findings import Finding, Severity
 

@@ -14,20 +14,21 @@ from deal_hw.cli.emulate import KINDS as EMULATE
 from deal_hw.cli.emulate import emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.go2.emulator.device import Go2Device
-from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
-from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, Go2Faults
+from deal_hw.drivers.go2.emulator.faults import FaultPlan, Go2Faults
 from deal_hw.drivers.go2.emulator.sport_controller import STANDING
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import decode_low_state
-from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.emulated_faults import SHARES
+from deal_hw.drivers.unitree.emulator import UnitreeEmulator
+from deal_hw.drivers.unitree.rpc import Request, decode_response, encode_request
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
 from deal_hw.robots.connect import make_topic_transport
 from deal_hw.transport import Message, WireOptions
-from deal_hw.workflows.emulation.go2 import free_port, summary
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.settings import Go2Options
+from deal_hw.workflows.emulation.topics import free_port, summary
 
 MS = 1_000_000
 ZERO = np.zeros(12)
@@ -41,7 +42,7 @@ class Bench:
         self.clock = VirtualClock(5_000 * MS)
         self.device = Go2Device(nominal_truth(), **options)
         self.wire = MemoryWire()
-        self.emulator = Go2Emulator(self.device, self.wire, self.clock)
+        self.emulator = UnitreeEmulator(self.device, self.wire, self.clock)
         self.emulator.open()
 
     def run(self, milliseconds: int) -> list[Message]:
@@ -143,7 +144,7 @@ def test_its_own_faults_do_not_end_it(transport: str, shares: dict[str, float], 
         MonotonicClock(),
         WireOptions(listen=True) if transport == "zenoh" else WireOptions(domain=dds_domain),
     )
-    emulator = Go2Emulator(device, wire, clock)
+    emulator = UnitreeEmulator(device, wire, clock)
     emulator.open()
     try:
         # At a share of 0.6, one state in 500 has another CDR header, which DDS refuses.

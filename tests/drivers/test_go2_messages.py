@@ -6,9 +6,10 @@ import struct
 
 import pytest
 
-from deal_hw.drivers.go2.messages import remote, rpc, sport_state
-from deal_hw.drivers.go2.messages.remote import Remote
+from deal_hw.drivers.go2.messages import sport_state
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree import remote, rpc
+from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.errors import ConfigurationError, FrameError, UnknownNameError
 
 

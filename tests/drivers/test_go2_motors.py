@@ -12,14 +12,16 @@ from hypothesis import strategies as st
 
 from deal_hw.drivers.go2.descriptions.floor import JOINTS
 from deal_hw.drivers.go2.descriptions.on_stand_recording import biased_space
-from deal_hw.drivers.go2.emulator.command_log import kind_of
-from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, StateFaults
-from deal_hw.drivers.go2.emulator.motors import AMBIENT_C, Motors
+from deal_hw.drivers.go2.emulator.faults import FaultPlan
+from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment, read_remote_script
 from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand
-from deal_hw.drivers.go2.messages.remote import Remote, button_mask
+from deal_hw.drivers.unitree.command_log import kind_of
+from deal_hw.drivers.unitree.emulated_faults import SHARES, StateFaults
+from deal_hw.drivers.unitree.emulated_motors import AMBIENT_C
+from deal_hw.drivers.unitree.remote import Remote, button_mask
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 ZERO = np.zeros(12)

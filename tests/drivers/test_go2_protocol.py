@@ -19,7 +19,8 @@ from deal_hw.drivers.go2.messages.layout import (
 )
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame, decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS, low_command_image, low_state_image, words_crc
+from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS, low_command_image, low_state_image
+from deal_hw.drivers.unitree.cdr import words_crc
 from deal_hw.errors import ConfigurationError, FrameError
 
 

@@ -13,9 +13,9 @@ from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages.low_command import decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.rpc import encode_note
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.rpc import encode_note
 from deal_hw.errors import (
     FrameError,
     SafetyError,

@@ -9,10 +9,10 @@ import pytest
 from fakes.go2 import RESTING, STANDING, STIFF, FakeBench
 
 from deal_hw.control.safety.passive import make_passive
-from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
-from deal_hw.drivers.go2.messages.rpc import Request, Response, encode_note, encode_response
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.remote import Remote, parse_combination
+from deal_hw.drivers.unitree.rpc import Request, Response, encode_note, encode_response
 from deal_hw.errors import (
     ProtocolError,
     SafetyError,

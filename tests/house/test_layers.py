@@ -63,7 +63,8 @@ ROOMS = {
     ),
     "drivers": (
         {"command_echo", "servo_bus", "transports"},
-        {"cartpole", "go2", "ros2", "servo_arm"},
+        {"unitree"},
+        {"cartpole", "g1", "go2", "ros2", "servo_arm"},
         {"so101"},
     ),
     "drivers.cartpole": (
@@ -74,10 +75,10 @@ ROOMS = {
         {"dynamixel"},
     ),
     "drivers.go2": (
-        {"descriptions"},
+        {"descriptions", "wording"},
         {"messages"},
-        {"emulator", "claim", "motion_switcher", "motions", "odometry", "state_stream", "support"},
-        {"bridge", "command_sender", "connect", "doctor", "takeover"},
+        {"emulator", "motions", "odometry", "state_stream", "support"},
+        {"bridge", "doctor"},
         {"robot"},
         {"unitree_mujoco"},
     ),
@@ -288,7 +289,7 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
         ("drivers/x.py", "import serial\nfrom deal_hw.sim.model import build\nfrom deal_hw.drivers import y"),
         (
             "drivers/go2/robot.py",
-            "from deal_hw.drivers.go2 import takeover\nfrom deal_hw.drivers.go2.messages import rpc",
+            "from deal_hw.drivers.go2 import support\nfrom deal_hw.drivers.go2.messages import body",
         ),
         (
             "deal_hw/bench/x.py",

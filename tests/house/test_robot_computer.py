@@ -19,8 +19,8 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.install import install_line
 from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.testing.plain_robots import make_robot, write
-from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.topics import free_port
 
 pytestmark = pytest.mark.real_time
 

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 SECOND_NAMES = {
     r"link[_ ]errors?\b": "transport errors",
-    r"go2_hung|--hung\b|--suspended\b": "go2_on_stand, --on-stand",
+    r"go2_hung|--hung\b(?!-on-crane)|--suspended\b": "go2_on_stand, --on-stand",
     r"\bP-D\b": "PD",
 }
 """Pattern of a word that readers took for another thing -> the one name."""

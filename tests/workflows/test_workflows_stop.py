@@ -17,7 +17,7 @@ from deal_hw.cli.main import main
 from deal_hw.clock import VirtualClock
 from deal_hw.control.process.claim import LocalClaim
 from deal_hw.control.process.run_note import RunNote, find_runs
-from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.drivers.unitree.command_log import DAMPING, STIFF
 from deal_hw.errors import ConfigurationError, PortBusyError, UnknownNameError
 from deal_hw.workflows import stop as module
 from deal_hw.workflows.emulation.process import EmulatorProcess

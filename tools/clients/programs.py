@@ -241,4 +241,20 @@ CLIENTS: Final = (
         # The example ends with sys.exit(-1).
         exit_codes=(255,),
     ),
+    Client(
+        name="g1_low_level_example.py",
+        source="unitree_sdk2_python/example/g1/low_level/g1_low_level_example.py",
+        command=("{source}", "{port}"),
+        emulator=("g1", "--transport", "dds", "--port", "lo", "--profile", "ideal", "--nominal"),
+        paths=("unitree_sdk2_python",),
+        own_python=True,
+        keys=(("Press Enter", "\n"),),
+        # Roll, pitch and yaw of every 500th state: its types and ours match, and the states' checksum is no
+        # matter to it. That its commands are taken is in the emulator's report.
+        must=(r"\[-?0\.\d+, -?0\.\d+, -?0\.\d+\]",),
+        # The three stages, 9 s: all joints to 0, ankles as pitch and roll, ankles as parallel motors.
+        stop_after_s=12.0,
+        exit_codes=(130, 1, -2),
+        must_not=(),
+    ),
 )

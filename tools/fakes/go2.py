@@ -18,11 +18,11 @@ from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_jacobians
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
-from deal_hw.drivers.go2.messages.remote import Remote, encode_remote
-from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_request, encode_response
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import TopicCore, VirtualTopics
+from deal_hw.drivers.unitree.remote import Remote, encode_remote
+from deal_hw.drivers.unitree.rpc import Request, Response, decode_request, encode_response
 from deal_hw.types import FloatArray
 
 

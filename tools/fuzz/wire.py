@@ -19,7 +19,10 @@ from deal_hw.drivers.cartpole.wire import protocol as serial
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.remote import (
+from deal_hw.drivers.go2.messages.sport_state import LONG_BYTES, SHORT_BYTES, decode_sport_state
+from deal_hw.drivers.go2.messages.wire import low_command_image, low_state_image
+from deal_hw.drivers.unitree.cdr import CDR_HEADER, words_crc
+from deal_hw.drivers.unitree.remote import (
     REMOTE_BYTES,
     Remote,
     decode_remote,
@@ -27,15 +30,13 @@ from deal_hw.drivers.go2.messages.remote import (
     encode_remote,
     encode_wireless,
 )
-from deal_hw.drivers.go2.messages.rpc import (
+from deal_hw.drivers.unitree.rpc import (
     Request,
     Response,
     decode_response,
     encode_request,
     encode_response,
 )
-from deal_hw.drivers.go2.messages.sport_state import LONG_BYTES, SHORT_BYTES, decode_sport_state
-from deal_hw.drivers.go2.messages.wire import CDR_HEADER, low_command_image, low_state_image, words_crc
 from fuzz.kind import Kind, WireKind
 from fuzz.mutations import damage_bytes, damage_json, mended
 from fuzz.recordings import make_cycle

@@ -102,8 +102,25 @@ class DoctorGo2Settings(DoctorRobotSettings):
             refuse(given(self, DoctorGo2Settings, ("state_check",)), f"{self.simulator} has no checksums")
 
 
+@dataclass(frozen=True, kw_only=True)
+class DoctorG1Settings(DoctorRobotSettings):
+    """Check this computer, the connection and a G1; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+    port: str
+    """The G1's port: a network interface (dds) or an end point (zenoh)."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """Transport to the G1."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options."""
+
+
 DOCTOR = robot_kinds(
-    {"cartpole": DoctorCartpoleSettings, "go2": DoctorGo2Settings},
+    {"cartpole": DoctorCartpoleSettings, "go2": DoctorGo2Settings, "g1": DoctorG1Settings},
     plain=DoctorRobotSettings,
     legged=DoctorRobotSettings,
     nothing=DoctorSettings,
@@ -174,6 +191,8 @@ def _examine_link(config: DoctorRobotSettings, name: str, clock: Clock) -> Itera
     network, own = WireOptions(), dict[str, str]()
     if isinstance(config, DoctorGo2Settings):
         network, own = config.wire, {"state_check": config.state_check, "simulator": config.simulator}
+    if isinstance(config, DoctorG1Settings):
+        network = config.wire
     if wire.doctor:
         link = make_topic_transport(wire.transport, config.port, clock, network)
         yield from entry.load(wire.doctor)(link, clock, config.seconds, **own).run()

@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import gc
-import re
-import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
-from deal_hw.errors import ConfigurationError, MissingExtraError, shown
+from deal_hw.errors import ConfigurationError, shown
 from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
-from deal_hw.robots import robot_entry
-from deal_hw.robots.connect import make_topic_transport
-from deal_hw.workflows.emulation.common import (
-    choose_truth,
-    happenings,
-    next_line,
-    realtime_priority,
-    reveal,
-    run_until,
-)
+from deal_hw.workflows.emulation.common import choose_truth
 from deal_hw.workflows.emulation.settings import EmulateGo2Settings
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.emulation.topics import emulate_on_topics
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
@@ -38,7 +27,6 @@ if TYPE_CHECKING:
 
 TRACK_COLUMNS = ("time_s", "x", "y", "heading")
 TRACK_NS = 10_000_000
-_ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
 
 
 def emulate_go2(
@@ -53,52 +41,15 @@ def emulate_go2(
         announce: Called with the port first, and with the truth at the end.
         say: Called with a summary at the end.
     """
-    entry = robot_entry(config.robot)
-    own_wire = entry.wire(config.transport or entry.emulated_on[0])
-    try:
-        Go2Emulator = entry.load(own_wire.emulator)
-    except ModuleNotFoundError as error:
-        if error.name == "mujoco":
-            raise MissingExtraError(error.name, "sim") from error
-        raise
     truth = _truth(config)
-    device = _device(config, truth)
-    transport = own_wire.name
-    port = free_port(config.port or own_wire.emulator_port)
-    wire = make_topic_transport(transport, port, MonotonicClock(), config.wire.on(transport))
-    emulator = Go2Emulator(device, wire)
-    gc.collect()
-    gc.freeze()
-    # Threads of the transport inherit the priority of the moment when it is opened.
-    with realtime_priority():
-        try:
-            emulator.open()
-            announce(f"port {port}")
-            announce(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends")
-            announce(next_line(config, port))
+    what = f"profile {truth.profile}, seed {truth.seed}"
 
-            log = device.log
-            with (
-                happenings(config.events_to, log.requests, log.changes) as tell,
-                tracking(config.go2.track_to, device, config.go2.tick_start_ms) as track,
-            ):
+    def watch(device: Go2Device) -> AbstractContextManager[Callable[[], None]]:
+        return tracking(config.go2.track_to, device, config.go2.tick_start_ms)
 
-                def step() -> bool:
-                    if cut.is_set():
-                        cut.clear()
-                        device.begin_fault("cut")
-                    emulator.step()
-                    tell()
-                    track()
-                    return True
-
-                run_until(step, stop, config.duration_s, config.parent)
-        finally:
-            emulator.close()
-    report = emulator.report()
-    reveal(report, announce if config.reveal else silent, config.reveal_to)
-    for line in summary(report):
-        say(line)
+    emulate_on_topics(
+        config, lambda: _device(config, truth), what, stop, cut, announce=announce, say=say, watch=watch
+    )
 
 
 @contextlib.contextmanager
@@ -141,38 +92,6 @@ def read_track(path: Path) -> Track:
         # The emulator may still be writing the last line.
         rows = np.array([[float(part) for part in line.split(",")] for line in lines[:-1]])
         return Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
-
-
-def summary(report: dict[str, Any]) -> list[str]:
-    """Return a summary of the run as text."""
-    commands = report["commands"]
-    lines = [
-        f"emulator: {report['device_ms'] / 1e3:.1f} s, {report['sent']['rt/lowstate']} states sent, "
-        f"{report['late_ticks']} ticks late (worst {report['latest_ms']:.1f} ms), {report['slips']} stalls, "
-        f"{report['unsent']} messages not sent",
-        f"commands: {commands['accepted']} taken, {commands['refused']} refused"
-        + (f" (the last: {commands['last_refusal']})" if commands["refused"] else "")
-        + f", the last kind: {commands['last_kind'] or 'none'}; sport mode: {report['sport'] or 'released'}",
-    ]
-    for fault in commands["faults"]:
-        damped = fault["first_damping_ms"]
-        after = "no damping since" if damped is None else f"damping {damped - fault['begin_ms']} ms later"
-        lines.append(f"fault {fault['name']} at {fault['begin_ms'] / 1e3:.3f} s: {after}")
-    return lines
-
-
-def free_port(port: str) -> str:
-    """Return the port, its number 0 replaced by that of a free TCP port."""
-    found = _ANY_PORT.fullmatch(port)
-    if found is None:
-        return port
-    address = found["address"]
-    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
-        try:
-            probe.bind((address, 0))
-        except OSError as error:
-            raise ConfigurationError(f"port {port!r}: {error}") from error
-        return f"{found['host']}:{probe.getsockname()[1]}"
 
 
 def _truth(config: EmulateGo2Settings) -> Go2Truth:

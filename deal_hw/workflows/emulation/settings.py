@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
+from deal_hw.drivers.g1.emulator.faults import G1Faults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
@@ -97,7 +98,7 @@ class EmulateSettings(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Hidden parameters lie within this factor of the nominal ones; by default 5 for the cart-pole, 2 for the
-    Go2, 1.5 for an arm."""
+    Go2, 1.5 for the G1 and an arm."""
 
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
@@ -247,7 +248,50 @@ class EmulateGo2Settings(EmulateSettings):
     """How it joins its network."""
 
 
-_SETTINGS: dict[str, type[EmulateSettings]] = {"cartpole": EmulateCartpoleSettings, "go2": EmulateGo2Settings}
+@dataclass(frozen=True, kw_only=True)
+class G1Options(Checked):
+    """Options of ``emulate g1`` alone."""
+
+    controller: Literal["ai", "normal", "advanced", "off"] = "ai"
+    """Mode of the robot's own controller at power-up. It overrides other commands until it is released."""
+
+    mode_machine: Annotated[int | None, Range(0, 255)] = None
+    """Version of the G1 that the states report; by default 5 (29 joints) or 4 (23 joints)."""
+
+    no_remote: bool = False
+    """Emulate no remote: its 40 bytes are zeros."""
+
+    tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
+    """The robot's clock at the start [ms]; it wraps at 2**32."""
+
+    faults: G1Faults = field(default_factory=G1Faults)
+    """Faults of the G1. Their times count from the first stiff command."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateG1Settings(EmulateSettings):
+    """Emulate a G1 that hangs on a crane, in real time on its own network, with hidden physics."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """The wire."""
+
+    port: str | None = None
+    """Network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one). By
+    default reachable on this machine only."""
+
+    g1: G1Options = field(default_factory=G1Options)
+    """Options of the G1 alone."""
+
+    wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
+    """How it joins its network."""
+
+
+_SETTINGS: dict[str, type[EmulateSettings]] = {
+    "cartpole": EmulateCartpoleSettings,
+    "go2": EmulateGo2Settings,
+    "g1": EmulateG1Settings,
+    "g1_23dof": EmulateG1Settings,
+}
 
 
 _HELP = {

@@ -87,6 +87,30 @@ class Go2LinkOptions(LinkOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class G1LinkOptions(LinkOptions):
+    """The connection to a G1, beyond the port."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """The transport."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CraneOptions:
+    """Options of a robot that must hang on a crane."""
+
+    hung_on_crane: bool = False
+    """Confirm that the robot hangs on a crane, feet free, nobody in reach. Without it the question is asked
+    on a terminal, and elsewhere the run is refused. No sensor tells it. Every end of a run is damping, in
+    which a robot on the floor falls."""
+
+    stop_buttons: str = ""
+    """Buttons of the robot's remote that, held together, make the robot passive; by default L2+B."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RecordOptions(Checked):
     """Where a run is recorded."""
 
@@ -138,6 +162,21 @@ class Go2RunOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class G1RunOptions(RunOptions):
+    """Options of every verb that runs a G1."""
+
+    port: str
+    """The robot's port: a network interface such as enp2s0 (dds), or an end point such as
+    tcp/127.0.0.1:7447 (zenoh)."""
+
+    link: G1LinkOptions = field(default_factory=G1LinkOptions)
+    """The connection to the robot, beyond the port."""
+
+    crane: CraneOptions = field(default_factory=CraneOptions)
+    """Options of a robot that must hang on a crane."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SimulationOptions(Checked):
     """Hidden truth of a simulated robot; noise and step of its sensors are those of robot.yaml."""
 
@@ -164,6 +203,12 @@ def legs_of(options: RunOptions) -> StandOptions | None:
     return legs
 
 
+def crane_of(options: RunOptions) -> CraneOptions | None:
+    """Return the options of a robot that must hang on a crane; None for another robot."""
+    crane: CraneOptions | None = getattr(options, "crane", None)
+    return crane
+
+
 def require_simulation(robot: str, options: SimulationOptions) -> None:
     """Check that the simulation of a user's robot is asked for: the robot itself has no driver.
 
@@ -187,7 +232,12 @@ def refuse_unrecorded(options: RunOptions, record: bool) -> None:
 
 
 def plan_options(
-    robot: str, link: LinkOptions, legs: StandOptions | None = None, *, walks: bool = True
+    robot: str,
+    link: LinkOptions,
+    legs: StandOptions | None = None,
+    *,
+    crane: CraneOptions | None = None,
+    walks: bool = True,
 ) -> dict[str, Any]:
     """Return the fields of a :class:`~deal_hw.workflows.running.plan.RunPlan` that follow from the options.
 
@@ -195,6 +245,7 @@ def plan_options(
         robot: The robot's name.
         link: The connection.
         legs: Options of a robot with legs; None for a robot without.
+        crane: Options of a robot that must hang on a crane; None for another.
         walks: Whether a policy runs that takes a requested velocity.
 
     Raises:
@@ -206,9 +257,9 @@ def plan_options(
         "robot": named(robot),
         "transport": link.transport or default_transport(robot),
         "record_wire": link.record_wire,
-        "robot_settings": _settings(link, legs),
+        "robot_settings": _settings(link, legs, crane),
     }
-    if isinstance(link, Go2LinkOptions):
+    if isinstance(link, Go2LinkOptions | G1LinkOptions):
         options["wire"] = link.wire
     if legs is None:
         return {**options, "stand": False}
@@ -227,10 +278,11 @@ def plan_options(
     return {**options, "stand": stands, "hand_back": legs.hand_back, "posture": legs.posture}
 
 
-def _settings(link: LinkOptions, legs: StandOptions | None) -> dict[str, Any]:
+def _settings(link: LinkOptions, legs: StandOptions | None, crane: CraneOptions | None) -> dict[str, Any]:
     """Return the given settings of the driver; a driver without such a setting refuses it."""
     own: tuple[tuple[Any, Any, tuple[str, ...]], ...] = (
         (legs, StandOptions, ("stop_buttons", "support_check")),
+        (crane, CraneOptions, ("stop_buttons", "hung_on_crane")),
         (link, Go2LinkOptions, ("state_check", "simulator")),
     )
     return {

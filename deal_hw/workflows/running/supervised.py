@@ -15,6 +15,8 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.channel import Beat, Outcome
 from deal_hw.description import RobotDescription
 from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
+from deal_hw.ranges import option
+from deal_hw.robot import Robot
 from deal_hw.robots.connect import make_robot
 from deal_hw.workflows.options import File
 from deal_hw.workflows.robot import is_user_robot, keep_robot
@@ -138,6 +140,7 @@ def run_episodes(
     # Errors of settings, policy or recording must be reported before the robot is used.
     ExcitationLevelSearch(plan.excitation_level, attempts)
     plan = check_plan(plan, robot.description, view)
+    plan = _conditioned(plan, robot, view)
     reports: list[EpisodeReport] = []
     current: list[EpisodeRun] = []
     sleeping = threading.Event()
@@ -186,6 +189,25 @@ def run_episodes(
         play_episodes(plan, episodes, attempts, robot.description, view, run_one)
     reports[-1].raise_error()
     return RunReport(dataset=dataset, episodes=tuple(reports))
+
+
+def _conditioned(plan: RunPlan, robot: Robot, view: RunView) -> RunPlan:
+    """Return the plan with the operator's word that the robot is as it must be, where no sensor tells.
+
+    Raises:
+        SafetyError: The operator says no, or nobody can answer.
+    """
+    name = robot.condition_setting
+    if not robot.condition or plan.dry_run or plan.robot_settings.get(name):
+        return plan
+    answer = view.confirm(f"{robot.description.name}: {robot.condition}", "is that so?")
+    if answer is None:
+        raise errors.SafetyError(
+            f"{robot.description.name}: {robot.condition}. No sensor tells it: confirm it by {option(name)}"
+        )
+    if not answer:
+        raise errors.SafetyError(f"not run, nothing was sent: {robot.condition}")
+    return dataclasses.replace(plan, robot_settings={**plan.robot_settings, name: True})
 
 
 def play_episodes(

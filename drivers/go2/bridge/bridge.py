@@ -19,7 +19,12 @@ from deal_hw.drivers.go2.bridge.robot_side import BUSY
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
-from deal_hw.drivers.go2.messages.rpc import (
+from deal_hw.drivers.go2.wording import WORDING
+from deal_hw.drivers.transports import topics
+from deal_hw.drivers.transports.zenoh_stamps import Stamp
+from deal_hw.drivers.unitree.motion_switcher import BUSY as BUSY_CODE
+from deal_hw.drivers.unitree.motion_switcher import CHECK_MODE, SWITCHER, MotionSwitcher, ServiceClient
+from deal_hw.drivers.unitree.rpc import (
     CLAIM_TEXTS,
     Request,
     decode_response,
@@ -27,10 +32,6 @@ from deal_hw.drivers.go2.messages.rpc import (
     encode_request,
     read_note,
 )
-from deal_hw.drivers.go2.motion_switcher import BUSY as BUSY_CODE
-from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, MotionSwitcher, ServiceClient
-from deal_hw.drivers.transports import topics
-from deal_hw.drivers.transports.zenoh_stamps import Stamp
 from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 
@@ -303,7 +304,7 @@ class Go2Bridge:
         A robot whose own controller is released holds its last command for ever. If its own controller is
         active, or another program commands it, the bridge sends nothing.
         """
-        self._services = ServiceClient(self._to_robot, self._pump, self._clock)
+        self._services = ServiceClient(self._to_robot, self._pump, self._clock, WORDING)
         switcher = MotionSwitcher(self._services, self._clock)
         try:
             # A request before the end of discovery is lost, and repeated half a second later.

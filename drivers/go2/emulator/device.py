@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS
 from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as RECORDED
-from deal_hw.drivers.go2.emulator.command_log import CommandLog
-from deal_hw.drivers.go2.emulator.faults import FaultPlan, StateFaults
+from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
@@ -22,9 +21,11 @@ from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
-from deal_hw.drivers.go2.messages.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.drivers.go2.messages.sport_state import POINTS, SportState, encode_sport_state
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.command_log import CommandLog
+from deal_hw.drivers.unitree.emulated_faults import StateFaults
+from deal_hw.drivers.unitree.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.errors import FrameError
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
@@ -126,6 +127,21 @@ class Go2Device:
     def device_ns(self) -> int:
         """Device time at which the next tick runs [ns]."""
         return self._tick * TICK_NS
+
+    @property
+    def published(self) -> tuple[str, ...]:
+        """Topics that it writes."""
+        return PUBLISHED if self.sport_on_wire else PUBLISHED[:-1]
+
+    @property
+    def subscribed(self) -> tuple[str, ...]:
+        """Topics that it reads."""
+        return SUBSCRIBED
+
+    @property
+    def types(self) -> Mapping[str, str]:
+        """No topic has another type than usual."""
+        return {}
 
     @property
     def true_position(self) -> FloatArray:

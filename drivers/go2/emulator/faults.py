@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Final
 
-import numpy as np
-
 from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.drivers.unitree.emulated_faults import SHARES
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
-SHARES: Final = ("drop", "duplicate", "reorder", "corrupt")
 MOMENTS: Final = (
     "wire",
     "freeze",
@@ -116,44 +114,3 @@ class FaultPlan(Go2Faults):
             if after_s is not None:
                 found.append((round(after_s * 1e3), name))
         return sorted(found)
-
-
-class StateFaults:
-    """Applies the four shares to messages of one topic.
-
-    Attributes:
-        counts: How often each happened.
-
-    Args:
-        plan: The shares.
-        rng: Source of randomness.
-    """
-
-    def __init__(self, plan: FaultPlan, rng: np.random.Generator) -> None:
-        self.counts = dict.fromkeys(SHARES, 0)
-        self._shares = np.array([getattr(plan, name) for name in SHARES])
-        self.any = bool(self._shares.any())
-        self._rng = rng
-        self._held: bytes | None = None
-
-    def apply(self, payload: bytes) -> list[bytes]:
-        """Return the messages that replace this one, in order."""
-        drop, duplicate, reorder, corrupt = self._rng.random(4) < self._shares
-        late = [] if self._held is None else [self._held]
-        self._held = None
-        if drop:
-            self.counts["drop"] += 1
-            return late
-        if corrupt:
-            self.counts["corrupt"] += 1
-            changed = bytearray(payload)
-            changed[int(self._rng.integers(len(payload)))] ^= int(self._rng.integers(1, 256))
-            payload = bytes(changed)
-        if reorder and not late:
-            self.counts["reorder"] += 1
-            self._held = payload
-            return []
-        if duplicate:
-            self.counts["duplicate"] += 1
-            return [payload, payload, *late]
-        return [payload, *late]

@@ -1,35 +1,15 @@
-"""The emulated Go2's twelve motors: a PD loop at 1 kHz on the last command, which they hold for ever."""
+"""The emulated Go2's twelve motors."""
 
 from __future__ import annotations
-
-from typing import Final
-
-import numpy as np
 
 from deal_hw.drivers.go2.descriptions.floor import EFFORT_LIMIT_NM, VELOCITY_LIMIT_RAD_S, per_joint
 from deal_hw.drivers.go2.emulator.profiles import Go2Profile
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
-from deal_hw.drivers.go2.messages.low_command import MODE_SERVO, POSITION_STOP, VELOCITY_STOP, LowCommand
-from deal_hw.types import FloatArray, IntArray
-
-AMBIENT_C: Final = 28.0
-_HEAT_K_PER_NM2: Final = 0.25
-"""Final warming for the square of the torque."""
-_WARMING_S: Final = 150.0
+from deal_hw.drivers.unitree.emulated_motors import PdMotors
 
 
-class Motors:
-    """Twelve motors in model order. There is no watchdog: the last command holds until the next.
-
-    Until the first command they are off, as after power-up.
-
-    Attributes:
-        mode: Mode of each motor as commanded last, (12,).
-        lost: Commands that each motor missed, (12,).
-        temperature: (12,) [°C].
-        effort: Efforts at the start of a step, (12,) [N·m].
-        constant: The part of the effort that is constant through the step, (12,) [N·m].
-        brake: The rest as damping, which falls as the joint slows down within the step, (12,) [N·m·s/rad].
+class Motors(PdMotors):
+    """Twelve motors in model order.
 
     Args:
         truth: True gains over commanded gains, encoder bias.
@@ -37,63 +17,11 @@ class Motors:
     """
 
     def __init__(self, truth: Go2Truth, profile: Go2Profile) -> None:
-        self._stiffness_factor, self._damping_factor = np.array(truth.stiffness), np.array(truth.damping)
-        self._bias = np.array(truth.encoder_bias)
-        self._limit = np.array(per_joint(EFFORT_LIMIT_NM))
-        self._no_load = np.array(per_joint(VELOCITY_LIMIT_RAD_S))
-        self._knee = profile.knee
-        self._q, self._dq, self._kp, self._kd, self._tau = np.zeros((5, 12))
-        self._alive, self._any_dead = np.ones(12), False
-        self.mode: IntArray = np.zeros(12, np.int64)
-        self.lost: IntArray = np.zeros(12, np.int64)
-        self.temperature = np.full(12, AMBIENT_C)
-        self.effort, self.constant, self.brake = np.zeros((3, 12))
-
-    def accept(self, command: LowCommand) -> None:
-        """Hold this command from now on."""
-        on = command.mode == MODE_SERVO
-        # The vendor's stop values switch a loop off at any gain.
-        position_on = on & (np.abs(command.position) < POSITION_STOP / 2)
-        velocity_on = on & (np.abs(command.velocity) < VELOCITY_STOP)
-        self._kp = np.where(position_on, command.stiffness * self._stiffness_factor, 0.0)
-        self._kd = np.where(velocity_on, command.damping * self._damping_factor, 0.0)
-        self._q = np.where(position_on, command.position, 0.0)
-        self._dq = np.where(velocity_on, command.velocity, 0.0)
-        self._tau = np.where(on, command.effort, 0.0)
-        self.mode = command.mode
-
-    def lose(self, joint: int) -> None:
-        """Disconnect a motor: it gives no torque and misses every command from now on."""
-        self._alive[joint] = 0.0
-        self._any_dead = True
-
-    def update(self, position: FloatArray, velocity: FloatArray) -> None:
-        """Compute the efforts for true positions and velocities, (12,).
-
-        The D gain becomes damping, which is integrated implicitly. If its torque were held through a step of
-        1 ms, high gains, which a real motor takes, would make the light joints unstable.
-        """
-        constant = self._kp * (self._q - position - self._bias) + self._kd * self._dq + self._tau
-        wish = constant - self._kd * velocity
-        limit = self._limit
-        if self._knee < 1.0:
-            share = (1.0 - np.abs(velocity) / self._no_load) / (1.0 - self._knee)
-            driving = self._limit * np.minimum(np.maximum(share, 0.0), 1.0)
-            # Braking is not limited by the supply's voltage.
-            limit = np.where(wish * velocity > 0.0, driving, self._limit)
-        free = np.abs(wish) <= limit
-        if free.all() and not self._any_dead:
-            self.effort, self.constant, self.brake = wish, constant, self._kd
-            return
-        self.effort = np.minimum(np.maximum(wish, -limit), limit) * self._alive
-        # Beyond the limit the effort does not depend on the joint's motion.
-        self.constant = np.where(free, constant * self._alive, self.effort)
-        self.brake = np.where(free, self._kd * self._alive, 0.0)
-
-    def warm(self, seconds: float) -> None:
-        """Warm the motors by their efforts, and count the commands that dead ones miss."""
-        steady = AMBIENT_C + _HEAT_K_PER_NM2 * self.effort * self.effort
-        self.temperature += (seconds / _WARMING_S) * (steady - self.temperature)
-        if self._any_dead:
-            # A new array, because earlier states keep the old one.
-            self.lost = self.lost + (self._alive == 0.0)
+        super().__init__(
+            truth.stiffness,
+            truth.damping,
+            truth.encoder_bias,
+            per_joint(EFFORT_LIMIT_NM),
+            per_joint(VELOCITY_LIMIT_RAD_S),
+            profile.knee,
+        )

@@ -2,74 +2,30 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from deal_hw.drivers.go2.descriptions.floor import FLOOR_FRICTION
+from deal_hw.drivers.unitree.emulated_profile import SENSOR, SensorProfile
 from deal_hw.errors import UnknownNameError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Go2Profile:
-    """Differences of an emulated robot from its equations. Noise is white; values are standard deviations.
+class Go2Profile(SensorProfile):
+    """Differences of an emulated Go2 from its equations.
 
     Attributes:
-        name: The profile's name, as on the command line.
-        position_noise: Of joint positions [rad].
-        position_resolution: Quantisation step of joint positions [rad]; 0 for none.
-        velocity_noise: Of joint velocities [rad/s].
-        acceleration_noise: Of joint accelerations [rad/s²].
-        effort_noise: Of estimated efforts [N·m].
-        orientation_noise: Of the estimated orientation, each axis [rad].
-        gyro_noise: Of angular velocities [rad/s].
-        specific_force_noise: Of the accelerometer [m/s²].
-        encoder_bias_rad: Largest hidden zero error of a joint, to both sides [rad].
         payload_kg: Lowest and highest hidden mass that is strapped to the trunk [kg].
         floor_friction: Lowest and highest hidden sliding friction of the floor.
-        latency_ms: Lowest and highest hidden time between a command's reception and its use [ms].
-        jitter_ms: A command acts up to this much later, uniformly [ms].
-        stribeck_ratio: Gear friction at standstill over friction in motion, less 1.
-        stribeck_rad_s: Speed at which that excess has fallen to 1/e [rad/s].
-        knee: Share of the no-load speed up to which a motor gives full torque; from there it falls linearly.
-            1: full torque at any speed.
-        drop: Share of lost states.
     """
 
-    name: str
-    position_noise: float = 0.0
-    position_resolution: float = 0.0
-    velocity_noise: float = 0.0
-    acceleration_noise: float = 0.0
-    effort_noise: float = 0.0
-    orientation_noise: float = 0.0
-    gyro_noise: float = 0.0
-    specific_force_noise: float = 0.0
-    encoder_bias_rad: float = 0.0
     payload_kg: tuple[float, float] = (0.0, 0.0)
     floor_friction: tuple[float, float] = (FLOOR_FRICTION, FLOOR_FRICTION)
-    latency_ms: tuple[int, int] = (0, 0)
-    jitter_ms: int = 0
-    stribeck_ratio: float = 0.0
-    stribeck_rad_s: float = 0.1
-    knee: float = 1.0
-    drop: float = 0.0
 
 
-_SENSOR: Final[Mapping[str, Any]] = {
-    "position_noise": 5e-4,
-    "position_resolution": 2 * math.pi / 32768,
-    "velocity_noise": 0.02,
-    "acceleration_noise": 2.0,
-    "effort_noise": 0.05,
-    "orientation_noise": 2e-3,
-    "gyro_noise": 0.01,
-    "specific_force_noise": 0.05,
-}
 PROFILES: Final = {
     "ideal": Go2Profile(name="ideal"),
-    "sensor": Go2Profile(name="sensor", latency_ms=(2, 10), **_SENSOR),
+    "sensor": Go2Profile(name="sensor", latency_ms=(2, 10), **SENSOR),
     "realistic": Go2Profile(
         name="realistic",
         latency_ms=(2, 10),
@@ -80,7 +36,7 @@ PROFILES: Final = {
         stribeck_ratio=0.4,
         knee=0.6,
         drop=0.002,
-        **_SENSOR,
+        **SENSOR,
     ),
 }
 """We know of no published figures of a real Go2's sensors: these are assumptions."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
+from deal_hw.drivers.unitree.remote import Remote, parse_combination
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.reading import number, read_json, reading
 

@@ -11,6 +11,7 @@ from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import Go2Profile
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.low_state import LowState
+from deal_hw.drivers.unitree.emulated_imu import roll_pitch_yaw, turned
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 
@@ -121,7 +122,7 @@ class Sensing:
             temperature[self.hot] = _HOT_C
         if self.broken is not None:
             position[self.broken] = velocity[self.broken] = math.nan
-        w, x, y, z = orientation = _turned(sim.orientation(), noise[48:51])
+        w, x, y, z = orientation = turned(sim.orientation(), noise[48:51])
         force = np.rint(np.minimum(sim.foot_force(), 32767.0)).astype(np.int64)
         self._cells[:CELLS] = battery.cell_mv
         return LowState(
@@ -135,7 +136,7 @@ class Sensing:
             orientation=orientation,
             angular_velocity=sim.angular_velocity() + noise[51:54],
             specific_force=sim.specific_force() + noise[54:57],
-            rpy=_roll_pitch_yaw(w, x, y, z),
+            rpy=roll_pitch_yaw(w, x, y, z),
             imu_temperature=IMU_TEMPERATURE_C,
             foot_force=force,
             foot_force_estimate=force,
@@ -149,28 +150,3 @@ class Sensing:
             voltage=battery.voltage,
             current=battery.current,
         )
-
-
-def _turned(orientation: FloatArray, angles: FloatArray) -> FloatArray:
-    """Return a quaternion turned by small angles about its own axes, to first order."""
-    w, x, y, z = orientation
-    a, b, c = angles / 2
-    turned = np.array(
-        (
-            w - x * a - y * b - z * c,
-            x + w * a + y * c - z * b,
-            y + w * b + z * a - x * c,
-            z + w * c + x * b - y * a,
-        )
-    )
-    return np.asarray(turned / math.sqrt(turned @ turned))
-
-
-def _roll_pitch_yaw(w: float, x: float, y: float, z: float) -> FloatArray:
-    return np.array(
-        (
-            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x)))),
-            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        )
-    )

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from deal_hw.drivers.go2.emulator.sport_controller import Posture, SportController
-from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_request, encode_response
+from deal_hw.drivers.unitree.rpc import Request, Response, decode_request, encode_response
 from deal_hw.errors import UnknownNameError
 from deal_hw.types import FloatArray
 

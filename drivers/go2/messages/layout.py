@@ -7,28 +7,16 @@ predecessor without padding, so the other motors' stride of 36 or 48 bytes does 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+
+from deal_hw.drivers.unitree.cdr import packed
 
 SLOTS: Final = 20
 """Motor slots of the messages; the Go2 uses the first 12."""
 LOW_COMMAND_BYTES: Final = 812
 LOW_STATE_BYTES: Final = 1180
-
-
-def packed(size: int, fields: Mapping[str, tuple[Any, int]]) -> np.dtype[np.void]:
-    """Return the layout of a message of this length; each field has its kind and its first byte."""
-    return np.dtype(
-        {
-            "names": list(fields),
-            "formats": [kind for kind, _ in fields.values()],
-            "offsets": [offset for _, offset in fields.values()],
-            "itemsize": size,
-        }
-    )
-
 
 # The beginning of both messages, after the encapsulation.
 _FRAME: Final = {

@@ -11,8 +11,6 @@ from deal_hw.drivers.go2.descriptions.floor import JOINTS
 from deal_hw.drivers.go2.messages import layout
 from deal_hw.drivers.go2.messages.layout import LOW_COMMAND_BYTES
 from deal_hw.drivers.go2.messages.wire import (
-    CDR_HEADER,
-    CRC_START,
     HEAD,
     LEVEL_LOW,
     SLOT,
@@ -20,16 +18,12 @@ from deal_hw.drivers.go2.messages.wire import (
     check_frame,
     low_command_image,
     verify_crc,
-    words_crc,
 )
+from deal_hw.drivers.unitree.cdr import CDR_HEADER, CRC_START, words_crc
+from deal_hw.drivers.unitree.motor_command import MODE_SERVO, POSITION_STOP, VELOCITY_STOP
 from deal_hw.errors import FrameError
 from deal_hw.types import FloatArray, IntArray
 
-MODE_OFF: Final = 0x00
-MODE_SERVO: Final = 0x01
-POSITION_STOP: Final = 2.146e9
-VELOCITY_STOP: Final = 16000.0
-"""Position and velocity in the vendor's examples for motors without a command; kp = kd = 0 there."""
 _LARGEST: Final = 1e30
 """Bound on the sum of squares of a command's numbers; stop values have 5.5e19."""
 

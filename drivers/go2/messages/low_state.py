@@ -17,8 +17,8 @@ from deal_hw.drivers.go2.messages.wire import (
     check_frame,
     low_state_image,
     verify_crc,
-    words_crc,
 )
+from deal_hw.drivers.unitree.cdr import words_crc
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray, IntArray
 

@@ -7,8 +7,8 @@ from typing import Final, Literal
 
 from deal_hw.drivers.go2.messages.layout import LOW_STATE_BYTES
 from deal_hw.drivers.go2.messages.simulated import UNITREE_MUJOCO, is_unitree_mujoco
-from deal_hw.drivers.go2.messages.wire import CDR_HEADER
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.cdr import CDR_HEADER
 from deal_hw.errors import FrameError, ProtocolError, VersionMismatchError, WrongDeviceError
 
 StateCheck = Literal["strict", "length"]

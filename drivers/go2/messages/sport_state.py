@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.messages.layout import packed
-from deal_hw.drivers.go2.messages.wire import CDR_HEADER, FOOT
+from deal_hw.drivers.go2.messages.wire import FOOT
+from deal_hw.drivers.unitree.cdr import CDR_HEADER, packed
 from deal_hw.errors import FrameError
 from deal_hw.types import FloatArray, IntArray
 

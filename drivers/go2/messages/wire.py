@@ -1,32 +1,21 @@
-"""Common parts of the Go2's two low-level messages: joint orders, header, checksum, and checks of frames.
-
-The checksum is CRC-32/MPEG-2: polynomial 0x04C11DB7, start 0xFFFFFFFF, no reflection, no final inversion. It
-covers the 32-bit words of the C struct without the last one, the checksum itself. Each word is a
-little-endian number, most significant bit first. The C struct aligns nested structs, CDR does not, so the
-struct's image is the CDR body with a few more bytes of padding. Source: crc32_core of unitree_sdk2_python @
-37116c5.
-"""
+"""Common parts of the Go2's two low-level messages: joint orders, header, and checks of frames."""
 
 from __future__ import annotations
 
 import functools
-from array import array
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from fastcrc import crc32
 
 from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS, PARTS
 from deal_hw.drivers.go2.messages import layout
 from deal_hw.drivers.go2.messages.layout import LOW_COMMAND_BYTES, LOW_STATE_BYTES
+from deal_hw.drivers.unitree.cdr import CDR_HEADER, field_mask, words_crc
 from deal_hw.errors import FrameError
 
 WIRE_LEGS: Final = ("FR", "FL", "RR", "RL")
 WIRE_JOINTS: Final = tuple(f"{leg}_{part}_joint" for leg in WIRE_LEGS for part in PARTS)
-CDR_HEADER: Final = b"\x00\x01\x00\x00"
-"""CDR version 1, little-endian."""
 HEAD: Final = b"\xfe\xef"
 BEGIN: Final = CDR_HEADER + HEAD
 LEVEL_LOW: Final = 0xFF
@@ -35,14 +24,6 @@ SLOT: Final = np.array([WIRE_JOINTS.index(joint) for joint in JOINTS])
 """Motor slot of each joint in model order, (12,)."""
 FOOT: Final = np.array([WIRE_LEGS.index(leg) for leg in LEGS])
 """Foot slot of each leg in model order, (4,)."""
-CRC_START: Final = 0xFFFF_FFFF
-
-
-def words_crc(image: bytes | bytearray, start: int = CRC_START) -> int:
-    """Return the checksum of whole 32-bit words, continued from ``start``."""
-    words = array("I", image)
-    words.byteswap()
-    return int(crc32.mpeg_2(words, start))
 
 
 def low_command_image(payload: bytes) -> bytes:
@@ -125,15 +106,4 @@ def _padding_mask(name: str) -> npt.NDArray[np.uint8]:
         if name == "LowCmd"
         else (layout.LOW_STATE, layout.STATE_MODE_AT)
     )
-    mask = np.zeros(kind.itemsize, np.uint8)
-    fields: Mapping[str, Any] = kind.fields or {}
-    for field_type, offset, *_ in fields.values():
-        if field_type.subdtype is not None and field_type.base.fields:
-            for part, at, *_ in field_type.base.fields.values():
-                for slot in range(layout.SLOTS):
-                    begin = offset + slot * field_type.base.itemsize + at
-                    mask[begin : begin + part.itemsize] = 255
-        else:
-            mask[offset : offset + field_type.itemsize] = 255
-    mask[modes] = 255
-    return mask
+    return field_mask(kind, modes, layout.SLOTS)

@@ -400,6 +400,8 @@ int main(int argc, char **argv) {
   if (strcmp(role, "hashes") == 0) {
     print_hashes(&unitree_go_msg_dds__LowCmd__desc);
     print_hashes(&unitree_go_msg_dds__LowState__desc);
+    print_hashes(&unitree_hg_msg_dds__LowCmd__desc);
+    print_hashes(&unitree_hg_msg_dds__LowState__desc);
     print_hashes(&unitree_go_msg_dds__SportModeState__desc);
     print_hashes(&unitree_go_msg_dds__WirelessController__desc);
     print_hashes(&unitree_api_msg_dds__Request__desc);

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, ServiceClient
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.motion_switcher import MotionSwitcher, ServiceClient
+from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray
@@ -40,8 +41,9 @@ class Takeover:
         motion: Returns positions and velocities of the joints in the newest state, (J,) each.
         robot_ns: Returns the time of the newest state, by the robot's own clock [ns].
         rest: The pose of a lying robot, (J,) [rad]; None for one whose base is held, which cannot fall.
+        wording: What messages say of the robot.
         services: Whether it has services, and with them a controller of its own to release.
-        why_unreached: As of :class:`~deal_hw.drivers.go2.motion_switcher.MotionSwitcher`.
+        why_unreached: As of :class:`~deal_hw.drivers.unitree.motion_switcher.MotionSwitcher`.
     """
 
     def __init__(
@@ -53,13 +55,15 @@ class Takeover:
         motion: Callable[[], tuple[FloatArray, FloatArray]],
         robot_ns: Callable[[], int],
         rest: FloatArray | None,
+        wording: Wording,
         *,
         services: bool = True,
         why_unreached: Callable[[int], str] = lambda since_ns: "",
     ) -> None:
         self._transport, self._clock, self._pump = transport, clock, pump
         self._motion, self._robot_ns, self._rest = motion, robot_ns, rest
-        self._services = ServiceClient(send, pump, clock)
+        self._wording = wording
+        self._services = ServiceClient(send, pump, clock, wording)
         self._switcher = MotionSwitcher(self._services, clock, why_unreached)
         self._has_services = services
         self._foreign, self._foreign_ns = 0, -1
@@ -87,8 +91,8 @@ class Takeover:
             self._pump_until(self._clock.now_ns() + round(RELEASE_PAUSE_S * 1e9))
             if self._left_s(deadline_ns) <= 0:
                 raise TransportTimeoutError(
-                    f"go2: mode {name!r} did not release the robot within {timeout_s:g} s; lay the robot "
-                    "down by its remote, or switch sport mode off in the vendor's app, and try again"
+                    f"{self._wording.name}: mode {name!r} did not release the robot within {timeout_s:g} s; "
+                    f"{self._wording.free}, and try again"
                 )
         self._await_silence(deadline_ns)
 
@@ -106,8 +110,8 @@ class Takeover:
             name = self._active(self._clock.now_ns() + round(timeout_s * 1e9))
         if name:
             raise SafetyError(
-                f"go2: the robot's own controller {name!r} has it, and a second commander would make it "
-                "jump, so nothing was sent; lay it down or damp it by its remote"
+                f"{self._wording.name}: the robot's own controller {name!r} has it, and a second commander "
+                f"would make it jump, so nothing was sent; {self._wording.quiet}"
             )
         self._await_silence(self._clock.now_ns())
 
@@ -136,8 +140,8 @@ class Takeover:
         writers = self._transport.writers(topics.LOW_COMMAND)
         who = f" It is one of: {'; '.join(writers)}." if writers else ""
         return (
-            f"go2: another program commands the robot's motors on {topics.LOW_COMMAND}.{who} Stop it; if it "
-            "is the robot's own sport mode, switch that off in the vendor's app"
+            f"{self._wording.name}: another program commands the robot's motors on {topics.LOW_COMMAND}."
+            f"{who} Stop it; {self._wording.off}"
         )
 
     def _active(self, deadline_ns: int) -> str:
@@ -151,8 +155,8 @@ class Takeover:
         self._await_stillness(deadline_ns)
         if not self._lies():
             raise SafetyError(
-                f"go2: mode {name!r} did not lay the robot down, and a robot that is released while it "
-                "stands falls; lay it down by its remote and try again"
+                f"{self._wording.name}: mode {name!r} did not lay the robot down, and a robot that is "
+                "released while it stands falls; lay it down by its remote and try again"
             )
 
     def _lies(self) -> bool:

@@ -12,8 +12,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_response, encode_request
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.rpc import Request, Response, decode_response, encode_request
+from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import FrameError, ProtocolError, SafetyError, TransportTimeoutError
 from deal_hw.transport import Message
 
@@ -38,10 +39,10 @@ ERRORS: Final[Mapping[int, str]] = {
     7005: "an internal command failed; restart the robot",
     7006: "checking the mode failed; restart the robot",
     7007: "switching the mode failed; restart the robot",
-    7008: "releasing the mode failed; lay the robot down by its remote and try again",
+    7008: "releasing the mode failed; {quiet} and try again",
     7009: "setting the configuration failed",
 }
-"""Meanings of response codes."""
+"""Meanings of response codes; ``{quiet}`` stands for the robot's own remedy."""
 
 _ASK_S: Final = 0.5
 """Time between repeated requests: a first one may be lost during the network's discovery [s]."""
@@ -66,9 +67,10 @@ class RefusedError(SafetyError):
         code: The service's code.
     """
 
-    def __init__(self, what: str, code: int) -> None:
+    def __init__(self, what: str, code: int, wording: Wording) -> None:
         self.code = code
-        super().__init__(f"go2: {what} was refused: {ERRORS.get(code, 'an unknown error')} (code {code})")
+        why = ERRORS.get(code, "an unknown error").format(quiet=wording.quiet)
+        super().__init__(f"{wording.name}: {what} was refused: {why} (code {code})")
 
 
 class ServiceClient:
@@ -79,12 +81,20 @@ class ServiceClient:
         pump: Receives one message, waiting at most this long [s], and passes it to its reader; raises
             TransportTimeoutError if none arrives.
         clock: For waiting and for numbering.
+        wording: What messages say of the robot.
+
+    Attributes:
+        wording: As given.
     """
 
     def __init__(
-        self, send: Callable[[str, bytes], object], pump: Callable[[float], None], clock: Clock
+        self,
+        send: Callable[[str, bytes], object],
+        pump: Callable[[float], None],
+        clock: Clock,
+        wording: Wording,
     ) -> None:
-        self._send, self._pump, self._clock = send, pump, clock
+        self._send, self._pump, self._clock, self.wording = send, pump, clock, wording
         self._identity = 0
         self._waiting = ""
         self._response: Response | None = None
@@ -118,14 +128,15 @@ class ServiceClient:
             left_ns = deadline_ns - self._clock.now_ns()
             if left_ns <= 0:
                 raise TransportTimeoutError(
-                    f"go2: service {service} did not answer request {api} within {timeout_s:g} s (code 3104)"
+                    f"{self.wording.name}: service {service} did not answer request {api} within "
+                    f"{timeout_s:g} s (code 3104)"
                 )
             try:
                 self._pump(left_ns * 1e-9)
             except TransportTimeoutError:
                 continue
         if response.code != 0:
-            raise RefusedError(f"request {api} to {service}", response.code)
+            raise RefusedError(f"request {api} to {service}", response.code, self.wording)
         return response.json()
 
 
@@ -151,6 +162,7 @@ class MotionSwitcher:
         self.released = ""
         self.old = False
         self._services, self._clock, self._why_unreached = services, clock, why_unreached
+        self._name = services.wording.name
         self._old_active = True
         self._answered = False
 
@@ -178,12 +190,13 @@ class MotionSwitcher:
                     raise
                 continue
             if not isinstance(name := answer.get("name"), str):
-                raise ProtocolError(f"go2: motion_switcher's answer {answer!r} names no mode")
+                raise ProtocolError(f"{self._name}: motion_switcher's answer {answer!r} names no mode")
             self._answered = True
             return name
         if self._answered or patience_s < _PATIENCE_S:
             raise TransportTimeoutError(
-                f"go2: motion_switcher did not answer within {patience_s:g} s (code 3104): {_UNHEARD}"
+                f"{self._name}: motion_switcher did not answer within {patience_s:g} s (code 3104): "
+                f"{_UNHEARD}"
             )
         self.old = True
         return OLD_SERVICE
@@ -193,7 +206,7 @@ class MotionSwitcher:
         if self._clock.now_ns() - begin_ns >= round(_UNREACHED_S * 1e9) and (
             why := self._why_unreached(begin_ns)
         ):
-            raise TransportTimeoutError(f"go2: {why}")
+            raise TransportTimeoutError(f"{self._name}: {why}")
 
     def lie_down(self, timeout_s: float) -> None:
         """Ask the active mode to lay the robot down; a refusal or a missing answer is ignored."""
@@ -222,7 +235,7 @@ class MotionSwitcher:
             self._services.ask(ROBOT_STATE, SERVICE_SWITCH, {"name": OLD_SERVICE, "switch": 0}, timeout_s)
         except TransportTimeoutError as error:
             raise TransportTimeoutError(
-                f"go2: neither motion_switcher nor robot_state answers (code 3104): {_UNHEARD}"
+                f"{self._name}: neither motion_switcher nor robot_state answers (code 3104): {_UNHEARD}"
             ) from error
         self._old_active = False
 
@@ -242,6 +255,7 @@ class MotionSwitcher:
             while self.active(_PATIENCE_S) != name:
                 if self._clock.now_ns() >= deadline_ns:
                     raise TransportTimeoutError(
-                        f"go2: mode {name!r} did not take the robot within {timeout_s:g} s; use the remote"
+                        f"{self._name}: mode {name!r} did not take the robot within {timeout_s:g} s; use "
+                        "the remote"
                     )
         self.released = ""

@@ -1,4 +1,4 @@
-"""Requests to and responses from the Go2's services, as CDR.
+"""Requests to and responses from the services of Unitree's robots, as CDR.
 
 Types unitree_api::msg::dds_::Request_ and Response_ (unitree_sdk2 @ 21d0a3b). Parameters and data are JSON.
 Both messages are written byte by byte, because they hold a string and have no static layout.
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from deal_hw.drivers.go2.messages.wire import CDR_HEADER
+from deal_hw.drivers.unitree.cdr import CDR_HEADER
 from deal_hw.errors import FrameError
 
 _REQUEST: Final = struct.Struct("<4sqqqi?")

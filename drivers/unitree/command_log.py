@@ -1,17 +1,17 @@
-"""Commands that an emulated Go2 received, with times. Tests compute the time from a fault to damping."""
+"""Commands that an emulated robot received, with times. Tests compute the time from a fault to damping."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from deal_hw.drivers.go2.messages.low_command import LowCommand
+from deal_hw.drivers.unitree.motor_command import MotorCommand
 
 STIFF, DAMPING, OFF = "stiff", "damping", "off"
 _MOST_CHANGES: Final = 2000
 
 
-def kind_of(command: LowCommand) -> str:
+def kind_of(command: MotorCommand) -> str:
     """Return the kind of a command: ``stiff`` (gain or feed-forward), ``damping`` (kd alone) or ``off``."""
     if not command.mode.any():
         return OFF
@@ -77,7 +77,7 @@ class CommandLog:
         self.refused += 1
         self.last_refusal = reason
 
-    def accept(self, command: LowCommand, now_ms: int, host_ns: int) -> None:
+    def accept(self, command: MotorCommand, now_ms: int, host_ns: int) -> None:
         """Note an accepted command."""
         kind = kind_of(command)
         if self._kind == STIFF and self.last_ms is not None:

@@ -1,4 +1,4 @@
-"""The Go2's remote control: the 40 bytes in each LowState, and the message WirelessController.
+"""The remote control of Unitree's robots: the 40 bytes in each LowState, and the message WirelessController.
 
 Layout of the 40 bytes, from unitree_sdk2_python @ 37116c5: two bytes of head, buttons as 16 bits, then the
 sticks as floats: lx at 4, rx at 8, ry at 12, ly at 20 (L2's travel at 16). All zeros: no remote in reach.
@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from deal_hw.drivers.go2.messages.wire import CDR_HEADER
+from deal_hw.drivers.unitree.cdr import CDR_HEADER
 from deal_hw.errors import ConfigurationError, FrameError, UnknownNameError
 
 BUTTONS: Final = (

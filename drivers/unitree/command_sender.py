@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.command_echo import CommandEcho
-from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.transports import topics
 from deal_hw.errors import FrameError, SafetyError
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand
 
+Encode: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray], bytes]
+"""Returns the message with position [rad], velocity [rad/s], stiffness [N·m/rad], damping [N·m·s/rad] and
+effort [N·m], (J,) each. Raises a FrameError where a number is not finite."""
 PASSIVE_COPIES: Final = 3
 """How often the last command is sent: the robot holds it for ever, and single messages may be lost."""
 
@@ -35,6 +37,8 @@ class CommandSender:
         clock: The clock of the messages' stamps.
         description: The robot.
         record: Takes each message that goes out, but no repeats.
+        encode: Makes the message of a command.
+        name: The robot, as messages begin.
     """
 
     def __init__(
@@ -43,9 +47,11 @@ class CommandSender:
         clock: Clock,
         description: RobotDescription,
         record: Callable[[Message], object],
+        encode: Encode,
+        name: str,
     ) -> None:
         self._transport, self._clock, self._record = transport, clock, record
-        self._encoder = LowCommandEncoder()
+        self._encode, self._name = encode, name
         self.damping = np.array(description.passive_damping)
         self.effort_limit = np.array(description.effort_limit)
         self._speed_limit = np.array(description.speed_limit)
@@ -79,7 +85,7 @@ class CommandSender:
         Raises:
             SafetyError: A value is not finite, or the robot is passive and was never commanded.
         """
-        low = LowCommand(
+        parts = (
             command.position_target,
             command.velocity_target,
             command.stiffness,
@@ -87,27 +93,24 @@ class CommandSender:
             command.effort,
         )
         try:
-            payload = self._encoder.encode(low)
+            payload = self._encode(*parts)
         except FrameError as error:
-            raise SafetyError(f"go2: {error}") from error
+            raise SafetyError(f"{self._name}: {error}") from error
         if damp_at is not None:
             if not self.in_force:
-                raise SafetyError("go2: not armed; call arm() before the first command")
-            low = self._passive_command(damp_at)
-            payload = self._encoder.encode(low)
+                raise SafetyError(f"{self._name}: not armed; call arm() before the first command")
+            parts = self._passive_command(damp_at)
+            payload = self._encode(*parts)
         stamp_ns = self.publish(topics.LOW_COMMAND, payload)
         self.in_force = payload
         self.sequence += 1
         self.echo.note(self.sequence, stamp_ns)
-        q, dq, kp, kd, tau = (
-            part.astype(np.float32).astype(np.float64)
-            for part in (low.position, low.velocity, low.stiffness, low.damping, low.effort)
-        )
+        q, dq, kp, kd, tau = (part.astype(np.float32).astype(np.float64) for part in parts)
         return JointCommand(q, dq, kp, kd, tau, self.effort_limit.copy(), self._speed_limit.copy())
 
     def damp(self, position: FloatArray) -> None:
         """Send the passive command for joints at a position, (J,) [rad]; it is not numbered."""
-        self.in_force = self._encoder.encode(self._passive_command(position))
+        self.in_force = self._encode(*self._passive_command(position))
         self.publish(topics.LOW_COMMAND, self.in_force)
 
     def repeat(self) -> None:
@@ -115,7 +118,9 @@ class CommandSender:
         if self.in_force:
             self._transport.send(Message(topics.LOW_COMMAND, self.in_force, self._clock.now_ns()))
 
-    def _passive_command(self, position: FloatArray) -> LowCommand:
+    def _passive_command(
+        self, position: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         zero = np.zeros(len(self.damping))
         pose = position if np.isfinite(position).all() else zero
-        return LowCommand(pose, zero, zero, self.damping, zero)
+        return pose, zero, zero, self.damping, zero

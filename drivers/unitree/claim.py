@@ -1,4 +1,4 @@
-"""An exclusive claim on a Go2, sent as messages: a second program that wants to command is refused at once.
+"""An exclusive claim on a robot, sent as messages: a second program that wants to command is refused at once.
 
 Claims use a topic of deal-hw, which robot and sport mode ignore. A claim has these states:
 
@@ -15,11 +15,11 @@ import contextlib
 import threading
 import uuid
 from collections.abc import Callable
-from typing import Final
+from typing import ClassVar, Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.messages.rpc import CLAIM_TEXTS, encode_note, read_note
 from deal_hw.drivers.transports.topics import CLAIM
+from deal_hw.drivers.unitree.rpc import CLAIM_TEXTS, encode_note, read_note
 from deal_hw.errors import PortBusyError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 
@@ -40,7 +40,12 @@ class WireClaim:
         clock: For the waiting.
         holder: Description of the claimant for other programs.
         identity: Number of the claim; of two simultaneous requests the smaller one wins. Random by default.
+
+    Attributes:
+        robot: Its name, as messages begin.
     """
+
+    robot: ClassVar[str] = "go2"
 
     def __init__(
         self, transport: TopicTransport, clock: Clock, holder: str, identity: str | None = None
@@ -90,8 +95,9 @@ class WireClaim:
     def _yield_to(self, claim: dict[str, str]) -> None:
         if claim["state"] == HELD or (claim["state"] == ASKING and claim["id"] < self._identity):
             raise PortBusyError(
-                f"go2: the robot is in use: {claim['who']} commands it, or is about to. Two programs that "
-                "command one robot make it jump. End the other run first (Ctrl-C in its terminal)"
+                f"{self.robot}: the robot is in use: {claim['who']} commands it, or is about to. Two "
+                "programs that command one robot make it jump. End the other run first "
+                "(Ctrl-C in its terminal)"
             )
 
     def _keep(self) -> None:

@@ -1,0 +1,1 @@
+"""An emulated G1 on a crane: mechanics, motors, firmware and services, with a hidden truth."""

@@ -1,0 +1,77 @@
+"""Faults of an emulated G1 on request."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Final
+
+from deal_hw.drivers.g1.joints import MOTORS
+from deal_hw.errors import ConfigurationError, UnknownNameError
+
+MOMENTS: Final = ("freeze", "cut", "sport", "nan", "hot", "error", "stop", "machine")
+"""Faults with a start time, as in ``<name>_after_s``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class G1Faults:
+    """Faults of an emulated G1; times count from the first stiff command."""
+
+    sport_after_s: float | None = None
+    """Time after which the robot's own controller comes back [s]."""
+
+    nan_after_s: float | None = None
+    """Time after which a joint's position and velocity are NaN [s]."""
+
+    hot_after_s: float | None = None
+    """Time after which a motor's winding reports 130 °C [s]."""
+
+    error_after_s: float | None = None
+    """Time after which a motor reports an error [s]."""
+
+    fault_joint: str = "left_knee_joint"
+    """The joint of the last three faults."""
+
+    stop_after_s: float | None = None
+    """Time after which the operator holds L2 and B [s]."""
+
+    machine_after_s: float | None = None
+    """Time after which the states have another mode_machine [s]."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name.endswith("_after_s") and value is not None and not 0.0 <= value <= 1e7:
+                raise ConfigurationError(f"{entry.name} must be 0 to 1e7 seconds, got {value}")
+        if self.fault_joint not in MOTORS:
+            raise UnknownNameError("G1 joint", self.fault_joint, MOTORS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class G1FaultPlan(G1Faults):
+    """All faults of an emulated G1: those of every emulated robot, and its own."""
+
+    drop: float = 0.0
+    """Share of states that are lost."""
+
+    duplicate: float = 0.0
+    """Share of states that arrive twice."""
+
+    reorder: float = 0.0
+    """Share of states that arrive after their successor."""
+
+    corrupt: float = 0.0
+    """Share of states in which one byte is changed."""
+
+    freeze_after_s: float | None = None
+    """Time after which the robot sends nothing; it still receives [s]."""
+
+    cut_after_s: float | None = None
+    """Time after which the wire is cut in both directions; the robot keeps its last command [s]."""
+
+    cut_s: float = 1.0
+    """How long the wire is cut [s]."""
+
+    def due(self) -> list[tuple[int, str]]:
+        """Return the start of each fault, in ms since the first stiff command, and its name, in order."""
+        found = ((name, getattr(self, f"{name}_after_s")) for name in MOMENTS)
+        return sorted((round(after_s * 1e3), name) for name, after_s in found if after_s is not None)

@@ -1,0 +1,1 @@
+"""What Unitree's robots have in common: services, claim, takeover, sending and receiving over topics."""

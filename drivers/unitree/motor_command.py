@@ -1,0 +1,47 @@
+"""A command to the motors, whatever its message."""
+
+from __future__ import annotations
+
+from typing import Final, Protocol
+
+from deal_hw.types import FloatArray, IntArray
+
+MODE_OFF: Final = 0x00
+MODE_SERVO: Final = 0x01
+POSITION_STOP: Final = 2.146e9
+VELOCITY_STOP: Final = 16000.0
+"""Position and velocity in the vendor's examples for motors without a command; kp = kd = 0 there."""
+
+
+class MotorCommand(Protocol):
+    """PD targets for the motors, (J,) each in model order."""
+
+    @property
+    def position(self) -> FloatArray:
+        """Targets [rad]."""
+        ...
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Targets [rad/s]."""
+        ...
+
+    @property
+    def stiffness(self) -> FloatArray:
+        """Gains [N·m/rad]."""
+        ...
+
+    @property
+    def damping(self) -> FloatArray:
+        """Gains [N·m·s/rad]."""
+        ...
+
+    @property
+    def effort(self) -> FloatArray:
+        """Feed-forward [N·m]."""
+        ...
+
+    @property
+    def mode(self) -> IntArray:
+        """1 servo, 0 off."""
+        ...
