@@ -14,7 +14,6 @@ from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.closed_loop import reported
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
@@ -23,7 +22,7 @@ from deal_hw.types import FloatArray
 BRAKE: Final = 0.55
 """Damping of a motor whose terminals are joined [N·m·s/rad]: kt²/R of an STS3215 in BAM's identification."""
 
-_SENSE_TICKS: Final = 5
+_LOOK_TICKS: Final = 5
 """Physics steps between two looks of the servos' protections, which take ten milliseconds and more. A request
 that comes between them is answered with what is measured then."""
 
@@ -70,11 +69,18 @@ class ArmDevice:
         self._batch.set_parameters(np.array([[truth.parameters[name] for name in space.names]]))
         self._effort = self._batch.batch.bind("qfrc_actuator")
         self._dofs = list(robot.qvel)
+        self._of_id = {servo.id: j for j, servo in enumerate(self._servos)}
+        limits = dict(zip(d.actuated, d.effort_limit, strict=True))
+        # Without a limit nothing says what share of the voltage an effort takes.
+        self._most = [
+            limits[name] if math.isfinite(limits.get(name, math.inf)) else 0.0 for name in d.joint_names
+        ]
         self._rng = np.random.default_rng((truth.seed, 2))
         self._tick_ns = round(1e9 / d.device_rate_hz)
         self._latency_ns = round(1e9 * truth.latency_s)
         self._coming: deque[tuple[int, FloatArray]] = deque()
         self._tick = self._now_ns = 0
+        self._stale = True
         self._held: dict[int, float] = {}
         self._hands: dict[int, float] = {}
         self._sent: tuple[float, ...] = ()
@@ -82,7 +88,8 @@ class ArmDevice:
         self._batch.set_state(home[None], np.zeros((1, len(home))))
         self._setpoint = home.copy()
         self._wanted = home.copy()
-        self.bus.sense = self._sense
+        self.bus.sense = self._sense_one
+        self._take_state()
         self._sense(0)
         for joint in self.joints:
             joint.begin()
@@ -144,8 +151,10 @@ class ArmDevice:
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the packets that they complete."""
         self.received_bytes += len(data)
-        self._sense(self._now_ns)
-        self.bus.receive(data)
+        if data:
+            self._sense(self._now_ns)
+            self.bus.receive(data)
+            self._stale = True
         self._take_goals(self._now_ns)
 
     def advance_to(self, device_ns: int) -> bytes:
@@ -173,13 +182,25 @@ class ArmDevice:
         now_ns = self._tick * self._tick_ns
         for joint in self.joints:
             joint.tick(now_ns, now_ns - self.bus.alive_ns)
-        self._follow(now_ns)
-        self._command()
+        while self._coming and self._coming[0][0] <= self._tick:
+            self._setpoint, self._stale = self._coming.popleft()[1].copy(), True
+        if self._stale:
+            self._command()
+            self._stale = False
         self._batch.advance(self._setpoint[None, None, self._actuated])
         self._hold()
+        self._take_state()
         self._tick += 1
-        if self._tick % _SENSE_TICKS == 0:
+        if self._tick % _LOOK_TICKS == 0:
             self._sense(self._now_ns)
+            # What the servos do by themselves: protections, watchdogs.
+            self._take_goals(self._now_ns)
+            self._stale = True
+
+    def _take_state(self) -> None:
+        """Note the state after a physics step."""
+        self._position, self._velocity = self._batch.position[0].copy(), self._batch.velocity[0].copy()
+        self._torque = self._effort[0, self._dofs].copy()
 
     def _hold(self) -> None:
         """Leave the joints where hands hold them."""
@@ -199,17 +220,10 @@ class ArmDevice:
             due = math.ceil((now_ns + self._latency_ns) / self._tick_ns - 1e-6)
             self._coming.append((max(due, self._coming[-1][0] if self._coming else 0), wanted))
 
-    def _follow(self, now_ns: int) -> None:
-        """Let the goals act that are due."""
-        self._take_goals(now_ns)
-        while self._coming and self._coming[0][0] <= self._tick:
-            self._setpoint = self._coming.popleft()[1].copy()
-
     def _command(self) -> None:
         """Set gains and limits as the servos' registers say."""
         d = self._description
         kp, kd, effort = np.array(d.stiffness), np.array(d.damping), np.array(d.effort_limit)
-        position = self._batch.position[0]
         for a, j in enumerate(self._actuated):
             joint, servo = self.joints[j], self._servos[j]
             if joint.torque != ON:
@@ -221,7 +235,7 @@ class ArmDevice:
             kd[a] *= joint.gains.d / servo.d_gain if servo.d_gain else 1.0
             effort[a] *= joint.share
             if joint.stopped:
-                self._setpoint[j] = self._held.setdefault(int(j), float(position[j]))
+                self._setpoint[j] = self._held.setdefault(int(j), float(self._position[j]))
             else:
                 self._held.pop(int(j), None)
         sent = (*kp, *kd, *effort)
@@ -230,21 +244,26 @@ class ArmDevice:
             self._batch.set_sent(kp, kd, effort)
 
     def _sense(self, now_ns: int) -> None:
-        """Set the registers of what the servos measure at a time [ns].
+        """Set the registers of what the servos measure at a time [ns]."""
+        for j in range(len(self.joints)):
+            self._measure(j, now_ns)
+
+    def _sense_one(self, servo: int, now_ns: int) -> None:
+        """The same of the servo with an id."""
+        j = self._of_id.get(servo)
+        if j is not None:
+            self._measure(j, now_ns)
+
+    def _measure(self, j: int, now_ns: int) -> None:
+        """Set the registers of a joint's servo.
 
         A servo samples faster than a physics step: between two steps the joint moves on at its velocity.
         """
-        d = self._description
-        since_s = 1e-9 * (now_ns - self._tick * self._tick_ns)
-        noise = d.sensor.noise if self._noisy else (0.0,) * len(d.joint_names)
-        nothing = (0.0,) * len(d.joint_names)
-        velocity = self._batch.velocity[0]
-        position = reported(self._batch.position[0] + since_s * velocity, noise, nothing, self._rng)
-        effort = np.zeros(len(self._servos))
-        effort[self._actuated] = self._effort[0, self._dofs][self._actuated]
-        limit = dict(zip(self._actuated, d.effort_limit, strict=True))
-        for j, (joint, servo) in enumerate(zip(self.joints, self._servos, strict=True)):
-            most = limit.get(j, math.inf)
-            duty = servo.direction * effort[j] / most if math.isfinite(most) and joint.torque == ON else 0.0
-            ticks = servo.ticks(float(position[j]))
-            joint.sense(ticks, servo.direction * float(velocity[j]) / RAD, min(max(duty, -1.0), 1.0))
+        joint, servo = self.joints[j], self._servos[j]
+        velocity = float(self._velocity[j])
+        position = float(self._position[j]) + 1e-9 * (now_ns - self._tick * self._tick_ns) * velocity
+        if self._noisy:
+            position += self._rng.standard_normal() * self._description.sensor.noise[j]
+        most = self._most[j]
+        duty = servo.direction * float(self._torque[j]) / most if most and joint.torque == ON else 0.0
+        joint.sense(servo.ticks(position), servo.direction * velocity / RAD, min(max(duty, -1.0), 1.0))

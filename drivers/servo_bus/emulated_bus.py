@@ -168,7 +168,7 @@ class EmulatedBus(ServosSide[EmulatedServo]):
                 break
             speaker = listeners[0]
             if not fast:
-                self.sense(self._free_ns)
+                self.sense(servo, self._free_ns)
             error, data = speaker.read(address, size)
             if error:
                 return

@@ -36,8 +36,8 @@ class ServosSide(abc.ABC, Generic[ServoT]):
         servos: The servos; may be changed.
         host_baud_rate: Rate of the host's port; a servo with another rate receives noise. None: the same.
         alive_ns: When the last request came [ns].
-        sense: Called with the time [ns] at which a servo of a group reads its registers, before it does so: a
-            servo reads them when its turn to answer comes.
+        sense: Called with an id and the time [ns] at which this servo of a group reads its registers, before
+            it does so: a servo reads them when its turn to answer comes.
 
     Args:
         servos: The servos.
@@ -51,7 +51,7 @@ class ServosSide(abc.ABC, Generic[ServoT]):
         self.servos = servos
         self.host_baud_rate: int | None = None
         self.alive_ns = 0
-        self.sense: Callable[[int], None] = lambda now_ns: None
+        self.sense: Callable[[int, int], None] = lambda servo, now_ns: None
         self._now_ns = 0
         self._changed, self._loses_answer = changed, loses
         self._replies: deque[tuple[int, bytes]] = deque()

@@ -150,7 +150,7 @@ class StsBus(ServosSide[StsServo]):
             return
         rate = self.host_baud_rate or BAUD_RATES[0]
         for servo in servos:
-            self.sense(max(self._free_ns, self._now_ns))
+            self.sense(servo, max(self._free_ns, self._now_ns))
             answers = self._data(servo, address, size) if servo != BROADCAST else []
             if answers:
                 rate = answers[0][0].baud_rate

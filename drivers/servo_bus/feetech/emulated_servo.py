@@ -30,6 +30,7 @@ BOOT_NS: Final = 800_000_000
 _SHORTEST_DELAY: Final = 50
 """A shorter return delay that is not 0 counts as this."""
 _LATCHED: Final = int(Fault.OVERLOAD | Fault.CURRENT)
+_LOAD_MAGNITUDE: Final = (1 << r.SIGN_BITS[r.PRESENT_LOAD]) - 1
 _POSITION_SIGN: Final = r.SIGN_BITS[r.PRESENT_POSITION]
 _WORD: Final = struct.Struct("<H")
 _SENSED: Final = struct.Struct("<HHBB2xB2xH")
@@ -222,9 +223,14 @@ class StsServo:
         # Each control step runs this for each servo, so it reads the table's bytes.
         table = self._table
         on = bool(table[r.TORQUE_ENABLE.address])
-        overloaded = on and abs(self.get(r.PRESENT_LOAD)) >= 10 * table[r.OVERLOAD_TORQUE.address]
+        load = _word(table, r.PRESENT_LOAD) & _LOAD_MAGNITUDE
+        overloaded = on and load >= 10 * table[r.OVERLOAD_TORQUE.address]
+        drawing = on and _word(table, r.PRESENT_CURRENT) > _word(table, r.PROTECTION_CURRENT)
+        if not (overloaded or drawing or self._overload_ns or self._current_ns) and not (
+            table[r.STATUS.address] or self._forced
+        ):
+            return
         self._overload_ns = self._since(self._overload_ns, overloaded)
-        drawing = on and self.get(r.PRESENT_CURRENT) > self.get(r.PROTECTION_CURRENT)
         self._current_ns = self._since(self._current_ns, drawing)
         latched = self._latched
         if self._lasts(self._overload_ns, r.PROTECTION_TIME):
@@ -404,3 +410,8 @@ def _allowed(register: Register, table: bytearray) -> bool:
 def _magnitude(number: int, bit: int) -> int:
     """Return the nearest number that the bits below a sign bit can hold, as a register has it."""
     return min(abs(number), (1 << bit) - 1) | (number < 0) << bit
+
+
+def _word(table: bytearray, register: Register) -> int:
+    found: int = _WORD.unpack_from(table, register.address)[0]
+    return found
