@@ -13,6 +13,7 @@ from deal_hw.drivers.servo_arm.examination import ArmInfo
 from deal_hw.drivers.servo_arm.families import Feetech
 from deal_hw.drivers.servo_arm.robot import ServoArm
 from deal_hw.drivers.servo_bus.feetech import registers as f
+from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.robots.hardware_section import TICKS, HardwareSection, ServoEntry
 from deal_hw.sim.robots.travel import Travel
@@ -20,6 +21,10 @@ from deal_hw.transport import Transport
 
 WHOLE_TURN: Final = (0, TICKS - 1)
 """Limits of a servo as it leaves the factory, and of a joint that LeRobot does not sweep."""
+_LIMITS: Final = Register(
+    f.MIN_POSITION.address, f.MIN_POSITION.size + f.MAX_POSITION.size, "Min and Max Position Limit"
+)
+"""Both in one read: an answer that comes late can then not be taken for the other one."""
 _AGAIN: Final = "calibrate the arm with lerobot-calibrate"
 
 
@@ -61,10 +66,8 @@ class CalibratedArm(ServoArm):
         limits: dict[int, tuple[int, int]] = {}
         problems: list[str] = []
         for servo in self._hardware.servos:
-            low, high = (
-                examination.surely(servo, partial(self._bus.read, servo.id, register))
-                for register in (f.MIN_POSITION, f.MAX_POSITION)
-            )
+            both = examination.surely(servo, partial(self._bus.read, servo.id, _LIMITS))
+            low, high = both & 0xFFFF, both >> 16
             limits[servo.id] = low, high
             try:
                 servos.append(self._calibrated(servo, low, high))

@@ -18,6 +18,8 @@ from deal_hw.transport import Message, Transport
 BITS_PER_BYTE: Final = 10
 """On the wire: start bit, 8 data bits, stop bit."""
 _QUEUE: Final = 4096
+_MOST_LATE: Final = 100
+"""Messages that are discarded at most after a failed request."""
 
 Writes: TypeAlias = Sequence[tuple[int, Mapping[int, bytes]]]
 """Sync writes: an address, and the bytes that each servo gets there."""
@@ -231,6 +233,16 @@ class ServoBus(abc.ABC):
             raise
         self._wanted.popleft()
         return found
+
+    def settle(self, seconds: float) -> None:
+        """Discard what arrives until the line was silent for a time [s].
+
+        An answer to a request that was given up may still come, and be taken for that to the next request.
+        """
+        for _ in range(_MOST_LATE):
+            if not self._port.receive(self._clock.now_ns() + round(seconds * 1e9)):
+                break
+        self._forget()
 
     def _forget(self) -> None:
         """Discard received bytes and the answers that were still wanted."""
