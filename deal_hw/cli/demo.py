@@ -60,7 +60,7 @@ class Demo(Checked):
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps. Cart-pole: by default as many as for the shipped UDR policy. Go2: 300,000, starting
-    from the shipped policy. SO-101: 500,000."""
+    from the shipped policy. SO-101: 600,000."""
 
     @property
     def folder(self) -> Path:

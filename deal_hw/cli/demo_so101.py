@@ -32,8 +32,8 @@ POSES: Final = 8
 POSE_S: Final = 2.0
 SHARE: Final = 0.6
 """Poses are drawn in this share of each joint's range of targets."""
-STEPS: Final = 500_000
-"""Steps of the training: about a minute of one processor."""
+STEPS: Final = 600_000
+"""Steps of the training: some three minutes of one processor."""
 EXCITE_S, HELDOUT_S = 6.0, 4.0
 TIP_M: Final = (0.0, 0.0, -0.09)
 """The finger's tip in the frame of the body `gripper`, as the model draws it [m]."""

@@ -333,8 +333,8 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
         robot_description("gotwo")
     with pytest.raises(UnknownNameError, match="go2_suspended"):
         parameter_spaces("gotwo")
-    # The Go2 on the floor is simulated at other rates than its wire has.
-    assert [entry.name for entry in ENTRIES if entry.driven and entry.description] == ["go2"]
+    # The Go2 on the floor and the SO-101 are simulated at other rates than their wires have.
+    assert [entry.name for entry in ENTRIES if entry.driven and entry.description] == ["go2", "so101"]
 
 
 def test_descriptions_load_no_simulator() -> None:
