@@ -31,8 +31,9 @@ def stands_alone(robot: str) -> bool:
 
 
 def balancing_policy(robot: str) -> Path | None:
-    """Return the shipped policy by which a robot is kept from falling; None if it needs none."""
-    return None if stands_alone(robot) else shipped_policy(robot)
+    """Return the shipped policy by which a robot is kept from falling; None if it needs or has none."""
+    found = shipped_policy(robot)
+    return None if found is None or stands_alone(robot) else found
 
 
 def required_policy(robot: str) -> Path:

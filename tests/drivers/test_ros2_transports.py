@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import random
 import socket
 from collections.abc import Callable, Iterator
@@ -35,8 +36,10 @@ from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.testing.transport_suite import TopicPair, TopicTransportSuite, meet
 from deal_hw.transport import Message, TopicTransport, WireOptions
 
-pytest.importorskip("cyclonedds")
-pytestmark = pytest.mark.real_time
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"),
+]
 
 SECTION = Ros2Section(bus="ros2_control", controller="arm", joints=("a", "b"))
 TOPICS = topics_of(SECTION)

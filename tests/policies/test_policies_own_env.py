@@ -210,7 +210,7 @@ def test_an_environment_that_cannot_be_used(robot: Path, env: str, words: str, t
     ("given", "words"),
     [
         ({"robot": "cartpole", "nominal": True}, "'env'.*`train robot.yaml` has it"),
-        ({"udr": True}, "'udr'.*`train humanoid` have it"),
+        ({"udr": True}, "'udr'.*`train so101` have it"),
         ({}, "no distribution is named"),
     ],
 )

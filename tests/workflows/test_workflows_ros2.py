@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import random
 import socket
 from collections.abc import Iterator
@@ -18,8 +19,10 @@ from deal_hw.findings import Severity
 from deal_hw.workflows.robot import carries_robot
 from deal_hw.workflows.running.settings import LinkOptions
 
-pytest.importorskip("cyclonedds")
-pytestmark = pytest.mark.real_time
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="pip install 'deal-hw[dds]'"),
+]
 
 WIRES = {"dds": "position", "zenoh": "trajectory"}
 """Wire -> kind of controller: each kind is driven on one of the two."""
@@ -48,7 +51,7 @@ def port(robot: Path, wire: str) -> Iterator[str]:
     where = "127.0.0.1" if wire == "dds" else f"tcp/127.0.0.1:{number}"
     with deal_hw.emulate(str(robot), transport=wire, port=where, profile="sensor", seed=1) as emulated:
         yield emulated.port
-    assert emulated.truth["commands_accepted"] > 300 and emulated.truth["commands_refused"] == 0
+    assert emulated.truth["commands_accepted"] > 100 and emulated.truth["commands_refused"] == 0
     assert set(emulated.truth["parameters"]) >= {"shoulder.frictionloss", "elbow.servo_stiffness"}
 
 
@@ -68,7 +71,7 @@ def test_collect_and_replay(robot: Path, wire: str, port: str, tmp_path: Path) -
     run = tmp_path / "run"
     report = deal_hw.collect(str(robot), port=port, link=link, out=run, motion="chirp", seconds=2.0)
     assert report.outcome is Outcome.FINISHED
-    assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 150
+    assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 100
     assert carries_robot(run / "dataset")
     kept = (run / "dataset" / "robot" / "robot.yaml").read_text(encoding="utf-8")
     assert "bus: ros2_control" in kept

@@ -47,6 +47,7 @@ FULL = RunPlan(
         certificate=Path("b.pem"),
         key=Path("c.pem"),
     ),
+    target="poses.csv",
     velocity="0.3,0,-0.1",
     stand=True,
     posture=POSTURE,

@@ -66,7 +66,7 @@ def test_what_is_given_wins() -> None:
 def test_a_robot_without_a_driver_is_refused() -> None:
     """It has a description only; one that nobody knows is unknown."""
     with pytest.raises(ConfigurationError, match="has no driver"):
-        plan_options("so101", LinkOptions(), LegOptions())
+        plan_options("go2_suspended", LinkOptions(), LegOptions())
     with pytest.raises(UnknownNameError, match="go3"):
         plan_options("go3", LinkOptions(), LegOptions())
 
