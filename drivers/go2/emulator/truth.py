@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,9 +18,10 @@ from deal_hw.drivers.go2.descriptions.floor import (
     TRUNK_KG,
 )
 from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
+from deal_hw.drivers.unitree.emulated_truth import JointTruth, JointTruthFile, draw_joints, truth_rng
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, reading
-from deal_hw.schema import OPEN, from_values
+from deal_hw.schema import from_values
 
 JOINT_DAMPING_NMS_RAD: Final = 0.6
 ARMATURE_KGM2: Final = 0.01
@@ -30,25 +30,14 @@ DEFAULT_RANGE_RATIO: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Go2Truth:
-    """Hidden parameters, which a calibrator has to find; tuples follow the 12 joints in model order.
+class Go2Truth(JointTruth):
+    """Hidden parameters of a Go2; see :class:`~deal_hw.drivers.unitree.emulated_truth.JointTruth`.
 
     Attributes:
-        profile: Name of the profile.
-        seed: Seed of the draw, of noise and of jitter.
-        stiffness: True kp over commanded kp.
-        damping: The same for kd.
-        joint_damping: Viscous friction [N·m·s/rad].
-        frictionloss: Coulomb friction of the gears [N·m].
-        armature: Inertia of the rotors at the joint [kg·m²].
-        encoder_bias: Reported minus true position [rad]; a motor closes its loop on the reported one.
         payload_kg: Mass that is strapped to the trunk [kg]; the trunk's inertia grows in proportion.
         floor_friction: Sliding friction between feet and floor.
-        latency_ms: Time from a command's reception to its effect, without jitter [ms].
     """
 
-    profile: str
-    seed: int
     stiffness: tuple[float, ...] = (1.0,) * 12
     damping: tuple[float, ...] = (1.0,) * 12
     joint_damping: tuple[float, ...] = (JOINT_DAMPING_NMS_RAD,) * 12
@@ -57,14 +46,16 @@ class Go2Truth:
     encoder_bias: tuple[float, ...] = (0.0,) * 12
     payload_kg: float = 0.0
     floor_friction: float = FLOOR_FRICTION
-    latency_ms: int = 0
 
-    def __post_init__(self) -> None:
-        for name in _PER_JOINT:
-            if len(getattr(self, name)) != len(JOINTS):
-                raise ConfigurationError(
-                    f"the truth of a Go2: {name} has {len(getattr(self, name))} entries, expected 12"
-                )
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints, in model order."""
+        return JOINTS
+
+    @property
+    def owner(self) -> str:
+        """The robot, for messages."""
+        return "Go2"
 
     def parameters(self, stiffness: float, damping: float) -> dict[str, float]:
         """Return the true values under the names in the parameter sets of the robot on a stand.
@@ -73,19 +64,7 @@ class Go2Truth:
             stiffness: Commanded kp [N·m/rad].
             damping: Commanded kd [N·m·s/rad]; the joint's own viscous friction adds to it.
         """
-        motor = np.array(self.damping) * damping + self.joint_damping
-        rows = {
-            "stiffness": np.array(self.stiffness) * stiffness,
-            "damping": motor,
-            "frictionloss": np.array(self.frictionloss),
-            "armature": np.array(self.armature),
-            "encoder_bias": np.array(self.encoder_bias),
-        }
-        return {
-            f"{joint}.{name}": float(value)
-            for name, values in rows.items()
-            for joint, value in zip(JOINTS, values, strict=True)
-        }
+        return self.at_gains(stiffness, damping)
 
     def walk_parameters(self) -> dict[str, float]:
         """Return the true values under the names in the parameter sets of the robot on the floor.
@@ -109,11 +88,7 @@ class Go2Truth:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; joints by name."""
-        values: dict[str, Any] = {"robot": "go2"}
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            values[entry.name] = dict(zip(JOINTS, value, strict=True)) if entry.name in _PER_JOINT else value
-        return values
+        return {"robot": "go2", **JointTruth.to_json(self)}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Go2Truth:
@@ -124,42 +99,18 @@ class Go2Truth:
         """
         with reading("the values", "the truth of a Go2", "--reveal-to writes one", error=ConfigurationError):
             found = from_values(_TruthFile, values)
-            arrays = {
-                name: tuple(
-                    number(getattr(found, name)[joint], f"{name} of {joint}", -1e3, 1e3) for joint in JOINTS
-                )
-                for name in _PER_JOINT
-            }
             return cls(
                 profile=find_profile(found.profile).name,
-                seed=int(number(found.seed, "seed", 0)),
-                latency_ms=int(number(found.latency_ms, "latency_ms", 0, 1000)),
                 payload_kg=number(found.payload_kg, "payload_kg", 0, 100),
                 floor_friction=number(found.floor_friction, "floor_friction", 0, 10),
-                **arrays,
+                **found.values(JOINTS),
             )
 
 
 @dataclass(frozen=True, slots=True)
-class _TruthFile:
-    """A truth as its file has it: joints by name."""
-
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
-
-    profile: str
-    seed: int
-    latency_ms: int
+class _TruthFile(JointTruthFile):
     payload_kg: float
     floor_friction: float
-    stiffness: dict[str, float]
-    damping: dict[str, float]
-    joint_damping: dict[str, float]
-    frictionloss: dict[str, float]
-    armature: dict[str, float]
-    encoder_bias: dict[str, float]
-
-
-_PER_JOINT: Final = ("stiffness", "damping", "joint_damping", "frictionloss", "armature", "encoder_bias")
 
 
 def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Go2Truth:
@@ -180,28 +131,12 @@ def draw_truth(profile: str, seed: int, *, range_ratio: float = DEFAULT_RANGE_RA
         ConfigurationError: ``range_ratio`` is not above 1, or the seed is negative.
     """
     found = find_profile(profile)
-    if seed < 0:
-        raise ConfigurationError(f"a seed is 0 or more, got {seed}")
-    if not 1.0 < range_ratio < math.inf:
-        raise ConfigurationError(f"the range ratio must be above 1, got {range_ratio}")
-    rng = np.random.default_rng([seed, 0x602])
-
-    def around(nominal: float) -> tuple[float, ...]:
-        exponent = rng.uniform(-0.8, 0.8, len(JOINTS))
-        return tuple(float(v) for v in nominal * range_ratio**exponent)
-
-    low, high = found.latency_ms
-    bias = found.encoder_bias_rad
+    rng = truth_rng(seed, range_ratio, 0x602)
+    joints = draw_joints(rng, nominal_truth(profile, seed), range_ratio, found)
     return Go2Truth(
         profile=profile,
         seed=seed,
-        stiffness=around(1.0),
-        damping=around(1.0),
-        joint_damping=around(JOINT_DAMPING_NMS_RAD),
-        frictionloss=around(FRICTIONLOSS_NM),
-        armature=around(ARMATURE_KGM2),
-        encoder_bias=tuple(float(v) for v in rng.uniform(-bias, bias, len(JOINTS))),
-        latency_ms=int(rng.integers(low, high + 1)),
         payload_kg=float(rng.uniform(*found.payload_kg)),
         floor_friction=float(rng.uniform(*found.floor_friction)),
+        **joints,
     )
