@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from deal_hw.drivers.go2.descriptions.floor import EFFORT_LIMIT_NM, VELOCITY_LIMIT_RAD_S, per_joint
-from deal_hw.drivers.go2.emulator.profiles import Go2Profile
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.unitree.emulated_motors import PdMotors
+from deal_hw.drivers.unitree.emulated_profile import SensorProfile
 
 
 class Motors(PdMotors):
@@ -16,7 +16,7 @@ class Motors(PdMotors):
         profile: Torque-speed limit.
     """
 
-    def __init__(self, truth: Go2Truth, profile: Go2Profile) -> None:
+    def __init__(self, truth: Go2Truth, profile: SensorProfile) -> None:
         super().__init__(
             truth.stiffness,
             truth.damping,
