@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
+
+from deal_hw.errors import UnknownNameError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +52,20 @@ class SensorProfile:
     drop: float = 0.0
 
 
+ProfileT = TypeVar("ProfileT", bound=SensorProfile)
+
+
+def find_profile(name: str, table: Mapping[str, ProfileT]) -> ProfileT:
+    """Return a profile of a robot by name.
+
+    Raises:
+        UnknownNameError: There is no such profile.
+    """
+    if name not in table:
+        raise UnknownNameError("profile", name, table)
+    return table[name]
+
+
 SENSOR: Final[Mapping[str, Any]] = {
     "position_noise": 5e-4,
     "position_resolution": 2 * math.pi / 32768,
@@ -59,6 +75,15 @@ SENSOR: Final[Mapping[str, Any]] = {
     "orientation_noise": 2e-3,
     "gyro_noise": 0.01,
     "specific_force_noise": 0.05,
+    "latency_ms": (2, 10),
 }
-"""Noise of the profiles sensor and realistic. We know of no published figures of a real robot's sensors:
-these are assumptions."""
+"""The profile sensor. We know of no published figures of a real robot's sensors: these are assumptions."""
+REALISTIC: Final[Mapping[str, Any]] = {
+    **SENSOR,
+    "jitter_ms": 2,
+    "encoder_bias_rad": 0.02,
+    "stribeck_ratio": 0.4,
+    "knee": 0.6,
+    "drop": 0.002,
+}
+"""What the profile realistic has beside what is a robot's own."""

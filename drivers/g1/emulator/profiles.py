@@ -4,22 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from deal_hw.drivers.unitree.emulated_profile import SENSOR, SensorProfile
-from deal_hw.errors import UnknownNameError
+from deal_hw.drivers.unitree.emulated_profile import REALISTIC, SENSOR, SensorProfile, find_profile
 
 PROFILES: Final = {
     "ideal": SensorProfile(name="ideal"),
-    "sensor": SensorProfile(name="sensor", latency_ms=(2, 10), **SENSOR),
-    "realistic": SensorProfile(
-        name="realistic",
-        latency_ms=(2, 10),
-        jitter_ms=2,
-        encoder_bias_rad=0.02,
-        stribeck_ratio=0.4,
-        knee=0.6,
-        drop=0.002,
-        **SENSOR,
-    ),
+    "sensor": SensorProfile(name="sensor", **SENSOR),
+    "realistic": SensorProfile(name="realistic", **REALISTIC),
 }
 """Assumptions, as for the Go2."""
 
@@ -30,6 +20,4 @@ def profile(name: str) -> SensorProfile:
     Raises:
         UnknownNameError: There is no such profile.
     """
-    if name not in PROFILES:
-        raise UnknownNameError("profile", name, PROFILES)
-    return PROFILES[name]
+    return find_profile(name, PROFILES)

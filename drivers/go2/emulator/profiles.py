@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from deal_hw.drivers.go2.descriptions.floor import FLOOR_FRICTION
-from deal_hw.drivers.unitree.emulated_profile import SENSOR, SensorProfile
-from deal_hw.errors import UnknownNameError
+from deal_hw.drivers.unitree.emulated_profile import REALISTIC, SENSOR, SensorProfile, find_profile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,19 +24,8 @@ class Go2Profile(SensorProfile):
 
 PROFILES: Final = {
     "ideal": Go2Profile(name="ideal"),
-    "sensor": Go2Profile(name="sensor", latency_ms=(2, 10), **SENSOR),
-    "realistic": Go2Profile(
-        name="realistic",
-        latency_ms=(2, 10),
-        jitter_ms=2,
-        encoder_bias_rad=0.02,
-        payload_kg=(0.0, 2.0),
-        floor_friction=(0.5, 1.1),
-        stribeck_ratio=0.4,
-        knee=0.6,
-        drop=0.002,
-        **SENSOR,
-    ),
+    "sensor": Go2Profile(name="sensor", **SENSOR),
+    "realistic": Go2Profile(name="realistic", payload_kg=(0.0, 2.0), floor_friction=(0.5, 1.1), **REALISTIC),
 }
 """We know of no published figures of a real Go2's sensors: these are assumptions."""
 
@@ -48,6 +36,4 @@ def profile(name: str) -> Go2Profile:
     Raises:
         UnknownNameError: There is no such profile.
     """
-    if name not in PROFILES:
-        raise UnknownNameError("profile", name, PROFILES)
-    return PROFILES[name]
+    return find_profile(name, PROFILES)
