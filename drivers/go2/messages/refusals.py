@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 from deal_hw.drivers.go2.messages.layout import LOW_STATE_BYTES
 from deal_hw.drivers.go2.messages.simulated import UNITREE_MUJOCO, is_unitree_mujoco
-from deal_hw.drivers.transports import topics
-from deal_hw.drivers.unitree.cdr import CDR_HEADER
-from deal_hw.errors import FrameError, ProtocolError, VersionMismatchError, WrongDeviceError
+from deal_hw.drivers.unitree.refusals import StateRefusals
+from deal_hw.errors import FrameError
 
 StateCheck = Literal["strict", "length"]
 """Checks that a LowState must pass: all, or all but head and checksum."""
@@ -22,52 +20,30 @@ ANOTHER_ROBOT: Final = (
 )
 
 
-class Refusals:
-    """Counts refused states.
+class Refusals(StateRefusals):
+    """Counts refused states of a Go2."""
 
-    Attributes:
-        count: Number of refused states.
-        first: Reason of the first refusal, as text; "" before.
-    """
+    robot: ClassVar[tuple[str, str]] = ("go2", "Go2")
+    state_bytes: ClassVar[int] = LOW_STATE_BYTES
+    rule: ClassVar[str] = "head and checksum"
 
     def __init__(self) -> None:
-        self.count, self.first = 0, ""
-        self._ruled = self._simulated = 0
-        self._lengths: Counter[int] = Counter()
+        super().__init__()
+        self._simulated = 0
 
     def add(self, payload: bytes, error: FrameError) -> None:
         """Take a refused message and the reason."""
-        self.count += 1
-        self.first = self.first or str(error)
-        self._lengths[len(payload)] += 1
-        self._ruled += len(payload) == LOW_STATE_BYTES and payload[:4] == CDR_HEADER
+        super().add(payload, error)
         self._simulated += is_unitree_mujoco(payload)
-
-    @property
-    def by_rule(self) -> bool:
-        """Whether most refused states have a Go2's length and encoding: then head or checksum differ."""
-        return 2 * self._ruled > self.count
 
     @property
     def remedy(self) -> str:
         """Remedy if every state was refused."""
         if 2 * self._simulated > self.count:
             return UNITREE_MUJOCO
-        return OTHER_RULE if self.by_rule else ANOTHER_ROBOT
+        return OTHER_RULE if self.by_rule else self.of_length
 
-    def error(self) -> ProtocolError:
-        """Return the finding if every state was refused."""
-        if self.by_rule:
-            return VersionMismatchError(
-                f"go2: {self._ruled} states have the right length, but none has the right head and "
-                f"checksum (the first: {self.first}): {self.remedy}"
-            )
-        length = self._lengths.most_common(1)[0][0]
-        if length != LOW_STATE_BYTES:
-            return WrongDeviceError(
-                f"go2: the messages on {topics.LOW_STATE} have {length} bytes, but those of a Go2 "
-                f"{LOW_STATE_BYTES}: {ANOTHER_ROBOT}"
-            )
-        return WrongDeviceError(
-            f"go2: the messages on {topics.LOW_STATE} are no states of a Go2: {self.first}"
-        )
+    @property
+    def of_length(self) -> str:
+        """Remedy if the states have another length."""
+        return ANOTHER_ROBOT
