@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from deal_hw.drivers.ros2.messages import TrajectoryPoint, encode_point, encode_
 from deal_hw.drivers.ros2.start_motion import StartMotion
 from deal_hw.drivers.ros2.state_stream import JointSample, JointStateStream
 from deal_hw.drivers.ros2.topics import ros_topic, topics_of
+from deal_hw.drivers.topic_robot import TopicRobot
 from deal_hw.errors import (
     ConfigurationError,
     SafetyError,
@@ -24,7 +24,6 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
-from deal_hw.robot import Robot
 from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
@@ -40,8 +39,6 @@ FIRST_STATES: Final = 20
 """Number of states that identify the robot and the rate of its clock."""
 _TOO_MANY: Final = 20
 """Number of messages without a state of this robot after which it is another one."""
-_ENOUGH: Final = 3
-"""Number of new states after the first command that confirm the connection."""
 _CLOCK_RATES: Final = (0.8, 1.25)
 """The robot's clock may run so fast against this computer's, over the first states."""
 _SPARSE: Final = 0.8
@@ -51,7 +48,6 @@ _FRESH_NS: Final = 200_000_000
 """An older state is no pose to hold [ns]."""
 _STILL: Final = {"rad": 0.15, "m": 0.03}
 """A joint slower than this stands [rad/s or m/s]."""
-_QUEUE: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +67,7 @@ class Ros2Info:
     not_reported: str
 
 
-class Ros2ControlRobot(Robot):
+class Ros2ControlRobot(TopicRobot[JointStateStream]):
     """A robot behind a forward position controller or a joint trajectory controller.
 
     The controller holds the last target for ever, and no message switches torque off. Passive therefore means
@@ -92,25 +88,28 @@ class Ros2ControlRobot(Robot):
     """
 
     stopped_by = "the robot's emergency stop or its supply"
+    look_at: ClassVar[str] = "look at the robot's controller_manager and the network"
+    info: Ros2Info | None
 
     def __init__(
         self, transport: TopicTransport, clock: Clock, description: RobotDescription, section: Ros2Section
     ) -> None:
         self.description = description  # type: ignore[misc]  # A user's robot is known at run time.
-        self._transport, self._clock, self._section = transport, clock, section
+        super().__init__(transport, clock, description.name, JointStateStream(description, section))
+        self._section = section
         self._topics = topics_of(section)
         self._graph = Graph(transport, self._topics, section)
-        self._stream = JointStateStream(description, section)
         self._actuated = np.array(description.actuated_index)
         self._order = [description.actuated.index(joint) for joint in section.joints or description.actuated]
         self._ros_names = tuple(section.ros_name(description.actuated[a]) for a in self._order)
         self._period_s = 1.0 / description.control_rate_hz
         self._still = np.array([_STILL[description.position_units[j]] for j in self._actuated])
-        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
-        self._wire: deque[Message] = deque(maxlen=_QUEUE)
         self._echo = CommandEcho()
-        self.info: Ros2Info | None = None
         self._forget()
+
+    @property
+    def _frozen(self) -> str:
+        return "their stamps stand still"
 
     def _forget(self) -> None:
         self.info = None
@@ -147,15 +146,6 @@ class Ros2ControlRobot(Robot):
         except BaseException:
             self._transport.close()
             raise
-
-    def disconnect(self) -> None:
-        """Close the transport."""
-        self._transport.close()
-        self._forget()
-
-    def reopen(self) -> None:
-        """Open the transport again where it is lost."""
-        self._transport.reopen()
 
     def _await_robot(self) -> Ros2Info:
         """Wait for states of one robot whose clock runs as this computer's, at the expected rate."""
@@ -300,33 +290,9 @@ class Ros2ControlRobot(Robot):
         self._hold = self._passive_ns = None
         self._stream.trouble = ""
         self._publish(self._target)
-        seen = self._stream.accepted
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while self._stream.accepted < seen + _ENOUGH:
-            if (left_ns := deadline_ns - self._clock.now_ns()) <= 0:
-                raise TransportTimeoutError(
-                    f"{self.description.name}: no new states within {timeout_s:g} s of the first command"
-                )
-            with contextlib.suppress(TransportTimeoutError):
-                self._pump(left_ns * 1e-9)
+        self._await_new_states(timeout_s)
         self._armed = True
         self._states.clear()
-
-    def read_state(self, timeout_s: float) -> RobotState:
-        """Return the next new state; others are counted and dropped."""
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        stale = self._stream.stale
-        while not self._states:
-            try:
-                self._pump(max(0, deadline_ns - self._clock.now_ns()) * 1e-9)
-            except TransportTimeoutError as error:
-                frozen = " (their stamps stand still)" * (self._stream.stale > stale)
-                raise TransportTimeoutError(
-                    f"{self.description.name}: no new state within {timeout_s:g} s{frozen}; look at the "
-                    f"robot's controller_manager and the network ({self.transport_errors} transport errors "
-                    "so far)"
-                ) from error
-        return self._states.popleft()
 
     def send_command(self, command: JointCommand) -> JointCommand:
         """Send position targets; once passive, the held pose is sent instead and returned.
@@ -408,21 +374,6 @@ class Ros2ControlRobot(Robot):
         """Number of the last new command; -1 before the first."""
         return self._sequence
 
-    @property
-    def transport_errors(self) -> int:
-        """Corrupt, incomplete, missing and repeated states so far."""
-        return self._stream.errors
-
-    def fileno(self) -> int:
-        """Return -1: each process opens its own path to the topics."""
-        return -1
-
-    def take_wire(self) -> list[Message]:
-        """Return and forget the messages since the last call; repeats of a command are left out."""
-        wire = list(self._wire)
-        self._wire.clear()
-        return wire
-
     # Messages.
 
     def _publish(self, target: FloatArray) -> int:
@@ -454,11 +405,6 @@ class Ros2ControlRobot(Robot):
         if state is None or self._clock.now_ns() - state.receive_ns > _FRESH_NS:
             raise TransportTimeoutError(f"{self.description.name}: its states ceased on the way")
         return state
-
-    def _drain(self) -> None:
-        with contextlib.suppress(TransportTimeoutError):
-            while True:
-                self._pump(0.0)
 
     def _pump(self, timeout_s: float) -> None:
         """Take one message, waiting for it."""
@@ -515,7 +461,3 @@ class Ros2ControlRobot(Robot):
         if self._armed or self._passive_ns is not None:
             status |= Status.ARMED
         return status | Status.FAULT if self._fault else status
-
-    def _check_connected(self) -> None:
-        if self.info is None:
-            raise SafetyError(f"{self.description.name}: not connected; call connect() first")

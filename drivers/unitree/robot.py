@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import abc
 import contextlib
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.drivers.topic_robot import TopicRobot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.command_sender import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.unitree.remote import Remote, decode_remote, parse_combination
@@ -18,7 +18,6 @@ from deal_hw.drivers.unitree.takeover import Takeover
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
-from deal_hw.robot import Robot
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import BodyState, FloatArray, JointCommand, RobotState, Status
 
@@ -30,11 +29,6 @@ SUBSCRIBED: Final = (
     topics.LOW_COMMAND,
     *(topics.response(name) for name in topics.SERVICES),
 )
-_QUEUE: Final = 4096
-_ENOUGH: Final = 3
-"""Number of new states after the first command that confirm the connection."""
-
-
 DAMPED_TOLERANCE_NM: Final = 1.5
 DAMPED_TOLERANCE_SHARE: Final = 0.3
 """Largest difference of estimated efforts from damping: the motors' noise, and the change of a joint's speed
@@ -90,7 +84,7 @@ def is_damped(frame: StateFrame, damping: FloatArray, effort_limit: FloatArray) 
     return known.size > 0 and bool((known <= 0.0).all())
 
 
-class UnitreeRobot(Robot, Generic[F], abc.ABC):
+class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
     """A Unitree robot at its motors' own level.
 
     The robot holds the last command for ever: it has no arming and no watchdog, and without torque it falls.
@@ -115,6 +109,7 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
     """
 
     wording: ClassVar[Wording]
+    look_at: ClassVar[str] = "check that the robot is on, and the cable"
     published: ClassVar[tuple[str, ...]] = PUBLISHED
     subscribed: ClassVar[tuple[str, ...]] = SUBSCRIBED
     types: ClassVar[Mapping[str, str]] = {}
@@ -128,11 +123,8 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
         stop_buttons: str,
         stream: TickStream[F],
     ) -> None:
-        self._transport, self._clock, self._name = transport, clock, self.wording.name
+        super().__init__(transport, clock, self.wording.name, stream)
         self._stop_text, self._stop_mask = stop_buttons, parse_combination(stop_buttons)
-        self._stream = stream
-        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
-        self._wire: deque[Message] = deque(maxlen=_QUEUE)
         self._sender = CommandSender(
             transport, clock, self.description, self._wire.append, self._encode, self.wording.name
         )
@@ -179,15 +171,6 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
         except BaseException:
             self._transport.close()
             raise
-
-    def disconnect(self) -> None:
-        """Close the transport."""
-        self._transport.close()
-        self._forget()
-
-    def reopen(self) -> None:
-        """Open the transport again where it is lost."""
-        self._transport.reopen()
 
     def home(self, timeout_s: float) -> None:
         """Release the robot's own controller and check that no other program commands the motors.
@@ -250,32 +233,9 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
             )
         self._fault = ""
         self._sender.damp(self._motion()[0])
-        seen = self._stream.accepted
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while self._stream.accepted < seen + _ENOUGH:
-            if (left_ns := deadline_ns - self._clock.now_ns()) <= 0:
-                raise TransportTimeoutError(
-                    f"{self._name}: no new states within {timeout_s:g} s of the first command"
-                )
-            with contextlib.suppress(TransportTimeoutError):
-                self._pump(left_ns * 1e-9)
+        self._await_new_states(timeout_s)
         self._armed, self._passive_ns, self._armed_ns = True, None, self._clock.now_ns()
         self._states.clear()
-
-    def read_state(self, timeout_s: float) -> RobotState:
-        """Return the next valid and new state; others are counted and dropped."""
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        stale = self._stream.stale
-        while not self._states:
-            try:
-                self._pump(max(0, deadline_ns - self._clock.now_ns()) * 1e-9)
-            except TransportTimeoutError as error:
-                frozen = f" (it repeats old ones: {self._stream.standstill})" * (self._stream.stale > stale)
-                raise TransportTimeoutError(
-                    f"{self._name}: no new state within {timeout_s:g} s{frozen}; check that the robot is on, "
-                    f"and the cable ({self.transport_errors} transport errors so far)"
-                ) from error
-        return self._states.popleft()
 
     def send_command(self, command: JointCommand) -> JointCommand:
         """Send PD targets; once passive, damping is sent instead and returned.
@@ -323,19 +283,8 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
         return self._sender.sequence
 
     @property
-    def transport_errors(self) -> int:
-        """Corrupt, missing, repeated and overtaken states so far."""
-        return self._stream.errors
-
-    def fileno(self) -> int:
-        """Return -1: each process opens its own path to the topics."""
-        return -1
-
-    def take_wire(self) -> list[Message]:
-        """Return and forget the messages since the last call; repeats of a command are left out."""
-        wire = list(self._wire)
-        self._wire.clear()
-        return wire
+    def _frozen(self) -> str:
+        return f"it repeats old ones: {self._stream.standstill}"
 
     def _await_robot(self) -> None:
         await_robot(self._transport, self._clock, self._stream, self._pump, self.wording.name)
@@ -375,11 +324,6 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
     def _why_unreached(self, since_ns: int) -> str:
         """Return why requests since a time [ns] cannot reach the robot; "" if nothing is known."""
         return ""
-
-    def _drain(self) -> None:
-        with contextlib.suppress(TransportTimeoutError):
-            while True:
-                self._pump(0.0)
 
     def _pump(self, timeout_s: float) -> None:
         """Take one message, waiting for it."""
@@ -437,10 +381,6 @@ class UnitreeRobot(Robot, Generic[F], abc.ABC):
             zero = np.zeros(len(self.description.joint_names))
             return zero, zero
         return self._frame.position, self._frame.velocity
-
-    def _check_connected(self) -> None:
-        if self.info is None:
-            raise SafetyError(f"{self._name}: not connected; call connect() first")
 
 
 CONNECT_TIMEOUT_S: Final = 5.0

@@ -62,7 +62,7 @@ ROOMS = {
         {"pipeline", "report"},
     ),
     "drivers": (
-        {"command_echo", "servo_bus", "transports"},
+        {"command_echo", "servo_bus", "topic_robot", "transports"},
         {"unitree"},
         {"cartpole", "g1", "go2", "ros2", "servo_arm"},
         {"so101"},
