@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import abc
 from collections import deque
-from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.command_log import CommandLog
-from deal_hw.drivers.unitree.emulated_faults import StateFaults
+from deal_hw.drivers.unitree.emulated_faults import StateFaults, WirePlan
 from deal_hw.drivers.unitree.emulated_motors import PdMotors
 from deal_hw.drivers.unitree.emulated_profile import SensorProfile
 from deal_hw.drivers.unitree.emulated_truth import JointTruth
@@ -26,19 +26,6 @@ SUBSCRIBED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topi
 """Topics that the robot reads."""
 Outgoing = tuple[str, bytes]
 CommandT = TypeVar("CommandT", bound=MotorCommand)
-
-
-class FaultPlan(Protocol):
-    """Faults to make: the four shares of the wire (:class:`StateFaults`), and those with a start time."""
-
-    @property
-    def cut_s(self) -> float:
-        """How long the wire is cut [s]."""
-        ...
-
-    def due(self) -> list[tuple[int, str]]:
-        """Return the start of each fault, in ms since the first stiff command, and its name, in order."""
-        ...
 
 
 class UnitreeDevice(abc.ABC, Generic[CommandT]):
@@ -76,7 +63,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         sim: LeggedSimulation,
         truth: JointTruth,
         profile: SensorProfile,
-        plan: FaultPlan,
+        plan: WirePlan,
         *,
         written: tuple[str, ...],
         jitter_rng: np.random.Generator,

@@ -1,12 +1,50 @@
-"""Faults of an emulated robot's states on the wire."""
+"""Faults of an emulated robot on the wire, and when each begins."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 SHARES: Final = ("drop", "duplicate", "reorder", "corrupt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WirePlan:
+    """Faults of every emulated robot of Unitree; times count from the first stiff command.
+
+    Attributes:
+        MOMENTS: Faults with a start time, as in ``<name>_after_s``.
+    """
+
+    MOMENTS: ClassVar[tuple[str, ...]] = ("freeze", "cut")
+
+    drop: float = 0.0
+    """Share of states that are lost."""
+
+    duplicate: float = 0.0
+    """Share of states that arrive twice."""
+
+    reorder: float = 0.0
+    """Share of states that arrive after their successor."""
+
+    corrupt: float = 0.0
+    """Share of states in which one byte is changed."""
+
+    freeze_after_s: float | None = None
+    """Time after which the robot sends nothing; it still receives [s]."""
+
+    cut_after_s: float | None = None
+    """Time after which the wire is cut in both directions; the robot keeps its last command [s]."""
+
+    cut_s: float = 1.0
+    """How long the wire is cut [s]."""
+
+    def due(self) -> list[tuple[int, str]]:
+        """Return the start of each fault, in ms since the first stiff command, and its name, in order."""
+        found = ((name, getattr(self, f"{name}_after_s")) for name in self.MOMENTS)
+        return sorted((round(after_s * 1e3), name) for name, after_s in found if after_s is not None)
 
 
 class StateFaults:

@@ -11,7 +11,7 @@ from deal_hw.drivers.g1.emulator.faults import G1FaultPlan
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.emulation.common import choose_truth
 from deal_hw.workflows.emulation.settings import EmulateG1Settings
-from deal_hw.workflows.emulation.topics import emulate_on_topics
+from deal_hw.workflows.emulation.topics import emulate_on_topics, of_every_robot
 from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
@@ -53,15 +53,7 @@ def _device(config: EmulateG1Settings, truth: G1Truth) -> G1Device:
     from deal_hw.drivers.g1.emulator.device import G1Device
 
     own = config.g1
-    plan = G1FaultPlan(
-        drop=config.drop,
-        duplicate=config.duplicate,
-        corrupt=config.corrupt,
-        freeze_after_s=config.freeze_after_s,
-        cut_after_s=config.cut_after_s,
-        cut_s=config.cut_s,
-        **asdict(own.faults),
-    )
+    plan = G1FaultPlan(**of_every_robot(config), **asdict(own.faults))
     return G1Device(
         truth,
         controller="" if own.controller == "off" else own.controller,

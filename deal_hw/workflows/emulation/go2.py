@@ -18,7 +18,7 @@ from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
 from deal_hw.workflows.emulation.common import choose_truth
 from deal_hw.workflows.emulation.settings import EmulateGo2Settings
-from deal_hw.workflows.emulation.topics import emulate_on_topics
+from deal_hw.workflows.emulation.topics import emulate_on_topics, of_every_robot
 from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
@@ -105,15 +105,7 @@ def _device(config: EmulateGo2Settings, truth: Go2Truth) -> Go2Device:
     from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
 
     own = config.go2
-    plan = FaultPlan(
-        drop=config.drop,
-        duplicate=config.duplicate,
-        corrupt=config.corrupt,
-        freeze_after_s=config.freeze_after_s,
-        cut_after_s=config.cut_after_s,
-        cut_s=config.cut_s,
-        **asdict(own.faults),
-    )
+    plan = FaultPlan(**of_every_robot(config), **asdict(own.faults))
     if own.no_remote and own.remote_script is not None:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")
     script = () if own.remote_script is None else read_remote_script(own.remote_script)

@@ -17,7 +17,7 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.robots import robot_entry
 from deal_hw.robots.connect import make_topic_transport
 from deal_hw.workflows.emulation.common import happenings, next_line, realtime_priority, reveal, run_until
-from deal_hw.workflows.emulation.settings import EmulateG1Settings, EmulateGo2Settings
+from deal_hw.workflows.emulation.settings import EmulateG1Settings, EmulateGo2Settings, EmulateSettings
 from deal_hw.workflows.say import Say, silent
 
 D = TypeVar("D", bound=DeviceOnTopics)
@@ -91,6 +91,12 @@ def emulate_on_topics(
     reveal(report, announce if config.reveal else silent, config.reveal_to)
     for line in summary(report):
         say(line)
+
+
+def of_every_robot(config: EmulateSettings) -> dict[str, Any]:
+    """Return the faults that every emulated robot has, as its plan names them."""
+    names = ("drop", "duplicate", "corrupt", "freeze_after_s", "cut_after_s", "cut_s")
+    return {name: getattr(config, name) for name in names}
 
 
 @contextlib.contextmanager

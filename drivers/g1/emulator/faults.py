@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import ClassVar, Final
 
 from deal_hw.drivers.g1.joints import MOTORS
+from deal_hw.drivers.unitree.emulated_faults import WirePlan
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 MOMENTS: Final = ("freeze", "cut", "sport", "nan", "hot", "error", "stop", "machine")
@@ -46,32 +47,8 @@ class G1Faults:
             raise UnknownNameError("G1 joint", self.fault_joint, MOTORS)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class G1FaultPlan(G1Faults):
+@dataclass(frozen=True, kw_only=True)
+class G1FaultPlan(G1Faults, WirePlan):
     """All faults of an emulated G1: those of every emulated robot, and its own."""
 
-    drop: float = 0.0
-    """Share of states that are lost."""
-
-    duplicate: float = 0.0
-    """Share of states that arrive twice."""
-
-    reorder: float = 0.0
-    """Share of states that arrive after their successor."""
-
-    corrupt: float = 0.0
-    """Share of states in which one byte is changed."""
-
-    freeze_after_s: float | None = None
-    """Time after which the robot sends nothing; it still receives [s]."""
-
-    cut_after_s: float | None = None
-    """Time after which the wire is cut in both directions; the robot keeps its last command [s]."""
-
-    cut_s: float = 1.0
-    """How long the wire is cut [s]."""
-
-    def due(self) -> list[tuple[int, str]]:
-        """Return the start of each fault, in ms since the first stiff command, and its name, in order."""
-        found = ((name, getattr(self, f"{name}_after_s")) for name in MOMENTS)
-        return sorted((round(after_s * 1e3), name) for name, after_s in found if after_s is not None)
+    MOMENTS: ClassVar[tuple[str, ...]] = MOMENTS

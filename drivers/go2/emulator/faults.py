@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import ClassVar, Final
 
 from deal_hw.drivers.go2.descriptions.floor import JOINTS
-from deal_hw.drivers.unitree.emulated_faults import SHARES
+from deal_hw.drivers.unitree.emulated_faults import SHARES, WirePlan
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 MOMENTS: Final = (
@@ -84,33 +84,8 @@ class Go2Faults:
                 raise UnknownNameError("Go2 joint", value, JOINTS)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FaultPlan(Go2Faults):
+@dataclass(frozen=True, kw_only=True)
+class FaultPlan(Go2Faults, WirePlan):
     """All faults of an emulated Go2: those of every emulated robot, and its own."""
 
-    drop: float = 0.0
-    """Share of states that are lost."""
-
-    duplicate: float = 0.0
-    """Share of states that arrive twice."""
-
-    corrupt: float = 0.0
-    """Share of states in which one byte is changed."""
-
-    freeze_after_s: float | None = None
-    """Time after which the robot sends nothing; it still receives [s]."""
-
-    cut_after_s: float | None = None
-    """Time after which the wire is cut in both directions; the robot keeps its last command [s]."""
-
-    cut_s: float = 1.0
-    """How long the wire is cut [s]."""
-
-    def due(self) -> list[tuple[int, str]]:
-        """Return the start of each fault, in ms since the first stiff command, and its name, in order."""
-        found = []
-        for name in MOMENTS:
-            after_s = getattr(self, f"{name}_after_s")
-            if after_s is not None:
-                found.append((round(after_s * 1e3), name))
-        return sorted(found)
+    MOMENTS: ClassVar[tuple[str, ...]] = MOMENTS
