@@ -21,7 +21,7 @@ from deal_hw.sim.robots.hardware_section import HardwareSection, ServoEntry
 from deal_hw.sim.robots.robot_file import RobotFile, write_robot_file
 from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
 from deal_hw.sim.robots.user_robot import derive_robot
-from deal_hw.testing.robot_suite import default_command
+from deal_hw.testing.robot_suite import arm, default_command, run_cycles
 from deal_hw.transport import Transport
 from deal_hw.types import RobotState
 
@@ -108,24 +108,12 @@ class Rig:
 
     def armed(self) -> ServoArm:
         """Return the driver, connected, homed and armed, after its first command."""
-        self.robot.connect()
-        self.robot.home(20.0)
-        self.robot.arm(1.0)
-        self.robot.send_command(default_command(self.robot))
+        arm(self.robot)
         return self.robot
 
     def run(self, cycles: int, target: float = 0.0) -> list[RobotState]:
         """Command and read as the control loop does; return the states."""
-        states = []
-        for _ in range(cycles):
-            deadline_ns = self.clock.now_ns() + 20_000_000
-            self.robot.send_command(default_command(self.robot, target))
-            while self.clock.now_ns() < deadline_ns:
-                try:
-                    states.append(self.robot.read_state((deadline_ns - self.clock.now_ns()) / 1e9))
-                except TransportTimeoutError:
-                    break
-        return states
+        return run_cycles(self.robot, self.clock, cycles, default_command(self.robot, target))
 
     def advance(self, seconds: float) -> None:
         """Let device time pass without the driver."""

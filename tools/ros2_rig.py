@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -23,14 +22,13 @@ from deal_hw.drivers.ros2.messages import (
 from deal_hw.drivers.ros2.robot import Ros2ControlRobot
 from deal_hw.drivers.ros2.topics import topics_of
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
-from deal_hw.errors import TransportTimeoutError
 from deal_hw.sim.robots.file_description import file_description
 from deal_hw.sim.robots.robot_file import RobotFile, write_robot_file
 from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
 from deal_hw.sim.robots.user_robot import derive_robot
 from deal_hw.testing.faults import FaultyTransport
-from deal_hw.testing.robot_suite import default_command
+from deal_hw.testing.robot_suite import arm, default_command, read_until, run_cycles
 from deal_hw.transport import Message, TopicEnd, TopicTransport
 from deal_hw.types import FloatArray, RobotState
 
@@ -117,28 +115,16 @@ class Ros2Rig:
 
     def armed(self) -> Ros2ControlRobot:
         """Return the driver, connected, homed and armed, after its first command."""
-        self.robot.connect()
-        self.robot.home(20.0)
-        self.robot.arm(1.0)
-        self.robot.send_command(default_command(self.robot))
+        arm(self.robot)
         return self.robot
 
     def run(self, cycles: int, target: float = 0.0) -> list[RobotState]:
         """Command and read as the control loop does; return the states."""
-        states = []
-        for _ in range(cycles):
-            deadline_ns = self.clock.now_ns() + 20_000_000
-            self.robot.send_command(default_command(self.robot, target))
-            states += self.listen(deadline_ns)
-        return states
+        return run_cycles(self.robot, self.clock, cycles, default_command(self.robot, target))
 
     def listen(self, deadline_ns: int) -> list[RobotState]:
         """Read until a time [ns]; return the states."""
-        states = []
-        with contextlib.suppress(TransportTimeoutError):
-            while (left_ns := deadline_ns - self.clock.now_ns()) > 0:
-                states.append(self.robot.read_state(left_ns / 1e9))
-        return states
+        return read_until(self.robot, self.clock, deadline_ns)
 
     def pass_time(self, seconds: float) -> list[RobotState]:
         """Read for a time [s]; return the states."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 from collections.abc import Callable
@@ -10,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from deal_hw.clock import Clock
 from deal_hw.errors import (
     SafetyError,
     TransportError,
     TransportLostError,
+    TransportTimeoutError,
     VersionMismatchError,
     WrongDeviceError,
 )
@@ -51,6 +54,34 @@ def default_command(robot: Robot, target: float = 0.0) -> JointCommand:
     """Return a command with the description's gains and limits and this target for every actuated joint."""
     facts = robot.description
     return position_command(facts, np.full(len(facts.actuated), target))
+
+
+def arm(robot: Robot) -> None:
+    """Connect, home and arm a robot, and send its first command."""
+    robot.connect()
+    robot.home(20.0)
+    robot.arm(1.0)
+    robot.send_command(default_command(robot))
+
+
+def run_cycles(robot: Robot, clock: Clock, cycles: int, command: JointCommand) -> list[RobotState]:
+    """Command and read as the control loop does, for cycles of its control period; return the states."""
+    period_ns = round(1e9 / robot.description.control_rate_hz)
+    states: list[RobotState] = []
+    for _ in range(cycles):
+        deadline_ns = clock.now_ns() + period_ns
+        robot.send_command(command)
+        states += read_until(robot, clock, deadline_ns)
+    return states
+
+
+def read_until(robot: Robot, clock: Clock, deadline_ns: int) -> list[RobotState]:
+    """Read until a time [ns]; return the states."""
+    states: list[RobotState] = []
+    with contextlib.suppress(TransportTimeoutError):
+        while (left_ns := deadline_ns - clock.now_ns()) > 0:
+            states.append(robot.read_state(left_ns / 1e9))
+    return states
 
 
 class RobotSuite:

@@ -38,7 +38,7 @@ from deal_hw.errors import (
     WrongDeviceError,
 )
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
-from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.testing.robot_suite import RobotBench, RobotSuite, arm, default_command, run_cycles
 from deal_hw.transport import Message, Transport
 from deal_hw.types import RobotState, Status
 
@@ -73,24 +73,12 @@ class Wire:
 
     def armed(self) -> DynamixelCartpole:
         """Return the driver, connected, homed and armed, after its first command."""
-        self.robot.connect()
-        self.robot.home(20.0)
-        self.robot.arm(1.0)
-        self.robot.send_command(default_command(self.robot))
+        arm(self.robot)
         return self.robot
 
     def run(self, cycles: int, target: float = 0.0) -> list[RobotState]:
         """Command and read as the control loop does; return the states."""
-        states = []
-        for _ in range(cycles):
-            deadline_ns = self.clock.now_ns() + 20_000_000
-            self.robot.send_command(default_command(self.robot, target))
-            while True:
-                try:
-                    states.append(self.robot.read_state((deadline_ns - self.clock.now_ns()) / 1e9))
-                except TransportTimeoutError:
-                    break
-        return states
+        return run_cycles(self.robot, self.clock, cycles, default_command(self.robot, target))
 
 
 @functools.cache

@@ -14,12 +14,12 @@ from deal_hw.drivers.so101.description import DRIVEN, JOINTS, emulated_space
 from deal_hw.drivers.so101.emulator import homed, so101_device
 from deal_hw.drivers.so101.robot import HARDWARE, RANGES, so101_arm
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
-from deal_hw.errors import ConfigurationError, TransportTimeoutError, WrongDeviceError
+from deal_hw.errors import ConfigurationError, WrongDeviceError
 from deal_hw.motions.behaviours import position_command
 from deal_hw.sim.robots.hardware_section import RAD
 from deal_hw.sim.robots.simulated import SimulatedTruth
 from deal_hw.testing.faults import FaultyTransport, OneBadFrame
-from deal_hw.testing.robot_suite import RobotBench, RobotSuite
+from deal_hw.testing.robot_suite import RobotBench, RobotSuite, arm, run_cycles
 from deal_hw.transport import Transport
 from deal_hw.types import RobotState
 
@@ -49,19 +49,8 @@ class Arm:
 
     def hold(self, pose: list[float], cycles: int = 100) -> RobotState:
         """Home, arm, command one pose for some cycles; return the last state."""
-        self.robot.connect()
-        self.robot.home(20.0)
-        self.robot.arm(1.0)
-        state = self.robot.read_state(0.1)
-        for _ in range(cycles):
-            deadline_ns = self.clock.now_ns() + 20_000_000
-            self.robot.send_command(position_command(DRIVEN, np.array(pose)))
-            while self.clock.now_ns() < deadline_ns:
-                try:
-                    state = self.robot.read_state((deadline_ns - self.clock.now_ns()) / 1e9)
-                except TransportTimeoutError:
-                    break
-        return state
+        arm(self.robot)
+        return run_cycles(self.robot, self.clock, cycles, position_command(DRIVEN, np.array(pose)))[-1]
 
 
 class TestSo101(RobotSuite):
