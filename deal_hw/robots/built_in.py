@@ -47,35 +47,29 @@ TRANSPORTS: Final = (
 )
 
 
-def _go2_wires(emulator: str = "") -> tuple[WireEntry, ...]:
-    """Return the wires of a Go2; its stand has no emulator of its own (``emulate go2 --on-stand``)."""
+def _unitree_wires(claim: str, doctor: str, *, emulated: bool = True) -> tuple[WireEntry, ...]:
+    """Return the wires of a robot of Unitree.
+
+    Args:
+        claim: Its claim.
+        doctor: Its doctor.
+        emulated: Whether it has an emulator of its own; a Go2 on its stand is ``emulate go2 --on-stand``.
+    """
     return tuple(
         WireEntry(
             name=name,
             transport=name,
-            emulator=emulator,
-            emulator_port=port if emulator else "",
-            claim="deal_hw.drivers.unitree.claim:WireClaim",
-            doctor="deal_hw.drivers.go2.doctor:Go2Doctor",
+            emulator="deal_hw.drivers.unitree.emulator:UnitreeEmulator" if emulated else "",
+            emulator_port=port if emulated else "",
+            claim=claim,
+            doctor=doctor,
         )
         for name, port in (("dds", "127.0.0.1"), ("zenoh", "tcp/127.0.0.1:7447"))
     )
 
 
-def _g1_wires() -> tuple[WireEntry, ...]:
-    """Return the wires of a G1."""
-    return tuple(
-        WireEntry(
-            name=name,
-            transport=name,
-            emulator="deal_hw.drivers.unitree.emulator:UnitreeEmulator",
-            emulator_port=port,
-            claim="deal_hw.drivers.g1.robot:G1Claim",
-            doctor="deal_hw.drivers.g1.doctor:G1Doctor",
-        )
-        for name, port in (("dds", "127.0.0.1"), ("zenoh", "tcp/127.0.0.1:7447"))
-    )
-
+_OF_GO2: Final = "deal_hw.drivers.unitree.claim:WireClaim", "deal_hw.drivers.go2.doctor:Go2Doctor"
+_OF_G1: Final = "deal_hw.drivers.g1.robot:G1Claim", "deal_hw.drivers.g1.doctor:G1Doctor"
 
 CARTPOLE: Final = RobotEntry(
     name="cartpole",
@@ -124,7 +118,7 @@ GO2: Final = RobotEntry(
     name="go2",
     api_version=API_VERSION,
     driver="deal_hw.drivers.go2.robot:Go2Robot",
-    wires=_go2_wires("deal_hw.drivers.unitree.emulator:UnitreeEmulator"),
+    wires=_unitree_wires(*_OF_GO2),
     # On the floor it is simulated at other rates than its wire has.
     description="deal_hw.drivers.go2.descriptions.floor:DESCRIPTION",
     spaces="deal_hw.drivers.go2.descriptions.floor:SPACES",
@@ -140,7 +134,7 @@ GO2_ON_STAND: Final = RobotEntry(
     name="go2_on_stand",
     api_version=API_VERSION,
     driver="deal_hw.drivers.go2.robot:Go2OnStandRobot",
-    wires=_go2_wires(),
+    wires=_unitree_wires(*_OF_GO2, emulated=False),
     spaces="deal_hw.drivers.go2.descriptions.on_stand:SPACES",
     simulators={"unitree_mujoco": "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot"},
     machine="go2",
@@ -149,7 +143,7 @@ G1: Final = RobotEntry(
     name="g1",
     api_version=API_VERSION,
     driver="deal_hw.drivers.g1.robot:G1Robot",
-    wires=_g1_wires(),
+    wires=_unitree_wires(*_OF_G1),
     recorded="deal_hw.drivers.g1.description:DESCRIPTION",
     spaces="deal_hw.drivers.g1.description:SPACES",
     motors="deal_hw.drivers.g1.joints:JOINTS_29",
@@ -158,7 +152,7 @@ G1_23DOF: Final = RobotEntry(
     name="g1_23dof",
     api_version=API_VERSION,
     driver="deal_hw.drivers.g1.robot:G1Dof23Robot",
-    wires=_g1_wires(),
+    wires=_unitree_wires(*_OF_G1),
     recorded="deal_hw.drivers.g1.description:DESCRIPTION_23",
     spaces="deal_hw.drivers.g1.description:SPACES_23",
     machine="g1",
