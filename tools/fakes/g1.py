@@ -6,7 +6,6 @@ Its joints never move by themselves. A test can change messages, and add other p
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.remote import Remote, encode_remote
 from deal_hw.drivers.unitree.rpc import Response, decode_request, encode_response
 from deal_hw.types import FloatArray
-from fakes.go2 import FakeTopics
+from fakes.go2 import FakeTopics, TopicBench
 
 
 class FakeG1:
@@ -122,14 +121,12 @@ class FakeG1:
         return G1State(**{**values, **self.changes})
 
 
-class FakeG1Bench:
+class FakeG1Bench(TopicBench[G1Robot]):
     """A fake robot, its driver, and the topics between them.
 
     Attributes:
         clock: The clock that everybody shares.
         device: The robot.
-        topics: The wire.
-        robot: The driver, not connected.
 
     Args:
         kind: The driver.
@@ -141,19 +138,3 @@ class FakeG1Bench:
         self.device = FakeG1(kind)
         self.topics = FakeTopics(self.device, self.clock)
         self.robot = kind(self.topics, self.clock, hung_on_crane=hung)
-
-    def armed(self) -> G1Robot:
-        """Return the driver, connected, homed and armed."""
-        self.robot.connect()
-        self.robot.home(10.0)
-        self.robot.arm(1.0)
-        return self.robot
-
-    def spoil_once(self, change: Callable[[bytes], Iterable[bytes]]) -> None:
-        """Let the next state arrive changed."""
-        pending = [True]
-
-        def tamper(topic: str, payload: bytes) -> Iterable[bytes]:
-            return change(payload) if topic == topics.LOW_STATE and pending and pending.pop() else (payload,)
-
-        self.topics.tamper = tamper

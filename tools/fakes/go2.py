@@ -9,7 +9,7 @@ import heapq
 import itertools
 import json
 from collections.abc import Callable, Iterable
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import TopicCore, VirtualTopics
 from deal_hw.drivers.unitree.remote import Remote, encode_remote
 from deal_hw.drivers.unitree.rpc import Request, Response, decode_request, encode_response
+from deal_hw.robot import Robot
 from deal_hw.types import FloatArray
 
 
@@ -229,27 +230,21 @@ class FakeTopics(VirtualTopics):
                 self._arrive(topic, arrived, tick_ns)
 
 
-class FakeBench:
+RobotT = TypeVar("RobotT", bound=Robot)
+
+
+class TopicBench(Generic[RobotT]):
     """A fake robot, its driver, and the topics between them.
 
     Attributes:
-        clock: The clock that everybody shares.
-        device: The robot.
         topics: The wire.
         robot: The driver, not connected.
-
-    Args:
-        kind: The driver.
-        settings: Arguments of :class:`FakeGo2`.
     """
 
-    def __init__(self, kind: type[Go2Robot] = Go2Robot, **settings: Any) -> None:
-        self.clock = VirtualClock(5_000_000_000)
-        self.device = FakeGo2(**{"on_stand": kind.description.floating_base is None, **settings})
-        self.topics = FakeTopics(self.device, self.clock)
-        self.robot = kind(self.topics, self.clock)
+    topics: FakeTopics
+    robot: RobotT
 
-    def armed(self) -> Go2Robot:
+    def armed(self) -> RobotT:
         """Return the driver, connected, homed and armed."""
         self.robot.connect()
         self.robot.home(10.0)
@@ -264,3 +259,22 @@ class FakeBench:
             return change(payload) if topic == topics.LOW_STATE and pending and pending.pop() else (payload,)
 
         self.topics.tamper = tamper
+
+
+class FakeBench(TopicBench[Go2Robot]):
+    """A fake robot, its driver, and the topics between them.
+
+    Attributes:
+        clock: The clock that everybody shares.
+        device: The robot.
+
+    Args:
+        kind: The driver.
+        settings: Arguments of :class:`FakeGo2`.
+    """
+
+    def __init__(self, kind: type[Go2Robot] = Go2Robot, **settings: Any) -> None:
+        self.clock = VirtualClock(5_000_000_000)
+        self.device = FakeGo2(**{"on_stand": kind.description.floating_base is None, **settings})
+        self.topics = FakeTopics(self.device, self.clock)
+        self.robot = kind(self.topics, self.clock)
