@@ -207,7 +207,7 @@ def table(settings: FirstAnswer) -> RowTable:
 
     run = partial(run_cell, real=settings.real, budget=settings.budget, threads=settings.threads)
     chosen = [(name, seed) for seed in seeds for name in problems if name not in REAL or seed == seeds[0]]
-    cells = Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
+    cells = Cells(names=KEY, run=run, args=[(cell, cell) for cell in chosen])
     return RowTable(cells=cells, line=line, summary=printed(summary))
 
 

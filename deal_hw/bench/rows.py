@@ -9,15 +9,17 @@ import platform
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
-from deal_hw.errors import DatasetError, DealHwError, shown
+from deal_hw.errors import DatasetError, DealHwError, TaskLostError, shown
 from deal_hw.reading import read_json
+from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray
 
 FORMAT = "deal_hw.bench/1"
@@ -31,11 +33,17 @@ class Cells:
 
     Attributes:
         names: Fields of a row that identify it.
-        runs: For each cell the values of these fields, and the function that runs it.
+        run: Runs a cell from its arguments; bound to it is what all cells share.
+        args: For each cell the values of these fields, and the arguments.
+        tasks: Does the cells: one after the other here, or in workers.
+        bench: Name of the bench, for the rows of cells whose workers ended.
     """
 
     names: Sequence[str]
-    runs: Sequence[tuple[tuple[Any, ...], Callable[[], Row]]]
+    run: Callable[..., Row]
+    args: Sequence[tuple[tuple[Any, ...], tuple[Any, ...]]]
+    tasks: TaskMap = field(default_factory=InThisProcess)
+    bench: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,29 +82,53 @@ def run_cells(
 ) -> list[Row]:
     """Run the cells without a valid row in a file, writing the file after each; return all rows.
 
+    Rows are written in the order of the cells, in whichever order they end. A Ctrl-C ends the cells that have
+    begun; the rows of those that have ended are kept.
+
     Args:
         cells: The cells.
         out: File of the rows; the CSV is beside it.
-        after: Called after each cell with its number, such as "2/10", its row and all rows.
+        after: Called after each cell with the number of those that are done, such as "2/10", its row and all
+            rows.
         program: Name of the command, for the file's head.
 
     Raises:
         DatasetError: The file holds something else.
+        ClusterError: The workers cannot be used.
     """
-    rows = load_rows(out)
+    earlier = rows = load_rows(out)
 
     def key(row: Row) -> tuple[Any, ...]:
         return tuple(row.get(name, "") for name in cells.names)
 
-    done = {key(row) for row in rows if not row["error"] and not row.get("skipped")}
-    for number, (cell, run) in enumerate(cells.runs, start=1):
-        if cell in done:
-            continue
-        row = run()
-        rows = [r for r in rows if key(r) != cell] + [row]
-        save_rows(out, rows, program)
-        after(f"{number}/{len(cells.runs)}", row, rows)
+    valid = {key(row) for row in rows if not row["error"] and not row.get("skipped")}
+    missing = [(cell, args) for cell, args in cells.args if cell not in valid]
+    if not missing:
+        return rows
+
+    def lost(cell: tuple[Any, ...], why: TaskLostError) -> Row:
+        # The other cells still run.
+        head = {"bench": cells.bench, **dict(zip(cells.names, cell, strict=True))}
+        return {**head, "error": f"{type(why).__name__}: {why}"}
+
+    found: dict[int, Row] = {}
+    with cells.tasks as tasks, contextlib.ExitStack() as stack:
+        # A cell that has ended is in the file before the next one is asked for.
+        run = partial(_run_cell, cells.run)
+        ended = stack.enter_context(
+            contextlib.closing(tasks.completed(run, missing, lambda spec, why: lost(spec[0], why)))
+        )
+        for index, row in ended:
+            found[index] = row
+            made = {missing[i][0] for i in found}
+            rows = [row for row in earlier if key(row) not in made] + [found[i] for i in sorted(found)]
+            save_rows(out, rows, program)
+            after(f"{len(cells.args) - len(missing) + len(found)}/{len(cells.args)}", row, rows)
     return rows
+
+
+def _run_cell(run: Callable[..., Row], spec: tuple[tuple[Any, ...], tuple[Any, ...]]) -> Row:
+    return run(*spec[1])
 
 
 @dataclass(frozen=True, slots=True)

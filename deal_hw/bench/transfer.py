@@ -128,14 +128,16 @@ def table(settings: Transfer) -> RowTable:
         threads=settings.threads,
         say=silent if settings.quiet else print_now,
     )
-    runs = [
+    args = [
         (
             (one.task, seed, method, one.steps, one.seconds, _base_name(one), *budget),
-            partial(run, one, seed, method),
+            (one, seed, method),
         )
         for one, seed, method in itertools.product(common, settings.seeds, methods)
     ]
-    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw_transfer)
+    return RowTable(
+        cells=Cells(names=KEY, run=run, args=args), line=line, summary=print_summary, draw=draw_transfer
+    )
 
 
 def print_now(text: str) -> None:

@@ -1,0 +1,200 @@
+"""Tasks in workers of Ray, on this machine or on a cluster.
+
+Ray is loaded when workers are started. The settings of this module hold for every start: one thread of the
+numeric libraries a worker, no dashboard, no statistics to anybody. Token authentication stays as Ray has it,
+which is on.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from typing_extensions import Self
+
+from deal_hw.errors import ClusterError, TaskLostError, short
+from deal_hw.scale.ray_errors import explained, needs_ray, reachable
+from deal_hw.scale.ray_nodes import check_nodes
+from deal_hw.task_map import InThisProcess, TaskMap
+
+if TYPE_CHECKING:
+    from deal_hw.scale.where import Where
+
+S = TypeVar("S")
+R = TypeVar("R")
+
+RETRIES: Final = 3
+"""Times that a task is begun again after its worker ended: killed, or its machine was lost."""
+
+ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Small matrices: a second thread only waits, and takes the processor of another worker."""
+
+QUIET: Final = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    # Else Ray begins a task whose machine has no memory left again and again.
+    "RAY_task_oom_retries": str(RETRIES),
+    # Without it Ray warns of a change that concerns GPUs.
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+HERE: Final = {
+    # Despite its name it holds on Linux: without it Ray takes the address of the network card for 127.0.0.1,
+    # and its servers listen on all addresses.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    # Else workers have niceness 15: on a machine that others use, too, they get next to nothing.
+    "RAY_worker_niceness": "0",
+}
+"""Settings of workers on this machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Common:
+    """What all tasks of a call share: sent to each machine once.
+
+    Attributes:
+        function: The function, with what is bound to it.
+        argv: Command line of the process that asked, which rows name.
+        folder: Its working directory, in which relative paths are meant.
+    """
+
+    function: Callable[[Any], Any]
+    argv: list[str]
+    folder: Path
+
+
+def _do(common: _Common, spec: Any) -> Any:
+    """Do a task in a worker."""
+    sys.argv[:] = common.argv
+    if common.folder.is_dir():
+        os.chdir(common.folder)
+    return common.function(spec)
+
+
+class RayTasks(TaskMap):
+    """Tasks in Ray's workers.
+
+    Args:
+        where: This machine, or the address of a cluster.
+        threads: Processors that each task takes.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+    """
+
+    def __init__(self, where: Where, threads: int = 1) -> None:
+        needs_ray()
+        self._where, self._threads = where, threads
+
+    def __reduce__(self) -> tuple[type[InThisProcess], tuple[()]]:
+        """A task that has tasks itself does them in its own process."""
+        return InThisProcess, ()
+
+    def __enter__(self) -> Self:
+        """Start the workers, or find the cluster, and check that its nodes compute as this machine does.
+
+        Raises:
+            ClusterError: That is not possible; the message has the remedy.
+        """
+        here = self._where.address is None
+        if self._where.address is not None:
+            reachable(self._where.address)
+        for name, value in {**QUIET, **(HERE if here else {})}.items():
+            os.environ.setdefault(name, value)
+        import ray
+
+        logging.getLogger("ray").setLevel(logging.ERROR)
+        options: dict[str, Any] = {"address": self._where.address}
+        if here:
+            workers = self._where.workers or max(_processors() // self._threads, 1)
+            options = {
+                "address": "local",
+                "num_cpus": workers * self._threads,
+                "include_dashboard": False,
+                "_node_ip_address": "127.0.0.1",
+            }
+        with explained(self._where):
+            ray.init(
+                **options,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                runtime_env={"env_vars": ONE_THREAD},
+            )
+        try:
+            if here:
+                _check_loopback(ray.nodes())
+            check_nodes(self._threads)
+        except BaseException:
+            ray.shutdown()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the cluster; workers that were started here end."""
+        import ray
+
+        ray.shutdown()
+
+    def completed(
+        self,
+        function: Callable[[S], R],
+        specs: Sequence[S],
+        lost: Callable[[S, TaskLostError], R] | None = None,
+    ) -> Generator[tuple[int, R], None, None]:
+        """See :meth:`TaskMap.completed`. Where the iteration is left early, the other tasks are cancelled."""
+        import ray
+
+        task = ray.remote(max_retries=RETRIES, num_cpus=self._threads)(_do)
+        with explained(self._where):
+            common = ray.put(_Common(function, list(sys.argv), Path.cwd()))
+            pending = {task.remote(common, spec): index for index, spec in enumerate(specs)}
+        try:
+            while pending:
+                (done,), _ = ray.wait(list(pending), num_returns=1)
+                index = pending[done]
+                found = self._result(done, specs[index], lost)
+                del pending[done]
+                yield index, found
+        finally:
+            for left in pending:
+                ray.cancel(left, force=True)
+
+    def _result(self, done: Any, spec: S, lost: Callable[[S, TaskLostError], R] | None) -> R:
+        """Return a task's result, raising what it has raised."""
+        import ray
+
+        try:
+            result: R = ray.get(done)
+        except ray.exceptions.RayTaskError as err:
+            raise err.cause from err
+        except ray.exceptions.RayError as err:
+            why = TaskLostError(
+                f"the worker of a task ended before the task, {1 + RETRIES} times "
+                f"({short(str(err).partition(chr(10))[0])}); look whether its machine has enough memory, or "
+                "give each task more processors (--threads), so that fewer run at once"
+            )
+            if lost is None:
+                raise why from err
+            return lost(spec, why)
+        return result
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _check_loopback(nodes: Sequence[dict[str, Any]]) -> None:
+    """Refuse workers that the network can reach; these are for this machine only."""
+    for node in nodes:
+        address = str(node["NodeManagerAddress"])
+        if not address.startswith("127."):
+            raise ClusterError(
+                f"Ray listens on {address}, not on this machine's own 127.0.0.1 alone, since it was loaded "
+                "before deal-hw set it up; set RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0 before Python starts"
+            )

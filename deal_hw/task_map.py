@@ -1,0 +1,80 @@
+"""Independent tasks, and where they run: in this process, or in workers on other machines.
+
+A task is a function of one specification, which names every seed. So its result does not depend on the worker
+that does it, on the number of workers or on the order, and a task whose worker was lost can be done again.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Generator, Sequence
+from types import TracebackType
+from typing import TypeVar
+
+from typing_extensions import Self
+
+from deal_hw.errors import TaskLostError
+
+S = TypeVar("S")
+R = TypeVar("R")
+
+
+class TaskMap(abc.ABC):
+    """Applies a function to specifications that do not depend on each other.
+
+    A context manager: workers are started at its beginning and ended at its end.
+    """
+
+    here = False
+    """Whether tasks run in this process, so that they share its memory."""
+
+    @abc.abstractmethod
+    def completed(
+        self,
+        function: Callable[[S], R],
+        specs: Sequence[S],
+        lost: Callable[[S, TaskLostError], R] | None = None,
+    ) -> Generator[tuple[int, R], None, None]:
+        """Yield the index and the result of each task as it ends; closed early, it cancels the others.
+
+        Args:
+            function: Pure: its result depends on the specification alone. What all tasks have in common, such
+                as recordings, is bound to it (``functools.partial``) and sent once.
+            specs: One small value for each task.
+            lost: Makes the result of a task that could not be done since its workers ended; None: that is
+                raised.
+
+        Raises:
+            TaskLostError: The workers of a task ended, each time that it was begun.
+            ClusterError: The function, with what is bound to it, cannot be sent to the workers.
+        """
+
+    def map(self, function: Callable[[S], R], specs: Sequence[S]) -> list[R]:
+        """Return the results in the order of the specifications. See :meth:`completed`."""
+        found = dict(self.completed(function, specs))
+        return [found[index] for index in range(len(specs))]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the workers; what they have not finished is lost."""
+        return None
+
+
+class InThisProcess(TaskMap):
+    """Does one task after the other, in order."""
+
+    here = True
+
+    def completed(
+        self,
+        function: Callable[[S], R],
+        specs: Sequence[S],
+        lost: Callable[[S, TaskLostError], R] | None = None,
+    ) -> Generator[tuple[int, R], None, None]:
+        """See :meth:`TaskMap.completed`; each task begins when its result is asked for."""
+        for index, spec in enumerate(specs):
+            yield index, function(spec)
