@@ -41,11 +41,13 @@ Quantity = Literal[
     "command",
     "clock",
     "joint_target",
+    "obstacle",
 ]
 Observation = npt.NDArray[np.float32]
 
 AXES = ("x", "y", "z")
 CLOCK_AXES = ("sin", "cos")
+OBSTACLE_AXES = ("distance", "height")
 BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", "height")
 """Observed quantities of a floating base, in the base's frame: the directions of gravity and of the world's x
 axis (unit vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
@@ -53,11 +55,11 @@ WORLD_QUANTITIES = ("place", "target_rotation")
 """Observed quantities of a floating base, in the world: its position [m], which no sensor of a robot
 reports, and the rotation vector that turns it to the target orientation [rad]."""
 BASE_SIZE = 6
-
 VERDICT: Final = "calibration_verdict"
-"""Key in a policy's training record: the colour of its calibration's verdict, or of its import's."""
 IMPORTED: Final = "imported"
-"""Key in a policy's training record: how another trainer's policy was imported."""
+CLIMBED: Final = "climbed_m"
+"""Keys in a training record: the verdict of a calibration or an import; the import; the highest platform that
+most robots climbed in training [m]."""
 MAX_DELAY: Final = 100
 """Most control periods that an observation may look back: 2 s at 50 Hz."""
 MAX_TERMS: Final = 4096
@@ -97,10 +99,12 @@ class ObservationTerm:
         quantity: The observed quantity. Positions are relative to the default pose; "action" is a former
             action; "joint_target" is the position that a joint is to reach, relative to the default pose.
             "command" is the requested velocity of the base: x and y [m/s], z [rad/s]. "clock" is a
-            phase that turns ``clock_hz`` times a second from the first observation on. Joint targets are
-            the same at all delays; so are command and clock, unless the spec says ``delayed_commands``.
+            phase that turns ``clock_hz`` times a second from the first observation on. "obstacle" is what
+            the operator says of a platform ahead: its height, and its distance, which the commanded velocity
+            makes smaller. Joint targets and obstacle are the same at all delays; so are command and clock,
+            unless the spec says ``delayed_commands``.
         joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z; for the
-            clock "sin" or "cos".
+            clock "sin" or "cos"; for the obstacle "distance" or "height".
         scale: The factor applied to it [1/unit].
         delay: How many control periods ago, at most :data:`MAX_DELAY`; 0 is now (for actions 1 is the last
             one).
@@ -135,6 +139,8 @@ class ObservationTerm:
             return ("z",)
         if self.quantity == "clock":
             return CLOCK_AXES
+        if self.quantity == "obstacle":
+            return OBSTACLE_AXES
         return AXES if self.quantity in (*BASE_QUANTITIES, *WORLD_QUANTITIES, "command") else ()
 
 
@@ -401,6 +407,8 @@ class ObservationBuilder:
         target: The requested orientation of the base as a rotation vector around the identity, (..., 3)
             [rad]; zero at first.
         joint_target: The positions that the joints are to reach, (..., J); the default pose at first.
+        obstacle: Distance and height of a platform ahead, as the operator says, (..., 2) [m]; zero at first
+            and where nothing is said. After each observation the distance is less by the commanded way.
     """
 
     def __init__(self, spec: PolicySpec, batch_shape: tuple[int, ...] = ()) -> None:
@@ -416,6 +424,7 @@ class ObservationBuilder:
         self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.target: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self.joint_target: FloatArray = np.broadcast_to(self._default, (*batch_shape, J)).copy()
+        self.obstacle: FloatArray = np.zeros((*batch_shape, len(OBSTACLE_AXES)))
         self.clock: FloatArray = np.zeros(batch_shape)
         # Without delays of their own, command and clock are read as they are now.
         memory = depth if spec.delayed_commands else 1
@@ -486,6 +495,8 @@ class ObservationBuilder:
             values = self._memory(read.quantity)[read.delay, ..., read.column]
             found[..., read.entry] = read.scale * np.moveaxis(values, 0, -1)
         self.clock = (self.clock + self.spec.clock_hz / self.spec.control_rate_hz) % 1.0
+        way = self.command[..., 0] / self.spec.control_rate_hz
+        self.obstacle[..., 0] -= np.where(self.obstacle[..., 1] != 0.0, way, 0.0)
         return found
 
     def _hands(self) -> FloatArray:
@@ -521,6 +532,8 @@ class ObservationBuilder:
                 return self._clock
             case "joint_target":
                 return np.asarray((self.joint_target - self._default)[None])
+            case "obstacle":
+                return self.obstacle[None]
             case "place" | "target_rotation":
                 return self._world
             case "gravity" | "heading" | "angular_velocity" | "linear_velocity" | "height":
@@ -548,7 +561,7 @@ def _reads(spec: PolicySpec) -> list[_Read]:
             np.array(
                 [
                     0
-                    if quantity == "joint_target"
+                    if quantity in ("joint_target", "obstacle")
                     or (quantity in ("command", "clock") and not spec.delayed_commands)
                     else spec.observation[i].delay
                     for i in found

@@ -28,6 +28,12 @@ def rotated(orientation: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors + 2.0 * (orientation[:, :1] * turned + np.cross(axis, turned)))
 
 
+def heading(orientation: FloatArray) -> FloatArray:
+    """Return the angle of a base's x axis seen from above, (...) [rad], for orientations wxyz, (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(orientation), -1, 0)
+    return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
 def rotation_vector(quaternion: FloatArray) -> FloatArray:
     """Return the rotation vector, (3,) [rad], of an orientation, (4,), a unit quaternion wxyz."""
     w, v = float(quaternion[0]), quaternion[1:]

@@ -64,8 +64,17 @@ class Checkpoint:
                 "give more --steps, or deploy its policy"
             )
 
-    def part(self, part: str, like: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def part(
+        self, part: str, like: Mapping[str, torch.Tensor], added: tuple[int, int] | None = None
+    ) -> dict[str, torch.Tensor]:
         """Return the tensors of a part, which must have the names and shapes of ``like``.
+
+        Args:
+            part: Name of the part, as ``actor``.
+            like: The tensors of this training's part.
+            added: Where this training observes more than the checkpoint's: the first new input of the
+                network and the number of new terms there. Further new inputs come last. New inputs have
+                weight zero at first, so the network does what it did. None: nothing may be new.
 
         Raises:
             CheckpointError: They do not, or a number is not finite.
@@ -75,6 +84,11 @@ class Checkpoint:
             for name, value in self.tensors.items()
             if name.startswith(part + ".")
         }
+        if added is not None:
+            found = {
+                name: _widened(value, like[name], *added) if name in like else value
+                for name, value in found.items()
+            }
         wanted = {name: tuple(value.shape) for name, value in like.items()}
         have = {name: tuple(value.shape) for name, value in found.items()}
         if have != wanted:
@@ -87,6 +101,24 @@ class Checkpoint:
                 f"{self.path}: the {part} holds a number that is not finite; give another checkpoint"
             )
         return found
+
+
+def _widened(weight: torch.Tensor, like: torch.Tensor, first: int, count: int) -> torch.Tensor:
+    """Return a first layer's weight, (H, I), with zeros for new inputs; another tensor unchanged.
+
+    Args:
+        weight: The weight.
+        like: One of the wanted shape.
+        first: The first new input.
+        count: Number of new inputs there; the others come last.
+    """
+    wider = weight.dim() == like.dim() == 2 and len(weight) == len(like)
+    if not wider or like.shape[1] < weight.shape[1] + count:
+        return weight
+    found = torch.zeros_like(like)
+    found[:, :first] = weight[:, :first]
+    found[:, first + count : weight.shape[1] + count] = weight[:, first:]
+    return found
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint, layout: PolicySpec) -> None:
@@ -104,6 +136,10 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, layout: PolicySpec) -> 
 
 def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
     """Read a checkpoint of a policy with this layout.
+
+    The layout may observe more: further terms after those of the checkpoint. ``notes["observed"]`` is the
+    number of terms that the checkpoint's policy observes, and ``notes["same_task"]`` whether it observes all
+    of them, in the same range of requested velocities.
 
     Raises:
         CheckpointError: The file is missing, is no checkpoint, or has another layout.
@@ -124,11 +160,16 @@ def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
         raise CheckpointError(f"{path} is damaged: its layout is {err}; give another checkpoint") from err
     wrong = [
         name
-        for name in ("robot", "joint_names", "observation", "action_scale", "control_rate_hz", "clock_hz")
+        for name in ("robot", "joint_names", "action_scale", "control_rate_hz", "clock_hz")
         if getattr(found, name) != getattr(layout, name)
     ]
+    observed = len(found.observation)
+    if found.observation != layout.observation[:observed]:
+        wrong.append("observation")
     if wrong:
         raise CheckpointError(
             f"{path} is of a policy with another {', '.join(wrong)}; give a checkpoint of the same task"
         )
-    return Checkpoint(tensors=tensors, notes={**notes, "trained_under": found.trained_under}, path=path)
+    same = observed == len(layout.observation) and found.command_range == layout.command_range
+    notes |= {"trained_under": found.trained_under, "observed": observed, "same_task": same}
+    return Checkpoint(tensors=tensors, notes=notes, path=path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from deal_hw.parameters import Parameter, ParameterDistribution
 from deal_hw.policies.locomotion import (
     ANGULAR,
     GRAVITY,
-    HEIGHT,
     LINEAR,
     LocomotionEnv,
     base,
@@ -157,7 +156,11 @@ def walk_spec(
     terms += [*vector_terms("command", 1.0), *(ObservationTerm("clock", axis, 1.0) for axis in CLOCK_AXES)]
     terms += joint_terms(description, 0.05)
     scale = [ACTION_SCALE_RAD[name.split("_")[1]] for name in description.actuated]
-    more = {"clock_hz": task.clock_hz, "command_range": task.command_range}
+    # A robot that was also trained to stand may be asked for less than the slowest velocity.
+    reach = [
+        (min(low, 0.0), max(high, 0.0)) if task.standing else (low, high) for low, high in task.command_range
+    ]
+    more = {"clock_hz": task.clock_hz, "command_range": tuple(reach)}
     return locomotion_spec(description, terms, scale, trained_under, **more)
 
 
@@ -190,6 +193,9 @@ class Go2Env(LocomotionEnv):
         ConfigurationError: The description does not name four feet.
     """
 
+    task_type: ClassVar[type[WalkTask]] = WalkTask
+    """Class of the settings; its defaults where none are given."""
+
     def __init__(
         self,
         description: RobotDescription,
@@ -199,7 +205,7 @@ class Go2Env(LocomotionEnv):
         task: WalkTask | None = None,
         threads: int | None = 1,
     ) -> None:
-        self.task = task = task or WalkTask()
+        self.task = task = task or self.task_type()
         self.failure_reward = -task.fall_cost
         if len(description.feet) != len(TROT):
             raise ConfigurationError(
@@ -207,7 +213,7 @@ class Go2Env(LocomotionEnv):
                 f"needs {len(TROT)}: give the driver's description"
             )
         self._filter = SafetyFilter(description)
-        layout = walk_spec(description, distribution.digest(), task=task)
+        layout = self.spec_of(description, distribution.digest(), task)
         zeros = np.zeros((count, len(layout.actuated)))
 
         def every(values: Sequence[float]) -> FloatArray:
@@ -242,6 +248,11 @@ class Go2Env(LocomotionEnv):
         self._feet_before = np.full((count, len(TROT), 3), np.nan)
         self._hips = [i for i, name in enumerate(description.joint_names) if "hip" in name]
 
+    @staticmethod
+    def spec_of(description: RobotDescription, trained_under: str, task: WalkTask) -> PolicySpec:
+        """Return the layout of observation and action."""
+        return walk_spec(description, trained_under, task)
+
     @property
     def command(self) -> FloatArray:
         """The commanded velocity of each member's base: x, y [m/s] and yaw rate [rad/s], (N, 3)."""
@@ -271,6 +282,10 @@ class Go2Env(LocomotionEnv):
         self._sent[where] = self._default
         # After a state is set, its feet are known one step later; until then none slips.
         self._feet_before[where] = np.nan
+
+    def base_height(self, position: FloatArray) -> FloatArray:
+        """Return the heights of bases over their ground, (N,) [m], at coordinates (N, C)."""
+        return np.asarray(position[:, 2])
 
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
         """Draw settled robots with a small motion of their bases."""
@@ -308,7 +323,7 @@ class Go2Env(LocomotionEnv):
         """Return the true velocity and height of the bases, and the heights of the feet, (N, P)."""
         seen = base(self.loop.position, self.loop.velocity)
         feet = 10.0 * (self._feet_now()[..., 2] - self._radius)
-        return np.hstack([seen[:, LINEAR], 4.0 * seen[:, [HEIGHT]], feet])
+        return np.hstack([seen[:, LINEAR], 4.0 * self.base_height(self.loop.position)[:, None], feet])
 
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
@@ -321,7 +336,7 @@ class Go2Env(LocomotionEnv):
         moving = np.any(command != 0.0, axis=1)
         feet = self._feet_now()
         wanted = self._wanted_heights() * moving[:, None]
-        gait = 1.0 - np.abs(feet[..., 2] - self._radius - wanted).mean(axis=1) / task.swing_m
+        gait = 1.0 - self._foot_errors(feet[..., 2] - self._radius - wanted).mean(axis=1)
         speed = (feet - self._feet_before)[..., :2] * self.description.control_rate_hz
         slip = np.nan_to_num(np.square(speed).sum(axis=2) * (wanted == 0.0)).sum(axis=1)
         self._feet_before = feet.copy()
@@ -330,7 +345,8 @@ class Go2Env(LocomotionEnv):
         reward += task.turn_weight * np.exp(-turn / task.turn_width)
         reward += task.gait_weight * gait
         reward -= task.tilt_weight * np.square(seen[:, GRAVITY][:, :2]).sum(axis=1)
-        reward -= task.height_weight * np.square(seen[:, HEIGHT] - task.height_m)
+        height = self.base_height(position)
+        reward -= task.height_weight * np.square(height - task.height_m)
         reward -= task.bounce_weight * np.square(linear[:, 2])
         reward -= task.roll_weight * np.square(angular[:, :2]).sum(axis=1)
         reward -= task.slip_weight * slip
@@ -346,7 +362,7 @@ class Go2Env(LocomotionEnv):
             velocity_error_m_s=np.nanmean(np.sqrt(error)),
             yaw_error_rad_s=np.nanmean(np.sqrt(turn)),
             clipped=np.any(np.abs(self._cut) > 1e-9, axis=1).mean(),
-            height_m=np.nanmean(seen[:, HEIGHT]),
+            height_m=np.nanmean(height),
             gait=np.nanmean(gait),
             slip=slip.mean(),
         )
@@ -356,7 +372,7 @@ class Go2Env(LocomotionEnv):
         """Return which robots fell."""
         seen = base(position, velocity)
         tilted = -seen[:, GRAVITY][:, 2] < self.task.largest_tilt
-        return np.asarray(tilted | (seen[:, HEIGHT] < self.task.lowest_m))
+        return np.asarray(tilted | (self.base_height(position) < self.task.lowest_m))
 
     def step(
         self, actions: FloatArray
@@ -402,6 +418,10 @@ class Go2Env(LocomotionEnv):
 
     def _feet_now(self) -> FloatArray:
         return np.asarray(self._places[:, self._feet])
+
+    def _foot_errors(self, error: FloatArray) -> FloatArray:
+        """Return the unitless errors of the feet's heights, (N, 4), of those in [m]."""
+        return np.asarray(np.abs(error) / self.task.swing_m)
 
     def _wanted_heights(self) -> FloatArray:
         """Return the wanted heights of the feet, (N, 4) [m]: half a sine in the first part of a step."""

@@ -173,6 +173,7 @@ def trained_spec(env: ServoVectorEnv, algorithm: str, config: Any, seed: int, **
     }
     training = {
         **env.layout.training,
+        **env.reached(),
         "algorithm": algorithm,
         "members": env.num_envs,
         "seed": seed,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -241,15 +242,26 @@ class _Learner:
             "learning_rate": self._ppo.learning_rate,
             "mean_return": self.mean_return,
             "hidden": list(self._config.hidden),
+            "progress": self._env.progress(),
         }
         return Checkpoint(tensors=tensors, notes=notes)
 
     def load(self, found: Checkpoint, *, whole: bool) -> None:
         """Load the networks and, with ``whole``, the state of the training."""
         found.check(trainer=PpoTrainer.name, hidden=list(self._config.hidden))
+        observed = int(found.notes["observed"])
+        more = len(self._env.layout.observation) - observed
+        added = None if whole else (observed, more)
         for part, model in (("actor", self._actor), ("critic", self._critic)):
-            model.load_state_dict(found.part(part, model.state_dict()))
+            model.load_state_dict(found.part(part, model.state_dict(), added))
+        if found.notes["same_task"]:
+            self._env.go_on(found.notes.get("progress", {}))
         if not whole:
+            if not found.notes["same_task"]:
+                # What is well learnt is hardly explored any more, and another task needs it again.
+                spread: Any = self._actor.distribution
+                with torch.no_grad():
+                    spread.log_std_param.fill_(math.log(self._config.exploration))
             return
         state: dict[int, dict[str, torch.Tensor]] = {}
         for name, value in found.tensors.items():

@@ -161,7 +161,7 @@ class ReachEnv(ServoVectorEnv):
 
     def _off(self, position: FloatArray) -> FloatArray:
         """Return how far the joints really are from the pose to reach, (N, A) [rad]."""
-        true = position - self.loop.batch.bias
+        true = self.loop.batch.true_joints(position)
         return np.asarray((true - self._builder.joint_target)[:, self._joints])
 
     def _aim(self, where: BoolArray, rng: np.random.Generator) -> None:

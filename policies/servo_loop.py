@@ -6,6 +6,8 @@ by frame; the loop below it is :class:`~deal_hw.sim.engine.closed_loop.ClosedLoo
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -14,7 +16,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, reported
-from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -33,6 +35,7 @@ class ServoLoop:
         sensor: Sensor model of the reported state; the description's by default.
         threads: Threads of the physics; None for all CPUs.
         step_s: Physics step [s]; the device period by default.
+        scene: Returns the model to simulate, made from the robot's own, such as one with a terrain.
 
     Attributes:
         reported_position: Reported positions, (N, C): a floating base, if any, then the joints. The sensor
@@ -49,11 +52,13 @@ class ServoLoop:
         sensor: SensorModel | None = None,
         threads: int | None = 1,
         step_s: float | None = None,
+        scene: Callable[[RobotModel], RobotModel] | None = None,
     ) -> None:
         self.description = description
         self.count = count
         period_s = 1.0 / description.device_rate_hz
-        self.batch = ServoBatch(load_model(description, step_s or period_s), space, count, threads)
+        robot = load_model(description, step_s or period_s)
+        self.batch = ServoBatch(robot if scene is None else scene(robot), space, count, threads)
         self._theta = np.repeat(space.nominal[None], count, axis=0)
         self._sensor = description.sensor if sensor is None else sensor
         self._window = _window_periods(self._sensor, description)

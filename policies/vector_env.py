@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import copy
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
+from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray
 
 
@@ -60,6 +61,20 @@ class TaskKnowledge:
     def feedback(self) -> FloatArray:
         """Return a fixed linear part of the policy, (A, O), that PPO adds to its network; zero by default."""
         return np.zeros((len(self.layout.actuated), len(self.layout.observation)))
+
+    def reached(self) -> dict[str, Any]:
+        """Return what training reached, plain JSON values for the policy's record; nothing by default."""
+        return {}
+
+    def progress(self) -> dict[str, Any]:
+        """Return what a training that goes on from here must know of the task, plain JSON values.
+
+        Such as how hard it has become. Nothing by default.
+        """
+        return {}
+
+    def go_on(self, progress: Mapping[str, Any]) -> None:
+        """Take over the :meth:`progress` of a former training of this task; nothing by default."""
 
     def mirror(self) -> tuple[Mirror, Mirror] | None:
         """Return the reflections of observation and action of a robot that is symmetric; None by default.
@@ -129,6 +144,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
             sensor=sensor,
             threads=threads,
             step_s=step_s,
+            scene=self.scene,
         )
         self._builder = ObservationBuilder(layout, (count,))
         self._elapsed = np.zeros(count, dtype=np.int64)
@@ -139,6 +155,10 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
     @abc.abstractmethod
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
         """Draw positions and velocities at the start of M episodes, (M, C) each."""
+
+    def scene(self, robot: RobotModel) -> RobotModel:
+        """Return the model to simulate, made from the robot's own; by default that one."""
+        return robot
 
     def start_setpoint(self) -> FloatArray | None:
         """Return the first set-point and targets of episodes, (A,); None for each member's position."""

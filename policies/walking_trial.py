@@ -23,14 +23,10 @@ from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import AXES, Observation, ObservationBuilder, PolicySpec, base_features
 from deal_hw.types import FloatArray, JointCommand
 
-SECONDS: Final = 6.0
-"""Length of a walk [s]."""
 UNCOUNTED_S: Final = 1.5
 """First part of a walk, in which the robot gets up to speed; only falls count there [s]."""
 SETTLING_S: Final = 1.0
 """Time in which the robots settle in their default pose before [s]."""
-ROBOTS: Final = 4
-"""Robots for each command; they differ in latency and noise."""
 SPEED: Final = 0.5
 TURN: Final = 0.6
 """Commands of the trial, where the training range has them [m/s, rad/s]."""
@@ -47,10 +43,24 @@ LEAST_FOLLOWED: Final = 0.3
 """Least share of a command that is followed; standing still has 0."""
 LEAST_UP: Final = 0.02
 """Time up may be this much shorter than that of standing still, as share of the walk."""
-SEED: Final = 0
 
 _GRAVITY_Z, _LINEAR, _TURN_RATE = 2, slice(9, 11), 8
 """Columns of :func:`deal_hw.policy.base_features`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WalkingTrial:
+    """Size of a trial.
+
+    Attributes:
+        seconds: Length of a walk [s].
+        robots: Robots for each command; they differ in latency and noise.
+        seed: Seeds latency and noise.
+    """
+
+    seconds: float = 6.0
+    robots: int = 4
+    seed: int = 0
 
 
 class TriedPolicy(Protocol):
@@ -96,11 +106,13 @@ class WalkingReport:
         walks: The policy at each command.
         standing: The same of robots that hold their default pose.
         clipped: Share of the time in which the safety filter changed a target.
+        seconds: Length of each walk [s].
     """
 
     walks: tuple[WalkAtCommand, ...]
     standing: tuple[WalkAtCommand, ...]
     clipped: float
+    seconds: float
 
     @property
     def up(self) -> float:
@@ -114,8 +126,8 @@ class WalkingReport:
             name = describe_command(walk.command)
             if walk.up < still.up - LEAST_UP:
                 found.append(
-                    f"{name}: it falls after {walk.up * SECONDS:.1f} s of {SECONDS:g} s (mean); a robot that "
-                    f"stands still stays up for {still.up * SECONDS:.1f} s"
+                    f"{name}: it falls after {walk.up * self.seconds:.1f} s of {self.seconds:g} s (mean); "
+                    f"a robot that stands still stays up for {still.up * self.seconds:.1f} s"
                 )
             elif any(walk.command) and walk.followed < LEAST_FOLLOWED:
                 reached = ", ".join(f"{value:.2f}" for value in walk.velocity)
@@ -124,6 +136,10 @@ class WalkingReport:
                     f"{walk.followed:.0%} of the command; standing still 0%, needed are {LEAST_FOLLOWED:.0%}"
                 )
         return tuple(found)
+
+
+TRIAL: Final = WalkingTrial()
+"""The trial of an import: measured to find nearly all exchanged joints and signs (docs/measured)."""
 
 
 def can_try(spec: PolicySpec, description: RobotDescription) -> str:
@@ -159,21 +175,25 @@ def describe_command(command: Sequence[float]) -> str:
 
 
 def try_walking(
-    policy: TriedPolicy, description: RobotDescription, *, seed: int = SEED, threads: int | None = None
+    policy: TriedPolicy,
+    description: RobotDescription,
+    trial: WalkingTrial = TRIAL,
+    *,
+    threads: int | None = None,
 ) -> WalkingReport:
     """Let simulated robots walk with a policy, and others stand still.
 
     Args:
         policy: The policy.
         description: The robot, as its driver describes it; :func:`can_try` must allow it.
-        seed: Seeds latency and noise.
+        trial: How many robots walk for how long.
         threads: Threads of the physics; None for all CPUs.
     """
     commands = trial_commands(policy.spec)
-    run = _Run(policy.spec, description, commands, seed, threads)
+    run = _Run(policy.spec, description, commands, trial, threads)
     walks = run.walks(policy)
     clipped = run.clipped
-    return WalkingReport(walks=walks, standing=run.walks(None), clipped=clipped)
+    return WalkingReport(walks=walks, standing=run.walks(None), clipped=clipped, seconds=trial.seconds)
 
 
 class _Run:
@@ -184,16 +204,17 @@ class _Run:
         spec: PolicySpec,
         description: RobotDescription,
         commands: Sequence[tuple[float, float, float]],
-        seed: int,
+        trial: WalkingTrial,
         threads: int | None,
     ) -> None:
-        self._spec, self._description, self._commands, self._seed = spec, description, commands, seed
-        self._wanted = np.repeat(np.array(commands), ROBOTS, axis=0)
+        self._spec, self._description, self._commands = spec, description, commands
+        self._robots, self._seed = trial.robots, trial.seed
+        self._wanted = np.repeat(np.array(commands), trial.robots, axis=0)
         self._count = len(self._wanted)
         self._loop = ServoLoop(description, ParameterSpace([]), self._count, threads=threads)
         self._map = ActionMap.of_robot(spec, description)
         self._filter = SafetyFilter(description)
-        self._ticks = round(SECONDS * description.control_rate_hz)
+        self._ticks = round(trial.seconds * description.control_rate_hz)
         self.clipped = 0.0
 
     def walks(self, policy: TriedPolicy | None) -> tuple[WalkAtCommand, ...]:
@@ -289,9 +310,9 @@ class _Run:
     def _judged(self, lasted: FloatArray, up: BoolArray, velocity: FloatArray) -> tuple[WalkAtCommand, ...]:
         found = []
         for i, command in enumerate(self._commands):
-            mine = slice(i * ROBOTS, (i + 1) * ROBOTS)
+            mine = slice(i * self._robots, (i + 1) * self._robots)
             size = float(np.linalg.norm(command))
-            shares = np.zeros(ROBOTS)
+            shares = np.zeros(self._robots)
             if size:
                 error = np.linalg.norm(velocity[mine] - np.array(command), axis=1)
                 shares = np.where(up[mine], 1.0 - error / size, 0.0)

@@ -19,7 +19,6 @@ goes on where it was.
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 from collections.abc import Sequence
@@ -216,15 +215,19 @@ def main() -> None:
     args = options.parse_args()
     policy = OnnxPolicy(args.policy)
     if args.ends:
-        runs = [
+        walks = [
             (
                 (args.profile, seed, ",".join(f"{v:g}" for v in velocity)),
-                functools.partial(measure_ends, policy, args.profile, seed, velocity, args.ends),
+                (seed, velocity),
             )
             for seed in args.seeds or [None]
             for velocity in VELOCITIES
         ]
-        cells = Cells(names=("profile", "seed", "velocity"), runs=runs)
+
+        def ends(seed: int | None, velocity: tuple[float, float, float]) -> Row:
+            return measure_ends(policy, args.profile, seed, velocity, args.ends)
+
+        cells = Cells(names=("profile", "seed", "velocity"), run=ends, args=walks)
         if args.out is None:
             options.error("--ends needs --out FILE.json, which keeps the rows")
 

@@ -4,10 +4,12 @@
     python tools/train_demo_policy.py ant
     python tools/train_demo_policy.py humanoid --checkpoint runs/base/humanoid.safetensors --hours 1
     python tools/train_demo_policy.py go2
+    python tools/train_demo_policy.py go2 --task canter --start policies/assets/go2_walk.safetensors
+    python tools/train_demo_policy.py go2 --task climb --start policies/assets/go2_walk.safetensors
 
-writes policies/assets/allegro_turn.onnx, ant_udr.onnx, humanoid_walk.onnx or go2_walk.onnx and, beside it,
-the record of its training and of its results on other robots. Task, trainer and settings are those of
-`deal-hw train ROBOT --udr`.
+writes policies/assets/allegro_turn.onnx, ant_udr.onnx, humanoid_walk.onnx, go2_walk.onnx, go2_canter.onnx or
+go2_climb.onnx and, beside it, the record of its training and of its results on other robots. Task, trainer
+and settings are those of `deal-hw train ROBOT --udr`, with `--task` for canter and climb.
 
 `--hours` ends the training after so many processor hours, those of the stopped parts included. The same
 command with `--resume` goes on from the checkpoint, also after a crash. The curve of the return against steps
@@ -44,6 +46,7 @@ from deal_hw.workflows.train import train_policy, udr_distribution
 
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
 FILES = {"allegro": "allegro_turn", "ant": "ant_udr", "go2": "go2_walk", "humanoid": "humanoid_walk"}
+OTHER_TASKS = {("go2", "canter"): "go2_canter", ("go2", "climb"): "go2_climb"}
 POINTS = 100
 """Number of points of a curve over all steps of a training."""
 JUDGED = 256
@@ -129,6 +132,7 @@ def train(
     resume: bool = False,
     start: Path | None = None,
     hours: float = math.inf,
+    task: str = "",
 ) -> OnnxPolicy:
     """Train, judge and write a policy; return it, read back from its file."""
     if checkpoint is not None:
@@ -136,8 +140,9 @@ def train(
     curve = Curve(_curve_file(checkpoint), resume=resume, start=_curve_file(start), hours=hours)
     policy = train_policy(
         robot,
-        udr_distribution(robot),
+        udr_distribution(robot, task),
         path,
+        task=task,
         seed=seed,
         steps=steps,
         members=members,
@@ -150,7 +155,7 @@ def train(
     # The record of a training that crashed is missing, its curve is not.
     record["cpu_seconds"] = 3600 * curve.cpu_hours
     record["curve_before"], record["curve"] = _short(curve.before), _short(curve.points)
-    add_judgement(robot, policy, record, judged)
+    add_judgement(robot, policy, record, judged, task)
     if checkpoint is not None:
         ship_checkpoint(checkpoint, policy)
     return policy
@@ -178,9 +183,12 @@ def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:
     )
 
 
-def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged: int) -> None:
+def add_judgement(
+    robot: str, policy: OnnxPolicy, record: dict[str, Any], judged: int, task: str = ""
+) -> None:
     """Judge a policy under its training distribution, and write its record."""
-    env = training_task(robot).make(recorded_description(robot), udr_distribution(robot), judged)
+    drawn = udr_distribution(robot, task)
+    env = training_task(robot, task).make(recorded_description(robot), drawn, judged)
     record["evaluation"] = judge(policy, env, JUDGE_SEED)
     record["at_rest"] = judge(_Rest(policy), env, JUDGE_SEED)
     text = json.dumps(record, indent=1, sort_keys=True)
@@ -204,6 +212,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("robot", choices=sorted(FILES))
+    parser.add_argument("--task", default="", choices=["", *(task for _, task in OTHER_TASKS)])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="environment steps; by default those of the shipped policy")
     parser.add_argument("--members", type=int, help="by default those of the shipped policy")
@@ -219,10 +228,11 @@ def main() -> None:
     parser.add_argument("--resume", action="store_true", help="continue from --checkpoint")
     parser.add_argument("--judge", action="store_true", help="do not train: evaluate the existing file")
     args = parser.parse_args()
-    path = args.out or ASSETS / f"{FILES[args.robot]}.onnx"
+    name = OTHER_TASKS[args.robot, args.task] if args.task else FILES[args.robot]
+    path = args.out or ASSETS / f"{name}.onnx"
     if args.judge:
         record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-        add_judgement(args.robot, OnnxPolicy(path), record, args.judged)
+        add_judgement(args.robot, OnnxPolicy(path), record, args.judged, args.task)
         if args.checkpoint is not None:
             ship_checkpoint(args.checkpoint, OnnxPolicy(path))
         return
@@ -237,6 +247,7 @@ def main() -> None:
         resume=args.resume,
         start=args.start,
         hours=args.hours,
+        task=args.task,
     )
 
 

@@ -1,4 +1,4 @@
-"""The Go2's part of ``deal-hw demo``: walk."""
+"""The Go2's part of ``deal-hw demo``: walk, canter or climb."""
 
 from __future__ import annotations
 
@@ -28,12 +28,13 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.documentation import page
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.motions.scores.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
+from deal_hw.sim.legged.terrain import DISTANCE_M
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.collect import CollectGo2Settings
 from deal_hw.workflows.emulation.go2 import read_track
 from deal_hw.workflows.emulation.process import EmulatorProcess
-from deal_hw.workflows.emulation.walk_script import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
+from deal_hw.workflows.emulation.walk_script import WALKS, write_script
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions, LinkOptions
 from deal_hw.workflows.shipped import required_policy
@@ -41,27 +42,40 @@ from deal_hw.workflows.train import read_distribution
 
 STEPS: Final = 300_000
 """Steps of the fine-tune: about a minute of one processor."""
+CLIMBS: Final = 3
+CLIMB_M_S: Final = 0.6
+CLIMB_S: Final = 6.0
+BEYOND_M: Final = 0.3
+"""How far behind the edge a base is when all feet are on the platform [m]: the hind ones are 0.2 m behind."""
 PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
 
 
 def check(config: DemoGo2) -> None:
     """Check settings. See :class:`deal_hw.cli.demo.Part`."""
-    required_policy("go2")
+    required_policy("go2", config.task)
 
 
 def run(config: DemoGo2, folder: RunFolder, stages: Stages) -> Demonstrated:
     """Walk, calibrate, fine-tune, walk again, inspect. See :class:`deal_hw.cli.demo.Part`."""
-    udr = required_policy("go2")
-    out, episodes = config.folder, config.episodes or 1
-    profile, heldout = write_script(out / "profile.csv", PROFILE), write_script(out / "heldout.csv", HELDOUT)
+    udr = required_policy("go2", config.task)
+    out, scripts = config.folder, WALKS[config.task]
+    profile, heldout = (
+        _Script(write_script(out / f"{name}.csv", walk.parts), walk.seconds)
+        for name, walk in zip(("profile", "heldout"), scripts, strict=True)
+    )
     walks: dict[str, _Walked] = {}
+    tries = _climbed(config, stages, {"udr": udr})
+    # A robot that climbs walks once, for the calibration.
+    times = 1 if tries else config.episodes or 1
     # The emulator takes a third of a processor, so it runs only while the robot is needed.
     with _emulated(config, "before") as robot:
-        with stages.stage("walk udr", f"stand up, walk {PROFILE_S:g} s, lie down; {episodes} times"):
-            walks["udr"] = robot.whole_walk(udr, profile, PROFILE_S, folder.dataset, episodes)
+        gait = "canter" if config.task == "canter" else "walk"
+        words = f"stand up, {gait} {profile.seconds:g} s on a flat floor, lie down; {times} times"
+        with stages.stage("walk udr", words):
+            walks["udr"] = robot.whole_walk(udr, profile, folder.dataset, times)
         if not config.on_stand:
-            with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities as held-out data"):
-                judge = robot.whole_walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
+            with stages.stage("walk held-out", f"{heldout.seconds:g} s of other velocities as held-out data"):
+                judge = robot.whole_walk(udr, heldout, folder.dataset, 1)
     if config.on_stand:
         found, distribution, episode = _on_stand(config, folder, stages)
     else:
@@ -78,12 +92,11 @@ def run(config: DemoGo2, folder: RunFolder, stages: Stages) -> Demonstrated:
             )
         distribution, episode = found.files["distribution.json"], walks["udr"].report.paths[0]
     policies = _fine_tuned(config, folder, stages, distribution, udr)
+    tries |= _climbed(config, stages, policies)
     with _emulated(config, "after") as robot:
         for name, policy in policies.items():
             with stages.stage(f"walk {name}", "the same velocities again"):
-                walks[name] = robot.walk(
-                    policy, profile, PROFILE_S, out / f"walk_{_in_paths(name)}", episodes
-                )
+                walks[name] = robot.walk(policy, profile, out / f"walk_{_in_paths(name)}", times)
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
         rrd = show_episode(folder, episode)
     truth = read_truth(out / "truth_after.json")
@@ -92,8 +105,8 @@ def run(config: DemoGo2, folder: RunFolder, stages: Stages) -> Demonstrated:
         found=found,
         truth=true,
         latency_s=1e-3 * truth["latency_ms"],
-        measures=(measures := _measures(walks)),
-        sentence=_sentence(measures),
+        measures=(measures := [*_measures(walks), *_climb_measures(tries)]),
+        sentence=_climb_sentence(config.platform, tries) if tries else _sentence(measures),
         episode=episode,
         run=walks["calibrated"].report,
         paths={
@@ -102,6 +115,14 @@ def run(config: DemoGo2, folder: RunFolder, stages: Stages) -> Demonstrated:
             "policy": str(policies["calibrated"]),
         },
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Script:
+    """A file of requested velocities, and how long they are followed [s]."""
+
+    file: Path
+    seconds: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,33 +141,54 @@ class _Emulated:
     link: LinkOptions
     track: Path
 
-    def walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
+    def walk(self, policy: Path, script: _Script, dataset: Path, times: int) -> _Walked:
         """Run a policy on the robot; a walk that only came late is walked again."""
-        once = partial(self._walk, policy, script, seconds, dataset)
+        once = partial(self._walk, policy, script, dataset)
         return _Walked(report=deployed(once, times, "walk"), track=self.track)
 
-    def whole_walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
+    def whole_walk(self, policy: Path, script: _Script, dataset: Path, times: int) -> _Walked:
         """Run a policy; repeat if a walk ended early or its recording cannot be used for calibration.
 
         Raises:
             SafetyError: No walk could be used.
         """
-        once = partial(self._walk, policy, script, seconds, dataset)
+        once = partial(self._walk, policy, script, dataset)
         report = recorded(lambda _: once(times), "walk", times)
         return _Walked(report=report, track=self.track)
 
-    def _walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> RunReport:
+    def climb(self, policy: Path, height: float, dataset: Path) -> bool:
+        """Run a policy towards the platform, once; return whether the robot came onto it and stayed up.
+
+        The platform is as wide as it is long, so a robot whose base is beyond the edge stands on it.
+        """
+        legs = LegOptions(
+            velocity=f"{CLIMB_M_S:g},0,0", hold_heading=True, obstacle=f"{DISTANCE_M:g},{height:g}"
+        )
+        once = partial(self._deploy, policy, legs, CLIMB_S, dataset, "climb")
+        report = deployed(once, 1, "climb")
+        x = read_track(self.track).place[:, 0]
+        beyond = bool(np.any(x > DISTANCE_M + BEYOND_M))
+        return beyond and report.episodes[-1].outcome is Outcome.FINISHED
+
+    def _walk(self, policy: Path, script: _Script, dataset: Path, times: int) -> RunReport:
+        return self._deploy(
+            policy, LegOptions(velocity=str(script.file)), script.seconds, dataset, "walk", times
+        )
+
+    def _deploy(
+        self, policy: Path, legs: LegOptions, seconds: float, dataset: Path, task: str, times: int
+    ) -> RunReport:
         return deploy(
             DEPLOY.settings(
                 robot="go2",
                 port=self.port,
                 link=self.link,
-                legs=LegOptions(velocity=str(script)),
+                legs=legs,
                 policy=policy,
                 seconds=seconds,
                 dataset=dataset,
                 episodes=times,
-                task="walk",
+                task=task,
             )
         )
 
@@ -164,6 +206,27 @@ def _emulated(config: DemoGo2, name: str, *options: str) -> Iterator[_Emulated]:
         # The demo needs no raw bytes, and they are half of the recorder's work.
         link = LinkOptions(transport=transport, record_wire=False)
         yield _Emulated(port=emulator.port, link=link, track=track)
+
+
+def _climbed(config: DemoGo2, stages: Stages, policies: Mapping[str, Path]) -> dict[str, list[bool]]:
+    """Let policies climb, each time with the same robot at its start; return which tries succeeded.
+
+    Nothing for another task.
+    """
+    if config.task != "climb":
+        return {}
+    height, times = config.platform, config.episodes or CLIMBS
+    tries: dict[str, list[bool]] = {}
+    for name, policy in policies.items():
+        part = f"climb_{_in_paths(name)}"
+        with stages.stage(f"climb {name}", f"a platform of {height:g} m, {times} times"):
+            for number in range(times):
+                terrain = ("--terrain", f"box:{height:g},{DISTANCE_M:g}")
+                with _emulated(config, f"{part}_{number}", *terrain) as robot:
+                    done = robot.climb(policy, height, config.folder / part)
+                tries.setdefault(name, []).append(done)
+                print(f"try {number + 1} of {times}: {'on the platform' if done else 'not climbed'}")
+    return tries
 
 
 def _on_stand(config: DemoGo2, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path, Path]:
@@ -220,6 +283,7 @@ def _fine_tuned(
             train(
                 TRAIN.settings(
                     robot="go2",
+                    task="" if config.task == "walk" else config.task,
                     distribution=distribution,
                     udr=distribution is None,
                     start=udr.with_suffix(".safetensors"),
@@ -274,6 +338,26 @@ def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
         Measure(name="estimated_velocity_error_m_s", unit="m_s", values=each(own, "velocity_m_s")),
         Measure(name="falls", values=falls),
     ]
+
+
+def _climb_measures(tries: Mapping[str, Sequence[bool]]) -> list[Measure]:
+    """Return the share of tries that climbed; nothing if no robot climbed."""
+    if not tries:
+        return []
+    return [
+        Measure(name="climbed", values={name: np.array(done, dtype=float) for name, done in tries.items()})
+    ]
+
+
+def _climb_sentence(height: float, tries: Mapping[str, Sequence[bool]]) -> str:
+    """Return a sentence on how often the policies climbed, as measured."""
+    done = {name: f"{sum(found)} of {len(found)}" for name, found in tries.items()}
+    return (
+        f"Onto a platform of {height:g} m: the policy fine-tuned under the calibration {done['calibrated']} "
+        f"times, the policy fine-tuned as long without it {done['udr more']}, the shipped policy "
+        f"{done['udr']}. With so few tries only large differences mean something: "
+        f"{page('how-to/go2-gaits.md')} has five robots."
+    )
 
 
 def _sentence(measures: Sequence[Measure]) -> str:

@@ -109,6 +109,7 @@ class PolicyBehaviour:
     Attributes:
         follows_velocity: Whether it observes a requested velocity.
         follows_targets: Whether it observes a pose that it is to reach.
+        follows_obstacle: Whether it observes a platform ahead.
 
     Args:
         policy: The policy.
@@ -116,6 +117,8 @@ class PolicyBehaviour:
         source: The requested velocity of the base, for a policy that observes it; by default zero.
         targets: Returns the pose to reach at a time [s], (A,), for a policy that observes it; by default the
             robot's default pose.
+        obstacle: Distance and height of a platform ahead [m], for a policy that observes it; by default not
+            said.
 
     Raises:
         PolicyMismatchError: The policy was made for another robot, or observes a quantity that this one
@@ -129,6 +132,7 @@ class PolicyBehaviour:
         description: RobotDescription,
         source: VelocitySource | None = None,
         targets: Callable[[float], FloatArray] | None = None,
+        obstacle: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         spec = policy.spec
         spec.check_fits(description)
@@ -146,9 +150,12 @@ class PolicyBehaviour:
         self._observes_base = spec.observes_base
         self.follows_velocity = "command" in observed
         self.follows_targets = "joint_target" in observed
+        self.follows_obstacle = "obstacle" in observed
+        self._obstacle = np.array(obstacle)
         self._targets, self._actuated = targets, list(description.actuated_index)
         self._policy = policy
         self._observations = ObservationBuilder(spec)
+        self._observations.obstacle = self._obstacle.copy()
         self._map = ActionMap.of_robot(spec, description)
         self._template = position_command(spec, self._map.centre)
         self.action: FloatArray | None = None
@@ -157,6 +164,7 @@ class PolicyBehaviour:
         """Clear the policy's memory."""
         self._policy.reset()
         self._observations.reset()
+        self._observations.obstacle = self._obstacle.copy()
         self.action = None
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:

@@ -16,11 +16,31 @@ if TYPE_CHECKING:
     from deal_hw.motions.behaviours import Behaviour
 
 
-def shipped_policy(robot: str) -> Path | None:
-    """Return the policy that is shipped for a robot, or None."""
-    package, _, file = (robot_entry(robot).policy if is_known(robot) else "").partition(":")
+def shipped_policy(robot: str, task: str = "") -> Path | None:
+    """Return the policy that is shipped for a robot, or None.
+
+    Args:
+        robot: Its name.
+        task: One of its further tasks; "" for its usual one.
+    """
+    entry = robot_entry(robot) if is_known(robot) else None
+    reference = "" if entry is None else entry.policies.get(task, "" if task else entry.policy)
+    package, _, file = reference.partition(":")
     path = Path(str(resources.files(package) / file)) if package else None
     return path if path is not None and path.is_file() else None
+
+
+def policy_file(robot: str, given: Path | str | None) -> Path | None:
+    """Return the policy that an option names: a file, or a task of the robot whose policy is shipped.
+
+    Args:
+        robot: The robot's name.
+        given: The option; None for the robot's usual policy.
+    """
+    if given is None:
+        return shipped_policy(robot)
+    named = None if Path(given).exists() else shipped_policy(robot, str(given))
+    return named or Path(given)
 
 
 def stands_alone(robot: str) -> bool:
@@ -36,16 +56,21 @@ def balancing_policy(robot: str) -> Path | None:
     return None if found is None or stands_alone(robot) else found
 
 
-def required_policy(robot: str) -> Path:
+def required_policy(robot: str, task: str = "") -> Path:
     """Return the policy that is shipped for a robot.
+
+    Args:
+        robot: Its name.
+        task: One of its further tasks; "" or walk for a Go2's usual one.
 
     Raises:
         ConfigurationError: There is none.
     """
-    path = shipped_policy(robot)
+    path = shipped_policy(robot, "" if task == "walk" else task)
     if path is None:
+        of = f" and task {task!r}" if task else ""
         raise ConfigurationError(
-            f"no policy is shipped for robot {robot!r}; tools/train_udr_policy.py trains one for the "
+            f"no policy is shipped for robot {robot!r}{of}; tools/train_udr_policy.py trains one for the "
             "cart-pole, tools/train_demo_policy.py for others"
         )
     return path

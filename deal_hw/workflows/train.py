@@ -18,7 +18,7 @@ from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import VERDICT
 from deal_hw.ranges import Checked, Range
 from deal_hw.reading import read_json, reading
-from deal_hw.robots import trained_robots
+from deal_hw.robots import robot_entry, trained_robots
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, File, Seed, from_settings
@@ -101,6 +101,14 @@ class TrainRobotSettings(TrainSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrainTaskSettings(TrainRobotSettings):
+    """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
+
+    task: str = ""
+    """One of the robot's further tasks (go2: canter or climb); by default its usual one."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainOwnSettings(TrainSettings):
     """Train a policy for your own robot in an environment of your own, under the calibrated distribution."""
 
@@ -117,7 +125,12 @@ class TrainOwnSettings(TrainSettings):
 
 def _table() -> dict[str, InputKind]:
     drawn = "--distribution runs/first/calibration/distribution.json --out runs/first"
-    robots = {name: InputKind(TrainRobotSettings, example=f"{name} {drawn}") for name in trained_robots()}
+    robots = {
+        name: InputKind(
+            TrainTaskSettings if robot_entry(name).tasks else TrainRobotSettings, example=f"{name} {drawn}"
+        )
+        for name in trained_robots()
+    }
     return {**robots, FILE: InputKind(TrainOwnSettings, example=f"{FILE} --env my_tasks:MyRobot-v0 {drawn}")}
 
 
@@ -253,6 +266,7 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
             files=files,
             verdict=verdict,
             env=config.env if isinstance(config, TrainOwnSettings) else "",
+            task=config.task if isinstance(config, TrainTaskSettings) else "",
         )
     training = Training(
         policy=policy,
@@ -280,6 +294,7 @@ def train_policy(
     files: TrainingFiles | None = None,
     verdict: str = "",
     env: str = "",
+    task: str = "",
 ) -> OnnxPolicy:
     """Train a policy and write it with its training record.
 
@@ -295,6 +310,7 @@ def train_policy(
         files: Checkpoint, TensorBoard files, and the request to stop.
         verdict: Colour of the distribution's calibration; "" if it is of none.
         env: Environment of a user, module:ENV_ID; "" for the robot's own task.
+        task: Name of one of the robot's further tasks; "" for its usual one.
 
     Returns:
         The policy, read back from its file.
@@ -306,10 +322,10 @@ def train_policy(
     from deal_hw.policies.tasks import OWN_TASK
     from deal_hw.robots import training_task
 
-    task = OWN_TASK if env else training_task(robot)
-    teacher, config = task.trainer_and_config(trainer, steps)
+    chosen = OWN_TASK if env else training_task(robot, task)
+    teacher, config = chosen.trainer_and_config(trainer, steps)
     own = (env,) if env else ()
-    world = task.make(*own, described(robot), distribution, members or task.members[teacher.name])
+    world = chosen.make(*own, described(robot), distribution, members or chosen.members[teacher.name])
     # An unwritable path is reported now and not after the training.
     path.parent.mkdir(parents=True, exist_ok=True)
     started, cpu = time.monotonic(), time.process_time()
@@ -374,7 +390,9 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
     if source is None and own:
         return ParameterDistribution.point(ParameterSpace([]), np.empty(0), 0.0), ""
     if source is None:
-        return udr_distribution(config.robot) if udr else nominal_distribution(config.robot), ""
+        task = config.task if isinstance(config, TrainTaskSettings) else ""
+        drawn = udr_distribution if udr else nominal_distribution
+        return drawn(config.robot, task), ""
     if isinstance(source, ParameterDistribution):
         return source, ""
     if isinstance(source, str | Path):
@@ -382,30 +400,38 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
     return source.distribution, source.colour
 
 
-def udr_distribution(robot: str) -> ParameterDistribution:
+def udr_distribution(robot: str, task: str = "") -> ParameterDistribution:
     """Return the distribution of uniform domain randomisation.
 
+    Args:
+        robot: The robot.
+        task: Name of one of its further tasks; "" for its usual one.
+
     Raises:
-        UnknownNameError: There is no such robot.
+        UnknownNameError: There is no such robot, or no such task.
     """
     from deal_hw.robots import training_task
 
-    task = training_task(robot)
-    return ParameterDistribution.uniform(_space(robot).with_ratio(task.udr_ratio), task.udr_latency_s)
+    found = training_task(robot, task)
+    return ParameterDistribution.uniform(_space(robot).with_ratio(found.udr_ratio), found.udr_latency_s)
 
 
-def nominal_distribution(robot: str) -> ParameterDistribution:
+def nominal_distribution(robot: str, task: str = "") -> ParameterDistribution:
     """Return the distribution of the model's nominal values; only the latency is drawn.
 
+    Args:
+        robot: The robot.
+        task: Name of one of its further tasks; "" for its usual one.
+
     Raises:
-        UnknownNameError: There is no such robot.
+        UnknownNameError: There is no such robot, or no such task.
     """
     from deal_hw.robots import training_task
 
-    task, space = training_task(robot), _space(robot)
+    found, space = training_task(robot, task), _space(robot)
     K = len(space)
     return ParameterDistribution(
-        space=space, mean=space.nominal, covariance=np.zeros((K, K)), latency_s=task.udr_latency_s
+        space=space, mean=space.nominal, covariance=np.zeros((K, K)), latency_s=found.udr_latency_s
     )
 
 

@@ -16,7 +16,7 @@ from deal_hw.drivers.go2.descriptions.leg_geometry import (
     foot_positions,
 )
 from deal_hw.motions.scores.velocity_error import Track
-from deal_hw.rotations import rotated
+from deal_hw.rotations import heading, rotated
 from deal_hw.sim.legged.velocity_filter import filtered_velocity, standing_feet
 from deal_hw.types import FloatArray, Trajectory
 
@@ -45,8 +45,7 @@ def walked(trajectory: Trajectory) -> Track | None:
     )
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time_s)[:, None]
     place = np.concatenate((np.zeros((1, 2)), np.cumsum(steps[:, :2], axis=0)))
-    w, x, y, z = orientation.T
-    return Track(time_s, place, np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return Track(time_s, place, heading(orientation))
 
 
 def _answers(

@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.velocity import (
+    FASTEST,
+    HEADING_TURN,
     KEY_LIFE_S,
     KEYS,
     LARGEST,
     FixedVelocity,
+    HeldHeading,
     KeyboardVelocity,
     RemoteVelocity,
     limited_axes,
@@ -24,12 +27,12 @@ from deal_hw.motions.velocity import (
 from deal_hw.types import BodyState, RobotState, Status
 
 
-def state(sticks: tuple[float, float, float, float] | None = None) -> RobotState:
-    """A state of a robot with one joint and, where sticks are given, a body."""
+def state(sticks: tuple[float, float, float, float] | None = None, heading: float = 0.0) -> RobotState:
+    """A state of a robot with one joint and, where sticks are given, a body with a heading [rad]."""
     body = None
     if sticks is not None:
         body = BodyState(
-            orientation=np.array([1.0, 0, 0, 0]),
+            orientation=np.array([math.cos(heading / 2), 0, 0, math.sin(heading / 2)]),
             angular_velocity=np.zeros(3),
             acceleration=np.zeros(3),
             foot_force=np.zeros(4),
@@ -62,7 +65,7 @@ def test_wrong_texts_are_refused(text: str) -> None:
 @given(st.tuples(*[st.floats(allow_nan=True)] * 3))
 def test_a_fixed_velocity_is_inside_the_limits_or_refused(velocity: tuple[float, float, float]) -> None:
     """Exactly the velocities inside the limits are taken."""
-    inside = all(abs(v) <= most for v, most in zip(velocity, LARGEST, strict=True))
+    inside = all(abs(v) <= most for v, most in zip(velocity, FASTEST, strict=True))
     if inside:
         np.testing.assert_array_equal(FixedVelocity(velocity).velocity(state(), 0.0), velocity)
     else:
@@ -160,3 +163,40 @@ def test_a_key_from_before_the_walk_does_not_count() -> None:
     np.testing.assert_array_equal(source.velocity(state(), 0.0), np.zeros(3))
     source.press("a")
     np.testing.assert_array_equal(source.velocity(state(), 0.02), KEYS["a"])
+
+
+REST = (0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_held_heading_is_where_the_yaw_rates_lead() -> None:
+    """By hand: 0.2 rad/s for 0.5 s from 3.1 rad; the base is 0.05 rad short, also across half a turn."""
+    source = HeldHeading(FixedVelocity((0.4, 0.1, 0.2)), gain=1.0)
+    np.testing.assert_allclose(source.velocity(state(REST, 3.1), 2.0), [0.4, 0.1, 0.2])
+    for tick in range(1, 25):
+        source.velocity(state(REST, 3.1 + 0.2 * 0.02 * tick), 2.0 + 0.02 * tick)
+    wanted = 3.1 + 0.2 * 0.5
+    assert wanted > math.pi
+    found = source.velocity(state(REST, wanted - 0.05), 2.5)
+    np.testing.assert_allclose(found, [0.4, 0.1, 0.2 + 0.05], atol=1e-9)
+    # A large error is corrected slowly.
+    np.testing.assert_allclose(
+        source.velocity(state(REST, wanted - 2.0), 2.5), [0.4, 0.1, 0.2 + HEADING_TURN]
+    )
+
+
+def test_a_robot_that_stands_may_be_turned_by_hand() -> None:
+    """Standing forgets the heading; a robot without an inertial sensor gets what was requested."""
+    velocity = [0.5, 0.0, 0.0]
+
+    class Source:
+        def velocity(self, state: RobotState, time_s: float) -> np.ndarray:
+            return np.array(velocity)
+
+    source = HeldHeading(Source(), gain=1.0)
+    source.velocity(state(REST, 0.0), 0.0)
+    np.testing.assert_allclose(source.velocity(state(REST, 0.1), 0.02), [0.5, 0.0, -0.1])
+    velocity[0] = 0.0
+    np.testing.assert_array_equal(source.velocity(state(REST, 1.0), 0.04), np.zeros(3))
+    velocity[0] = 0.5
+    np.testing.assert_array_equal(source.velocity(state(REST, 1.0), 0.06), [0.5, 0.0, 0.0])
+    np.testing.assert_array_equal(source.velocity(state(), 0.08), [0.5, 0.0, 0.0])

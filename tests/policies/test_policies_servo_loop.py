@@ -13,7 +13,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.policies.servo_loop import EXACT_SENSOR, ServoLoop
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.engine.servo import slew
+from deal_hw.sim.laws.setpoints import slew
 
 SPACE = k9_space()
 ALL = np.ones(1, dtype=bool)

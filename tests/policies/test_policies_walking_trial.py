@@ -11,10 +11,10 @@ from fakes.wrong_policy import ERRORS, WrongPolicy
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.policies import walking_trial
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.walking_trial import (
     WalkingReport,
+    WalkingTrial,
     can_try,
     describe_command,
     trial_commands,
@@ -27,16 +27,13 @@ from deal_hw.workflows.shipped import required_policy
 SHIPPED = OnnxPolicy(required_policy("go2"))
 
 
-@pytest.fixture(autouse=True)
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A walk half as long, of half as many robots, shows the same."""
-    monkeypatch.setattr(walking_trial, "SECONDS", 3.0)
-    monkeypatch.setattr(walking_trial, "ROBOTS", 2)
+SHORT = WalkingTrial(seconds=3.0, robots=1)
+"""A walk half as long, of one robot for each command, shows the same."""
 
 
 def test_the_shipped_policy_walks() -> None:
     """It stays up at all commands, and follows them."""
-    report = try_walking(SHIPPED, DRIVER)
+    report = try_walking(SHIPPED, DRIVER, WalkingTrial(seconds=3.0, robots=2))
     assert report.faults() == ()
     assert report.up == 1.0 and report.clipped < 0.1
     assert [walk.up for walk in report.standing] == [1.0] * 7
@@ -52,14 +49,14 @@ def test_the_shipped_policy_walks() -> None:
 )
 def test_exchanged_legs_and_wrong_signs_are_caught(error: str) -> None:
     """They fall, or do not go where they should, at several commands; all errors are in docs/measured."""
-    faults = try_walking(ERRORS[error](SHIPPED), DRIVER).faults()
+    faults = try_walking(ERRORS[error](SHIPPED), DRIVER, SHORT).faults()
     assert len(faults) >= 2
     assert all("falls after" in fault or "of the command" in fault for fault in faults)
 
 
 def test_one_flipped_axis_of_the_command_is_caught() -> None:
     """The robot walks well, and turns the wrong way."""
-    report = try_walking(ERRORS["yaw of the command"](SHIPPED), DRIVER)
+    report = try_walking(ERRORS["yaw of the command"](SHIPPED), DRIVER, SHORT)
     assert report.up == 1.0
     assert len(report.faults()) == 2 and all(fault.startswith("turn") for fault in report.faults())
 
@@ -71,7 +68,7 @@ def test_a_policy_that_stands_still_follows_nothing() -> None:
         def act_batch(self, observations: Observation) -> FloatArray:
             return np.zeros((len(observations), 12))
 
-    report = try_walking(Still(SHIPPED), DRIVER)
+    report = try_walking(Still(SHIPPED), DRIVER, SHORT)
     assert report.up == 1.0 and len(report.faults()) == 6
 
 
@@ -79,7 +76,7 @@ def test_the_same_trial_gives_the_same_result() -> None:
     """Its draws are fixed."""
 
     def walk() -> WalkingReport:
-        return try_walking(SHIPPED, DRIVER, threads=1)
+        return try_walking(SHIPPED, DRIVER, WalkingTrial(seconds=1.0, robots=2), threads=1)
 
     assert walk() == walk()
 

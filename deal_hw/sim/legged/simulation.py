@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from deal_hw.sim.legged.terrain import Terrain, add_terrain, terrain_geoms
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
@@ -27,13 +28,22 @@ class LeggedSimulation:
         feet: Sphere geoms of the feet.
         timestep_s: Length of one step [s].
         base: The body that carries the legs, with a free joint of the same name or none.
+        terrain: What is ahead on the floor; None for a flat floor.
     """
 
     def __init__(
-        self, mjcf: Path, joints: Sequence[str], feet: Sequence[str], timestep_s: float, base: str = "base"
+        self,
+        mjcf: Path,
+        joints: Sequence[str],
+        feet: Sequence[str],
+        timestep_s: float,
+        base: str = "base",
+        terrain: Terrain | None = None,
     ) -> None:
         spec = mujoco.MjSpec.from_file(str(mjcf))
         _add_touch_sensors(spec, feet)
+        if terrain is not None:
+            add_terrain(spec, terrain)
         spec.option.timestep = timestep_s
         model = spec.compile()
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -129,10 +139,10 @@ class LeggedSimulation:
         self._derive()
 
     def set_floor_friction(self, friction: float, floor: str = "floor") -> None:
-        """Set the sliding friction of the floor geom, if the model has one."""
+        """Set the sliding friction of the floor geom, if the model has one, and of its terrain."""
         index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, floor)
-        if index >= 0:
-            self._model.geom_friction[index, 0] = friction
+        ground = [index] if index >= 0 else []
+        self._model.geom_friction[ground + terrain_geoms(self._model), 0] = friction
 
     def _derive(self) -> None:
         """Derive constants of masses and armatures; positions stay."""

@@ -103,11 +103,16 @@ def _truth(config: EmulateGo2Settings) -> Go2Truth:
 def _device(config: EmulateGo2Settings, truth: Go2Truth) -> Go2Device:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
+    from deal_hw.sim.legged.terrain import Terrain
 
     own = config.go2
     plan = FaultPlan(**of_every_robot(config), **asdict(own.faults))
     if own.no_remote and own.remote_script is not None:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")
+    if own.on_stand and own.terrain:
+        raise ConfigurationError(
+            "--on-stand and --terrain exclude each other: a robot on a stand has no floor"
+        )
     script = () if own.remote_script is None else read_remote_script(own.remote_script)
     return Go2Device(
         truth,
@@ -118,4 +123,5 @@ def _device(config: EmulateGo2Settings, truth: Go2Truth) -> Go2Device:
         plan=plan,
         remote=None if own.no_remote else script,
         tick_ms=own.tick_start_ms,
+        terrain=Terrain.parse(own.terrain),
     )

@@ -26,8 +26,9 @@ from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.motions.planned_end import PlannedEnd
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, Track, Wanted, velocity_data, wanted_in
-from deal_hw.motions.velocity import NotedVelocity, SlowedVelocity, VelocitySource
+from deal_hw.motions.velocity import HeldHeading, NotedVelocity, SlowedVelocity, VelocitySource
 from deal_hw.policy import Policy
+from deal_hw.sim.legged.terrain import Terrain
 from deal_hw.types import Event, FloatArray, Trajectory
 
 _START_NS = 10**9
@@ -83,6 +84,9 @@ def walk(
     *,
     record: bool = True,
     end: PlannedEnd | None = None,
+    terrain: Terrain | None = None,
+    obstacle: tuple[float, float] = (0.0, 0.0),
+    hold_heading: bool = False,
 ) -> VirtualWalk:
     """Make a new robot stand up, walk, come to a stand and lie down.
 
@@ -95,17 +99,21 @@ def walk(
         metadata: For the recording.
         record: Whether to record; recording takes a third of the time.
         end: Takes requests for an earlier end.
+        terrain: What is ahead of the robot; None for a flat floor.
+        obstacle: What a policy that climbs is told of it: distance and height [m].
+        hold_heading: Whether the requested turn is corrected by the robot's inertial sensor.
     """
     clock = VirtualClock(_START_NS)
-    watched = _Watched(Go2Device(truth))
+    watched = _Watched(Go2Device(truth, terrain=terrain))
     wanted_events: list[Event] = []
 
     def note(velocity: FloatArray) -> None:
         loop.note(VELOCITY_EVENT, "wanted velocity", **velocity_data(velocity))
         wanted_events.append(Event(watched.device_ns, VELOCITY_EVENT, "", velocity_data(velocity)))
 
-    slowed = SlowedVelocity(NotedVelocity(source, note))
-    inner = PolicyBehaviour(policy, DRIVER, slowed)
+    noted: VelocitySource = NotedVelocity(source, note)
+    slowed = SlowedVelocity(HeldHeading(noted) if hold_heading else noted)
+    inner = PolicyBehaviour(policy, DRIVER, slowed, obstacle=obstacle)
     whole = PostureBehaviour(inner, DRIVER, seconds, PostureConfig(), slowed=slowed, end=end)
     trajectory = None
     with contextlib.ExitStack() as folder, contextlib.ExitStack() as recording:

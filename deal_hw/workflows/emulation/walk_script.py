@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -29,6 +30,42 @@ class Walk(NamedTuple):
 
     parts: Script
     seconds: float
+
+
+CANTER: Final = Walk(
+    (
+        (0.0, (0.0, 0.0, 0.0)),
+        (2.0, (1.0, 0.0, 0.0)),
+        (6.0, (1.4, 0.0, 0.0)),
+        (10.0, (0.8, 0.0, 0.4)),
+        (13.5, (0.8, 0.0, -0.4)),
+    ),
+    17.0,
+)
+"""The canter of every policy."""
+CANTER_HELDOUT: Final = Walk(
+    ((0.0, (0.0, 0.0, 0.0)), (1.0, (0.6, 0.0, 0.0)), (4.0, (1.2, 0.0, 0.2)), (6.0, (0.5, 0.0, -0.3))), 8.0
+)
+APPROACH: Final = Walk(
+    (
+        (0.0, (0.0, 0.0, 0.0)),
+        (2.0, (0.8, 0.0, 0.0)),
+        (7.0, (0.5, 0.0, 0.3)),
+        (12.0, (0.6, 0.0, -0.3)),
+    ),
+    17.0,
+)
+"""What a robot that climbs walks for its calibration, on the flat floor: contacts with a platform are not in
+the calibration's model."""
+APPROACH_HELDOUT: Final = Walk(
+    ((0.0, (0.0, 0.0, 0.0)), (1.0, (0.5, 0.0, 0.0)), (4.0, (0.7, 0.0, 0.2)), (6.0, (0.4, 0.0, -0.2))), 8.0
+)
+WALKS: Final[Mapping[str, tuple[Walk, Walk]]] = {
+    "walk": (Walk(PROFILE, PROFILE_S), Walk(HELDOUT, HELDOUT_S)),
+    "canter": (CANTER, CANTER_HELDOUT),
+    "climb": (APPROACH, APPROACH_HELDOUT),
+}
+"""By task: the walk to calibrate from, and the one that judges the calibration."""
 
 
 def write_script(path: Path, script: Script) -> Path:

@@ -32,7 +32,9 @@ from deal_hw.drivers.unitree.emulated_device import (
     require_finite,
 )
 from deal_hw.drivers.unitree.remote import Remote, encode_remote, encode_wireless, parse_combination
+from deal_hw.rotations import heading
 from deal_hw.sim.legged.simulation import LeggedSimulation
+from deal_hw.sim.legged.terrain import Terrain
 from deal_hw.types import FloatArray
 
 SLOW_MS: Final = 50
@@ -60,6 +62,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
         plan: Faults to make.
         remote: The remote's states, in order of time; None: no remote is in reach.
         tick_ms: The robot's clock at the beginning.
+        terrain: What is ahead of it on the floor; None for a flat floor.
     """
 
     own_period_ms: ClassVar[int] = PERIOD_MS
@@ -75,6 +78,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
         plan: FaultPlan | None = None,
         remote: Sequence[RemoteMoment] | None = (),
         tick_ms: int = 0,
+        terrain: Terrain | None = None,
     ) -> None:
         self._truth, self._plan = truth, plan or FaultPlan()
         profile = find_profile(truth.profile)
@@ -82,7 +86,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
         sensor_rng, jitter_rng, self._drop_rng, fault_rng = streams
         mjcf = (RECORDED if on_stand else DESCRIPTION).mjcf
         super().__init__(
-            LeggedSimulation(mjcf, JOINTS, [f"{leg}_foot" for leg in LEGS], TICK_NS * 1e-9),
+            LeggedSimulation(mjcf, JOINTS, [f"{leg}_foot" for leg in LEGS], TICK_NS * 1e-9, terrain=terrain),
             truth,
             profile,
             self._plan,
@@ -132,8 +136,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
     @property
     def heading(self) -> float:
         """Angle of the base's x axis about the vertical, from the world's x axis [rad]; not reported."""
-        w, x, y, z = self._sim.orientation()
-        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return float(heading(self._sim.orientation()))
 
     @property
     def tilt(self) -> float:
