@@ -11,6 +11,7 @@ weights, critic). Deviations are noted in place.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from deal_hw.types import FloatArray
 BATCH_PER_MEMBER = 16
 """Transitions in a batch of the critic per member of the population (16)."""
 
+CRITIC = CriticSettings(hidden=(128, 128))
+"""The published program's: two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EasiSettings:
@@ -36,15 +40,13 @@ class EasiSettings:
         survive_rate: Share of elites; at most a half, beyond which weights are negative.
         linear: Whether the range is linear, as published; then one of ratio xi^2 has its midpoint at half its
             upper end. Off is uniform in each parameter's own scale (log for positive ones).
-        latency: Whether a latency that is not given is one more coordinate; EASI has none.
-        critic: The published critic (two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation).
     """
+
+    latency: ClassVar[bool] = False  # EASI has no latency among its coordinates.
 
     fitness: str = "critic"
     survive_rate: float = 0.5
     linear: bool = True
-    latency: bool = False
-    critic: CriticSettings = field(default_factory=lambda: CriticSettings(hidden=(128, 128)))
 
     def __post_init__(self) -> None:
         if not 0 < self.survive_rate <= 0.5:
@@ -108,7 +110,7 @@ class _Easi(ScoredStepper):
 
     def scoring(self) -> FitnessSettings:
         batch = BATCH_PER_MEMBER * self.log.budget.population
-        return FitnessSettings(critic=replace(self.settings.critic, batch=batch))
+        return FitnessSettings(critic=replace(CRITIC, batch=batch))
 
     def step(self) -> None:
         """Roll out, train the critic, score by the trained critic, select."""

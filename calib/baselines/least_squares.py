@@ -17,13 +17,15 @@ import abc
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Member, Problem, WindowData
 from deal_hw.calib.data.resume import State
 from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calib.fit.intervals import intervals
@@ -320,10 +322,10 @@ class MultiStartLeastSquares(OneShotSearch):
         parts = [p for e in problem.episodes for p in stretches(e, PART_S)]
         part = dataclasses.replace(problem, episodes=spread(parts, FIRST_S))
         few, most = FIRST_ITERATIONS, max(log.budget.generations, 1)
-        rough = [fit_output_error(part, *start, recipe, iterations=few) for start in starts]
-        order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]
-        good = [(rough[i].theta, rough[i].latency_s) for i in order]
-        fits = [fit_output_error(problem, *start, recipe, iterations=most) for start in good]
+        rough = list(in_order(part, partial(_rough, recipe=recipe, iterations=few), starts))
+        order = np.argsort([fit.score for fit in rough], kind="stable")[: settings.survivors]
+        good = [rough[i].member for i in order]
+        fits = [fit_output_error(problem, theta, late, recipe, iterations=most) for theta, late in good]
         best = min(fits, key=_score)
         K = len(problem.space)
         residual = np.concatenate([r.ravel() for r in best.normal.residual])
@@ -334,12 +336,31 @@ class MultiStartLeastSquares(OneShotSearch):
             theta=best.theta,
             covariance=np.asarray(np.linalg.inv(best.normal.hessian[:K, :K] / variance + flat)),
             latency_s=best.latency_s,
-            iterations=sum(fit.iterations for fit in (*rough, *fits)),
+            iterations=sum(fit.iterations for fit in rough) + sum(fit.iterations for fit in fits),
             message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
             source=f"textbook s^2 inv(J'J), best of {settings.starts} starts",
             steps=part.steps,
             alarms=() if best.iterations < most else (_unfinished(most),),
         )
+
+
+class _Rough(NamedTuple):
+    """A first fit: what comes back from a worker.
+
+    Attributes:
+        member: Its parameters, (K,), and latency [s].
+        score: Its residual; lower is better.
+        iterations: Iterations used.
+    """
+
+    member: Member
+    score: float
+    iterations: int
+
+
+def _rough(problem: Problem, start: Member, recipe: Recipe, iterations: int) -> _Rough:
+    fit = fit_output_error(problem, start[0], start[1], recipe, iterations=iterations)
+    return _Rough(fit.member, _score(fit), fit.iterations)
 
 
 def _unfinished(iterations: int) -> Finding:

@@ -41,7 +41,7 @@ class _Random(Stepper):
         """Draw and score one population."""
         unit = self.coordinates.sample(self.rng, self.log.budget.population)
         members = self.coordinates.members(unit)
-        residual = whitened_residual(self.problem, members, self._middle, self._windows)
+        residual = whitened_residual(self.problem, members, self._middle, self._windows, population=True)
         score = np.mean(np.abs(residual), axis=1)
         score = np.where(np.isfinite(score), score, np.inf)
         units, scores = np.concatenate([self._unit, unit]), np.concatenate([self._score, score])

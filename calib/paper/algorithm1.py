@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.search import Coordinates, RangedSearch, SearchLog, Stepper
-from deal_hw.calib.paper.critic import CriticSettings
 from deal_hw.calib.paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 from deal_hw.calib.paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calibration import CalibrationResult
@@ -28,8 +28,6 @@ class PaperSettings(FitnessSettings):
     r"""Choices of `deal-paper`; section numbers are the paper's.
 
     Attributes:
-        critic: Size (section 3.1: two layers of 256) and training of the critic. Learning rate, clip, updates
-            n and batch M are not in the paper.
         diffusion: The search's choices; its number of generations is the budget's.
         normalise: Whether the search moves in the normalised range (section 3.2). Off is the ablation
             DEAL\PN, which moves in SI units.
@@ -41,19 +39,18 @@ class PaperSettings(FitnessSettings):
             edge.
         linear: Whether the range is linear ("within the search range", section 3.2); off is uniform in each
             parameter's own scale.
-        latency: Whether a latency that is not given is one more coordinate; the paper has none.
         fitness: Name of the fitness (`deal_hw.calib.paper.fitness`). "critic" is the paper's. "flat"
             scores every member 0, so the search does not depend on the data. Eq. 9 reads the raw fitness,
             whatever its scale.
     """
 
-    critic: CriticSettings = field(default_factory=CriticSettings)
+    latency: ClassVar[bool] = False  # The paper searches no latency.
+
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     normalise: bool = True
     centred: bool = True
     box: tuple[float, float] = (-(3.0**0.5), 3.0**0.5)
     linear: bool = True
-    latency: bool = False
     fitness: str = "critic"
 
     def __post_init__(self) -> None:

@@ -55,6 +55,9 @@ class CriticSettings:
     clip: float = 0.01
 
 
+PAPER_CRITIC = CriticSettings()
+"""Two layers of 256 (section 3.1). Learning rate, clip, updates n and batch M are not in the paper."""
+
 FEATURE_CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
 """The critic whose features are regressed on: smaller and faster than the paper's."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.paper.critic import ClippedCritic, CriticSettings
+from deal_hw.calib.paper.critic import ClippedCritic
 from deal_hw.calib.paper.fitness import Fitness, RolloutView, Samples
 from deal_hw.sim.engine.batch import default_threads
 from deal_hw.types import FloatArray
@@ -21,7 +21,7 @@ class CriticFitness(Fitness):
         self._view = RolloutView(self._problem, settings, rng)
         self._critic = ClippedCritic(
             self._view.real.shape[1],
-            settings.critic or CriticSettings(),
+            settings.critic,
             rng,
             self._problem.threads or default_threads(),
         )

@@ -10,7 +10,7 @@ import abc
 import functools
 import importlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Stateful
 from deal_hw.calib.data.search import Coordinates
 from deal_hw.calib.data.start_states import drawn_start
+from deal_hw.calib.paper.critic import PAPER_CRITIC, CriticSettings
 from deal_hw.calib.paper.rollouts import (
     TransitionScale,
     control_ticks,
@@ -33,9 +34,6 @@ from deal_hw.calib.paper.rollouts import (
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.sim.recordings.imu_base import PLACE_STD
 from deal_hw.types import FloatArray
-
-if TYPE_CHECKING:
-    from deal_hw.calib.paper.critic import CriticSettings
 
 Samples = npt.NDArray[np.float32]
 
@@ -73,7 +71,7 @@ class FitnessSettings:
         standardise: Scale transitions to mean 0 and variance 1 over the recording; the paper has no input
             scaling. Standardised inputs are cut at five standard deviations: otherwise a member whose pole
             spins dominates the critic's output, and with it the softmax.
-        critic: Size and training of the critic; None for the paper's.
+        critic: Size and training of the critic.
         replay_generations: Number of generations of rollouts D_S in the critic's training; None for all.
             Algorithm 1 stores rollouts and does not say whether it forgets. A critic that is still trained
             against old populations pushes the present one away with them (measured: no better than the
@@ -85,7 +83,7 @@ class FitnessSettings:
     replay: bool = False
     difference: bool = False
     standardise: bool = True
-    critic: CriticSettings | None = None
+    critic: CriticSettings = PAPER_CRITIC
     replay_generations: int | None = 1
 
     def __post_init__(self) -> None:

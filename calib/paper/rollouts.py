@@ -14,8 +14,8 @@ from deal_hw.calib.data.problem import PopulationPolicy, Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps
-from deal_hw.sim.engine.servo import slew
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
+from deal_hw.sim.laws.setpoints import slew
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
@@ -169,7 +169,7 @@ def rollout_population(
     Raises:
         InsufficientDataError: As :func:`policy_of`.
     """
-    batches = problem.batches(len(members.theta))
+    batches = problem.batches(len(members.theta), index)
     ends = np.cumsum([batch.count for batch in batches])
 
     def roll(batch: ServoBatch, end: int) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -72,19 +73,21 @@ class DealSettings:
 
     Attributes:
         critic: Size and training.
-        clean_ticks: Window lengths of the stages for positions without noise [control periods].
-        noisy_ticks: The same for noisy positions; a long window of a distant simulator has no information.
-        widen: Least spread of a coordinate at the start of each further stage, in logits.
+        noisy_ticks: Window lengths of the stages for noisy positions [control periods]; a long window of a
+            distant simulator has no information.
         noise_draws: Draws of the noise that estimate its effect on the statistics (noisy recordings).
         innovations: Whether the update regresses on the innovations, too, as that of `eki`.
         features: Whether it regresses on the critic's statistics; off is a search without a critic.
         trained: Whether the critic is trained; off leaves the features of its random first weights.
     """
 
+    # One stage without noise: ten periods already tell the members apart [control periods].
+    clean_ticks: ClassVar[tuple[int, ...]] = (10,)
+    # The noisy second stage begins as wide as that of `eki`: the first may have narrowed too much [logits].
+    widen: ClassVar[float] = 0.5
+
     critic: CriticSettings = field(default_factory=lambda: FEATURE_CRITIC)
-    clean_ticks: tuple[int, ...] = (10,)
     noisy_ticks: tuple[int, ...] = (5, 20)
-    widen: float = 0.5
     noise_draws: int = 100
     innovations: bool = True
     features: bool = True
@@ -311,7 +314,7 @@ class _CleanView(_View):
             np.concatenate([members.theta, centre.theta]),
             np.concatenate([members.latency_s, centre.latency_s]),
         )
-        predicted = predict(self._problem, both, data).observed[:, :, self._at]
+        predicted = predict(self._problem, both, data, population=True).observed[:, :, self._at]
         real = data.measured[:, self._at] - predicted[-1]
         fake = predicted[:-1] - predicted[-1]
         return real.reshape(len(real), -1), fake.reshape(*fake.shape[:2], -1)
@@ -357,7 +360,8 @@ class _NoisyView(_View):
     ) -> tuple[FloatArray, FloatArray]:
         offset = self._offsets[data.episode]
         whitening = linearise(self._problem, centre, data, offset)
-        predicted = predict(self._problem, members, data, *whitening.starts(data)).observed
+        starts = whitening.starts(data)
+        predicted = predict(self._problem, members, data, *starts, population=True).observed
         if self._move_starts:
             self._offsets[data.episode] = whitening.next_offset(data.measured)
         # The inverse Cholesky factor is lower triangular: each period's innovation is whitened by its past.

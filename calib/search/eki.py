@@ -269,7 +269,9 @@ class _Eki(KalmanStepper):
         """Do one Kalman step; at the end of a stage or search, begin the next."""
         z = self.kalman.ask()
         members, centre = self.population(z)
-        residual = whitened_residual(self.problem, members, centre, self._windows, self._offsets)
+        residual = whitened_residual(
+            self.problem, members, centre, self._windows, self._offsets, population=True
+        )
         step = self.kalman.tell(residual)
         self._generation += 1
         self._near = self._brief and step.spread < NEAR_SPREAD

@@ -23,6 +23,7 @@ from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Severity
+from deal_hw.sim.engine import gpu
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.workflows.doctor import machine
 from deal_hw.workflows.doctor.examine import DoctorReport, examine_robot, judge_interfaces
@@ -81,6 +82,21 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     text = " ".join(f.do for f in findings)
     for word in ("limits.conf", "rtprio", "memlock", "[dds]", "rmem_max", "tsc"):
         assert word in text
+
+
+@pytest.mark.parametrize(
+    ("version", "problem", "found"),
+    [("", "", []), ("4.0.0", "", [Severity.OK]), ("4.0.0", "no NVIDIA driver is installed", [Severity.NOTE])],
+)
+def test_a_gpu_is_looked_for_where_its_packages_are(
+    monkeypatch: pytest.MonkeyPatch, version: str, problem: str, found: list[Severity]
+) -> None:
+    """Without MuJoCo Warp nothing is said; without a GPU, why --engine warp is refused."""
+    monkeypatch.setattr(machine, "_version", lambda name: version)
+    monkeypatch.setattr(gpu, "gpu_problem", lambda: problem)
+    findings = list(machine._gpu())
+    assert [finding.severity for finding in findings] == found
+    assert all(problem in finding.seen for finding in findings)
 
 
 def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[str]) -> None:

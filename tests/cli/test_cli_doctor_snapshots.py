@@ -196,6 +196,7 @@ def computer(monkeypatch: pytest.MonkeyPatch) -> Callable[[SetUp], None]:
             (os, "getloadavg", lambda: (0.5, 0.5, 0.5)),
             (os, "sched_getaffinity", lambda _: set(range(8))),
             (machine, "_version", lambda name: "1.2.3"),
+            (machine, "_gpu", lambda: ()),
             (machine, "_may_use_fifo", lambda: set_up.rights),
             (machine, "_user", lambda: "ada"),
             (machine, "_read", lambda path: files.get(path.rpartition("/")[2], "")),

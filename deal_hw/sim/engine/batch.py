@@ -2,37 +2,49 @@
 
 States are tangent coordinates (see the module of this name), (N, C): for a floating base its position,
 rotation vector and then the joints, for a fixed base the joints alone. Velocities are MuJoCo's, in the same
-order. Joint positions are as the robot reports them: each member's encoder bias is added to outputs and
-subtracted from inputs.
+order. Joint positions and speeds are as the robot reports them: with each member's encoder bias and scale.
 """
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from mujoco.batch import Batch
 
-from deal_hw.errors import CalibrationError, short
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.effort import TORQUE, EffortSensors, effort_joints
+from deal_hw.sim.engine.engines import EngineName, State, make_engine
+from deal_hw.sim.engine.model import RobotModel, drop_filters
+from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
-from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
-from deal_hw.sim.parameters.fields import BatchFields
+from deal_hw.sim.laws.commands import NEUTRAL, CommandLaws, Filters
+from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters, present
+from deal_hw.sim.parameters.values import KindValues, spread, values_by_kind
 from deal_hw.types import FloatArray
 
 ENCODER_BIAS = "encoder_bias"
-"""Kind of parameter without a MuJoCo field: reported minus true joint position."""
+"""Kind of parameter without a MuJoCo field: reported joint position at a true one of 0."""
+
+ENCODER_SCALE = "encoder_scale"
+"""Kind of parameter without a MuJoCo field: reported over true change of a joint position."""
 
 COMMAND_DELAY = "command_delay"
 """Kind of parameter without a MuJoCo field: delay of an actuator's commands, in addition to the latency."""
 
-SERVO_PLAY = "servo_play"
-"""Kind of parameter without a MuJoCo field: width of the gear play between an actuator and its joint."""
+COMMAND_KINDS = {
+    "command_dead_zone": "dead_zone",
+    "command_asymmetry": "asymmetry",
+    "command_saturation": "saturation",
+    "command_lag": "lag_s",
+    "servo_play": "play",
+}
+"""Kinds of parameters that are laws of commands, and their fields in `CommandLaws`."""
 
 SIZES_KEPT = 6
 """Number of simulator sizes that are kept: one iteration of a search or refinement needs up to four."""
@@ -53,6 +65,26 @@ def default_threads() -> int:
     return len(os.sched_getaffinity(0))
 
 
+def command_laws(
+    values: KindValues, actuators: Sequence[str], count: int, filters: Filters | None = None
+) -> CommandLaws:
+    """Return what the drives of N members make of their commands.
+
+    Args:
+        values: Values by kind.
+        actuators: Names of the actuators, A of them.
+        count: Members N.
+        filters: Filters of the MJCF; a parameter sets their time constants.
+    """
+    laws = {law: spread(values, kind, actuators, NEUTRAL[law], count) for kind, law in COMMAND_KINDS.items()}
+    if filters is not None:
+        own = np.repeat(filters.lag_s[None], count, axis=0)
+        searched = {name for name, _ in values.get("command_lag", ())}
+        given = np.array([name in searched for name in actuators])
+        laws["lag_s"] = own if laws["lag_s"] is None else np.where(given, laws["lag_s"], own)
+    return CommandLaws(**laws, filters=filters)
+
+
 @dataclass(slots=True)
 class StepCount:
     """Number of simulated physics steps, which several simulators may share."""
@@ -69,9 +101,13 @@ class ServoBatch:
         count: Members N.
         threads: Threads; None for all CPUs.
         counted: Counts the physics steps; None for a count of its own.
+        engine: What simulates.
 
     Attributes:
-        play: Width of the play before each joint, (N, A) [rad or m]; None if no parameter is a play.
+        commands: What the drives make of commands; set-points given to :meth:`advance` have passed it.
+        effort_joints: Columns of the joints whose effort the parameters describe, (E,).
+        effort: Efforts of these joints at the samples of the last :meth:`advance`, as the robot would report
+            them, (N, S // every, E).
     """
 
     def __init__(
@@ -81,19 +117,33 @@ class ServoBatch:
         count: int,
         threads: int | None = None,
         counted: StepCount | None = None,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.robot = robot
         self.space = space
+        self._here = present(space, robot.absent)
+        self.effort_joints = effort_joints(robot.description, space)
         self.count = count
-        self.batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())
-        self._fields = BatchFields(self.batch, robot.model)
-        self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self._warmstart, self._applied = self.batch.bind("qacc_warmstart"), self.batch.bind("qfrc_applied")
+        self._filters, model = robot.filters, robot.model
+        if self._filters is not None:
+            # Windows begin with positions and velocities: the filters' states follow from the commands.
+            model = copy.copy(model)
+            drop_filters(model)
+        self.engine = make_engine(engine, model, robot.model, count, threads or default_threads())
+        self.batch = self.engine.batch
+        self._fields = self.engine.fields
+        bind = self.engine.bind
+        self._qpos, self._qvel = bind("qpos"), bind("qvel")
+        self._warmstart, self._applied = bind("qacc_warmstart"), bind("qfrc_applied")
         self._nominal = np.array([p.nominal for p in space.parameters])
         self._dof = list(robot.qvel)
         if robot.base is not None:
             self._dof = [*range(robot.base[1], robot.base[1] + 6), *self._dof]
         description = robot.description
+        self._per_ctrl = robot.command_scale
+        self._scaled = bool(np.any(self._per_ctrl != 1.0))
+        self._ratio = np.array([1.0 if drive is None else drive.ratio for drive in robot.drives])
+        self._gear = robot.model.actuator_gear[list(robot.actuator), 0]
         self._default = {
             "servo_stiffness": np.array(description.stiffness),
             "servo_damping": np.array(description.damping),
@@ -101,6 +151,8 @@ class ServoBatch:
             "servo_speed_limit": np.array(description.speed_limit),
         }
         self._counted = counted or StepCount()
+        self._steps: StepLaws | None = None
+        self.effort = np.zeros((count, 0, len(self.effort_joints)))
         self.set_parameters(np.repeat(space.nominal[None], count, axis=0))
 
     def set_parameters(self, theta: FloatArray, where: npt.NDArray[np.intp] | None = None) -> None:
@@ -111,31 +163,27 @@ class ServoBatch:
             where: Indices of the members whose derived constants change; None for all.
         """
         self._theta = np.array(theta, dtype=float)
-        apply_parameters(self._fields, self.space, self._theta)
-        self.batch.set_const(ids=where)
-        columns = {name: self._theta[:, k] for k, name in enumerate(self.space.names)}
-        description = self.robot.description
-        self._acting = {
-            kind: np.repeat(self._default[kind][None], self.count, axis=0) for kind in SERVO_KINDS
-        }
-        self._bias = np.zeros((self.count, len(description.joint_names)))
-        self._delay_s: FloatArray | None = None
-        self.play: FloatArray | None = None
-        for p in self.space.parameters:
-            values = columns.get(p.name, np.full(self.count, p.nominal))
-            for name in p.elements:
-                if p.kind in SERVO_KINDS:
-                    self._acting[p.kind][:, self.robot.actuator_names.index(name)] = values
-                elif p.kind == ENCODER_BIAS:
-                    self._bias[:, description.joint_names.index(name)] = values
-                elif p.kind == COMMAND_DELAY:
-                    if self._delay_s is None:
-                        self._delay_s = np.zeros((self.count, len(self.robot.actuator_names)))
-                    self._delay_s[:, self.robot.actuator_names.index(name)] = values
-                elif p.kind == SERVO_PLAY:
-                    if self.play is None:
-                        self.play = np.zeros((self.count, len(self.robot.actuator_names)))
-                    self.play[:, self.robot.actuator_names.index(name)] = values
+        if self._steps is not None:
+            self._steps.restore()
+        apply_parameters(self._fields, self._here, self._theta)
+        self.engine.set_const(where)
+        values, count = values_by_kind(self._here, self._theta), self.count
+        joints, actuators = self.robot.description.joint_names, self.robot.actuator_names
+        self._acting = {kind: np.repeat(self._default[kind][None], count, axis=0) for kind in SERVO_KINDS}
+        for kind in SERVO_KINDS:
+            for name, value in values.get(kind, ()):
+                self._acting[kind][:, actuators.index(name)] = value
+        bias = spread(values, ENCODER_BIAS, joints, 0.0, count)
+        self._bias = np.zeros((count, len(joints))) if bias is None else bias
+        self._scale = spread(values, ENCODER_SCALE, joints, 1.0, count)
+        self._delay_s = spread(values, COMMAND_DELAY, actuators, 0.0, count)
+        self.commands = command_laws(values, actuators, count, self._filters)
+        self._steps = StepLaws.of(self._fields, self.engine.bind, values)
+        self._efforts: EffortSensors | None = None
+        if self.effort_joints:
+            names = [joints[j] for j in self.effort_joints]
+            dofs = [self.robot.qvel[j] for j in self.effort_joints]
+            self._efforts = EffortSensors(names, dofs, values, count)
         self._biased = bool(np.any(self._bias))
         self.set_sent(
             self._default["servo_stiffness"],
@@ -153,8 +201,16 @@ class ServoBatch:
 
     @property
     def bias(self) -> FloatArray:
-        """Each member's encoder biases, (N, J): reported minus true joint positions."""
+        """Each member's encoder biases, (N, J): reported joint positions at true ones of 0."""
         return self._bias
+
+    def true_joints(self, position: FloatArray) -> FloatArray:
+        """Return the true joint positions of reported ones, (N, J)."""
+        return self._true(position, slice(None))
+
+    def _true(self, position: FloatArray, rows: npt.NDArray[np.intp] | slice) -> FloatArray:
+        true = position - self._bias[rows] if self._biased else position
+        return true if self._scale is None else true / self._scale[rows]
 
     def lag_s(self, latency_s: FloatArray) -> FloatArray:
         """Return the delay of commands: the latency, plus each actuator's command delay.
@@ -178,17 +234,28 @@ class ServoBatch:
         """Set the gains and limits that the host sends from now on, (A,) each; without effect on motors."""
         if self.robot.description.actuation != "position":
             return
+        if self._steps is not None:
+            self._steps.restore_limits()
         gain, bias = self._fields.get("actuator_gainprm"), self._fields.get("actuator_biasprm")
         force = self._fields.get("actuator_forcerange")
         kp, kd = self._act("servo_stiffness", stiffness), self._act("servo_damping", damping)
+        if self._scale is not None:
+            # The servo's error and speed are those of the reading.
+            scale = self._scale[:, list(self.robot.description.actuated_index)]
+            kp, kd = kp * scale, kd * scale
         limit = self._act("servo_effort_limit", effort_limit)
         actuator = np.array(self.robot.actuator)
-        gain[:, actuator, 0] = kp
+        # The model's numbers are those before the gear, and a scaled set-point stays scaled.
+        kp, kd = kp / self._gear**2, kd / self._gear**2
+        gain[:, actuator, 0] = kp * self._ratio
         bias[:, actuator, 1] = -kp
         bias[:, actuator, 2] = -kd
         limited = np.isfinite(limit).all(axis=0)
+        limit = limit / np.abs(self._gear)
         force[:, actuator[limited], 0] = -limit[:, limited]
         force[:, actuator[limited], 1] = limit[:, limited]
+        if self._steps is not None:
+            self._steps.read_limits()
 
     def set_state(
         self,
@@ -207,13 +274,15 @@ class ServoBatch:
         """
         rows = np.arange(self.count)[where][:, None]
         joints = position[..., self.robot.joints]
-        self._qpos[rows, list(self.robot.qpos)] = joints - self._bias[rows[:, 0]] if self._biased else joints
+        self._qpos[rows, list(self.robot.qpos)] = self._true(joints, rows[:, 0])
         if self.robot.base is not None:
             at = self.robot.base[0]
             self._qpos[rows, [at, at + 1, at + 2]] = position[..., :3]
             orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
             self._qpos[rows, [at + 3, at + 4, at + 5, at + 6]] = orientation
         self._qvel[rows, self._dof] = velocity
+        if self._scale is not None:
+            self._qvel[rows, list(self.robot.qvel)] /= self._scale[rows[:, 0]]
         # A warm start from another episode would make results depend on history in the last digits.
         self._warmstart[rows[:, 0]] = 0.0
 
@@ -225,11 +294,21 @@ class ServoBatch:
     @property
     def velocity(self) -> FloatArray:
         """Present velocities, (N, C)."""
-        return np.asarray(self._qvel[:, self._dof])
+        return self._reported_speed(np.asarray(self._qvel[:, self._dof]))
+
+    def _reported_speed(self, velocity: FloatArray) -> FloatArray:
+        """Return velocities, (N, ..., C), as the encoders report them."""
+        if self._scale is None:
+            return velocity
+        factor = np.ones((self.count, *(1,) * (velocity.ndim - 2), velocity.shape[-1]))
+        factor[..., self.robot.joints] = self._scale.reshape(self.count, *(1,) * (velocity.ndim - 2), -1)
+        return velocity * factor
 
     def _tangent_coordinates(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
         """Return qpos, (N, ..., nq), as reported tangent coordinates, (N, ..., C)."""
         joints = qpos[..., list(self.robot.qpos)]
+        if self._scale is not None:
+            joints = joints * self._scale.reshape(self.count, *(1,) * (qpos.ndim - 2), -1)
         if self._biased:
             joints = joints + self._bias.reshape(self.count, *(1,) * (qpos.ndim - 2), -1)
         if self.robot.base is None:
@@ -257,49 +336,105 @@ class ServoBatch:
             Positions and velocities after steps every, 2 every, ..., (N, S // every, C) each. A member that
             diverged (MuJoCo's warning counters increased) is NaN.
         """
-        if self._biased and self.robot.description.actuation == "position":
-            # The servo compares the set-point with the biased reading.
-            setpoint = setpoint - self._bias[:, None, list(self.robot.description.actuated_index)]
-        count, steps, _ = setpoint.shape
-        nu = self.robot.model.nu
-        if nu != setpoint.shape[2] or list(self.robot.actuator) != list(range(nu)):
-            control = np.zeros((count, steps, nu))
-            control[:, :, list(self.robot.actuator)] = setpoint
-        else:
-            control = setpoint
-        spec = mujoco.mjtState.mjSTATE_CTRL
-        if force is not None:
-            applied = np.zeros((count, steps, self.robot.model.nv))
-            applied[:, :, self._dof] = force
-            control = np.concatenate([control, applied], axis=2)
-            spec |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
-        before = self._warnings()
-        self._counted.steps += count * steps
-        if not every:
-            # Stepping by rollout with a record of one field costs no more than bare stepping.
-            every = steps
+        pushed = None if force is None else force[:, None]
+        position, velocity = self._roll(setpoint[:, None], every, reference, pushed, None)
+        if self._efforts is not None:
+            self.effort = self.effort[:, 0]
+        return position[:, 0], velocity[:, 0]
+
+    def advance_windows(
+        self,
+        start: State,
+        setpoint: FloatArray,
+        every: int,
+        start_reference: FloatArray | None = None,
+        reference: FloatArray | None = None,
+        force: FloatArray | None = None,
+    ) -> State:
+        """Simulate G windows with all members, from start states of their own.
+
+        Args:
+            start: Tangent coordinates and velocities, (N, G, C) each.
+            setpoint: Set-point (or motor command) in force at each step, (N, G, S, A).
+            every: Record each ``every``-th step.
+            start_reference: Reference orientations of the starts, (G, 4); the identity by default.
+            reference: Those at the recorded steps, (G, S // every, 4).
+            force: Forces on the coordinates, (N, G, S, C); none by default.
+
+        Returns:
+            Positions and velocities as :meth:`advance`, (N, G, S // every, C) each.
+        """
+        position, velocity = start
+        count, windows = position.shape[:2]
+        qpos = np.empty((count, windows, self._qpos.shape[1]))
+        qvel = np.empty((count, windows, self._qvel.shape[1]))
+        for g in range(windows):
+            own = None if start_reference is None else start_reference[g]
+            self.set_state(position[:, g], velocity[:, g], reference=own)
+            qpos[:, g], qvel[:, g] = self._qpos, self._qvel
+        return self._roll(setpoint, every, reference, force, (qpos, qvel))
+
+    def _roll(
+        self,
+        setpoint: FloatArray,
+        every: int,
+        reference: FloatArray | None,
+        force: FloatArray | None,
+        start: State | None,
+    ) -> State:
+        """Return positions and velocities in windows, (N, G, S // every, C), and keep the efforts there."""
+        control, spec = self._control(setpoint, force)
+        count, windows, steps = control.shape[:3]
+        self._counted.steps += count * windows * steps
+        every = every or steps
+        recorded = {name: 1 if name == TORQUE else every for name in self.recorded}
         try:
-            record = self.batch.rollout(
-                steps, control=control, control_spec=int(spec), record=("qpos", "qvel")
-            )
-        except mujoco.FatalError as err:
-            raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
+            record, bad = self.engine.rollout(control, spec, recorded, self._steps, start)
         finally:
             if force is not None:
                 # Otherwise the engine would keep the last forces.
                 self._applied[:] = 0.0
-        position = self._tangent_coordinates(record["qpos"][:, every - 1 :: every], reference)
-        velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
-        bad = self._warnings() > before
+        position = self._tangent_coordinates(record["qpos"], reference)
+        velocity = self._reported_speed(record["qvel"][..., self._dof])
         if bad.any():
             position, velocity = position.copy(), velocity.copy()
             position[bad], velocity[bad] = np.nan, np.nan
+        if self._efforts is not None:
+            torque, step_s = record[TORQUE], self.robot.step_s
+            report = [self._efforts.report(torque[:, g], every, step_s) for g in range(windows)]
+            self.effort = np.stack(report, axis=1)
+            self.effort[bad] = np.nan
         return position, velocity
 
-    def _warnings(self) -> npt.NDArray[np.int64]:
-        # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): an increase is a divergence, after which
-        # MuJoCo resets the state.
-        return np.asarray(self.batch.warning[..., 1].sum(axis=-1), dtype=np.int64)
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Fields of MjData that a rollout records."""
+        return ("qpos", "qvel") if self._efforts is None else ("qpos", "qvel", TORQUE)
+
+    def _control(self, setpoint: FloatArray, force: FloatArray | None) -> tuple[FloatArray, int]:
+        """Return what the engine sets at each step, (N, G, S, U), and the components of the state it is."""
+        if self.robot.description.actuation == "position":
+            # The servo compares the set-point with the reading.
+            actuated = list(self.robot.description.actuated_index)
+            if self._biased:
+                setpoint = setpoint - self._bias[:, None, None, actuated]
+            if self._scale is not None:
+                setpoint = setpoint / self._scale[:, None, None, actuated]
+            if self._scaled:
+                setpoint = setpoint / self._per_ctrl
+        nu = self.robot.model.nu
+        if nu != setpoint.shape[-1] or list(self.robot.actuator) != list(range(nu)):
+            control = np.zeros((*setpoint.shape[:-1], nu))
+            control[..., list(self.robot.actuator)] = setpoint
+        else:
+            control = setpoint
+        spec = mujoco.mjtState.mjSTATE_CTRL
+        if force is not None:
+            applied = np.zeros((*setpoint.shape[:-1], self.robot.model.nv))
+            applied[..., self._dof] = force
+            control = np.concatenate([control, applied], axis=-1)
+            spec |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
+        return control, int(spec)
 
 
 class BatchPool:
@@ -326,35 +461,47 @@ class BatchPool:
     ) -> None:
         self._robot, self._space, self._most = robot, space, most
         self._threads = threads or default_threads()
-        self._kept: dict[tuple[int, int], list[ServoBatch]] = {}
+        self._kept: dict[tuple[int, int, str, EngineName], list[ServoBatch]] = {}
+        self._most *= 1 + len(robot.setups)
         self.counted = counted or StepCount()
 
     def __len__(self) -> int:
         return len(self._kept)
+
+    def __reduce__(self) -> tuple[type[BatchPool], tuple[RobotModel, ParameterSpace, int]]:
+        """Pickle without the simulators, which cannot be, and with a count of steps of its own."""
+        return BatchPool, (self._robot, self._space, self._threads)
 
     @property
     def steps(self) -> int:
         """Physics steps of all simulators so far, including dropped ones and those with the same count."""
         return self.counted.steps
 
-    def get(self, count: int) -> ServoBatch:
-        """Return the simulator of ``count`` members; parameters and state are those of its last user."""
-        return self._take(count, 1)[0]
+    def get(self, count: int, setup: str = "", engine: EngineName = "mujoco") -> ServoBatch:
+        """Return the simulator of ``count`` members in a set-up, with parameters and state of its last user.
 
-    def parts(self, count: int) -> list[ServoBatch]:
+        Args:
+            count: Members.
+            setup: Name of the set-up; "" for the model itself.
+            engine: What simulates.
+        """
+        return self._take(count, 1, setup, engine)[0]
+
+    def parts(self, count: int, setup: str = "") -> list[ServoBatch]:
         """Return simulators with ``count`` members in all: one of one thread for each thread.
 
+        Arguments are those of :meth:`get`.
         So the work between two steps of a closed loop is divided among the threads, too. The result does not
         depend on their number.
         """
-        return self._take(count, min(self._threads, count))
+        return self._take(count, min(self._threads, count), setup, "mujoco")
 
-    def _take(self, count: int, parts: int) -> list[ServoBatch]:
-        key = count, parts
+    def _take(self, count: int, parts: int, setup: str, engine: EngineName) -> list[ServoBatch]:
+        key, robot = (count, parts, setup, engine), self._robot.in_setup(setup)
         sizes = [count // parts + (i < count % parts) for i in range(parts)]
         threads = max(self._threads // parts, 1)
         kept = self._kept.pop(key, None) or [
-            ServoBatch(self._robot, self._space, n, threads, self.counted) for n in sizes
+            ServoBatch(robot, self._space, n, threads, self.counted, engine) for n in sizes
         ]
         # Last in order is last used.
         self._kept[key] = kept

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.servo import delay, play, slew
+from deal_hw.sim.laws.setpoints import delay, slew
 from deal_hw.types import FloatArray
 
 
@@ -20,7 +20,7 @@ class ClosedLoop:
     """The path from the targets that a host sends to the states of N members.
 
     Args:
-        batch: The members; their command delays and plays apply.
+        batch: The members; their command delays and laws apply.
         steps: Device periods in a control period.
         step_s: Length of a device period [s]; the physics step by default.
         whole: Round latencies to device periods, as a device does; otherwise set-points are interpolated.
@@ -33,7 +33,7 @@ class ClosedLoop:
         self.step_s = batch.robot.step_s if step_s is None else step_s
         self._lag = np.zeros((batch.count, 1))
         self._path = np.zeros((batch.count, 1, len(batch.robot.description.actuated)))
-        self._driven = self._path[:, 0].copy()
+        self._memory = batch.commands.memory(self._path[:, 0])
 
     def restart(
         self,
@@ -58,7 +58,10 @@ class ClosedLoop:
         if missing > 0:
             self._path = np.concatenate([np.repeat(self._path[:, :1], missing, axis=1), self._path], axis=1)
         self._path[where] = setpoint[:, None]
-        self._driven[where] = setpoint
+        if self.batch.commands.any:
+            held = self._path[:, 0].copy()
+            held[where] = setpoint
+            self._memory[where] = self.batch.commands.memory(held)[where]
 
     def advance(
         self, target: FloatArray, rate: FloatArray | None = None, every: int = 0
@@ -80,9 +83,8 @@ class ClosedLoop:
         path = np.concatenate([self._path, ahead], axis=1)
         self._path = path[:, self.steps :]
         late = delay(path, self._lag, path[:, 0])[:, -self.steps :]
-        if self.batch.play is not None:
-            late = play(self._driven, late, self.batch.play)
-            self._driven = late[:, -1]
+        if self.batch.commands.any:
+            late, self._memory = self.batch.commands.act(late, self._memory, self.step_s)
         control = on_physics_steps(self.batch, late, self.step_s)
         return self.batch.advance(control, round(every * self.step_s / self.batch.robot.step_s))
 

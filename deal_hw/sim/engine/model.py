@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -14,7 +15,9 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.compiling import load_mjcf
-from deal_hw.sim.parameters import apply_parameters
+from deal_hw.sim.laws.commands import Filters
+from deal_hw.sim.parameters import apply_parameters, present
+from deal_hw.sim.parameters.drive import JointDrive, filtered, find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
@@ -34,6 +37,8 @@ class RobotModel:
         qvel: Index into qvel of each joint, (J,).
         actuator: Index of the actuator that drives each actuated joint, (A,).
         base: Where the floating base's entries begin in qpos and qvel; None for a fixed base.
+        setups: The robot in other set-ups, such as with a payload, by their names.
+        absent: Type and name of elements that other set-ups have, and this model lacks.
     """
 
     description: RobotDescription
@@ -42,12 +47,35 @@ class RobotModel:
     qvel: tuple[int, ...]
     actuator: tuple[int, ...]
     base: tuple[int, int] | None = None
+    setups: Mapping[str, RobotModel] = field(default_factory=dict)
+    absent: frozenset[tuple[str, str]] = frozenset()
+
+    def in_setup(self, name: str) -> RobotModel:
+        """Return the robot in a set-up; "" is the model itself."""
+        return self.setups[name] if name else self
 
     @property
     def actuator_names(self) -> tuple[str, ...]:
         """Names of the actuators in the order of the actuated joints, (A,)."""
         names = element_names(self.model, "actuator")
         return tuple(names[i] for i in self.actuator)
+
+    @property
+    def drives(self) -> tuple[JointDrive | None, ...]:
+        """What each of these actuators does, (A,); None for one that is none of the known drives."""
+        return tuple(find_drive(self.model, i) for i in self.actuator)
+
+    @property
+    def filters(self) -> Filters | None:
+        """The filters of the actuators' commands, in the commands' units; None without any."""
+        if not any(filtered(self.model, i) for i in self.actuator):
+            return None
+        return filters_of(self.model, self.actuator, self.command_scale)
+
+    @property
+    def command_scale(self) -> FloatArray:
+        """A command of each actuator, set-point of the joint or ``ctrl`` of a motor, over ``ctrl``, (A,)."""
+        return command_scale(self.model, self.actuator)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -131,17 +159,54 @@ def actuator_of(model: mujoco.MjModel, joint: str) -> int:
     )
 
 
+def command_scale(model: mujoco.MjModel, actuators: Sequence[int]) -> FloatArray:
+    """Return what one unit of ``ctrl`` of servos is as set-point of their joints, (A,); 1 for others."""
+    drives = [find_drive(model, i) for i in actuators]
+    return np.array([d.scale if d is not None and d.takes == "position" else 1.0 for d in drives])
+
+
+def filters_of(model: mujoco.MjModel, actuators: Sequence[int], scale: FloatArray) -> Filters:
+    """Return the filters of actuators as laws of commands.
+
+    Args:
+        model: The model as in its file.
+        actuators: The actuators, A of them.
+        scale: From :func:`command_scale`.
+    """
+    rows = list(actuators)
+    on = np.array([filtered(model, i) for i in rows])
+    limited = on & np.array(model.actuator_ctrllimited[rows], dtype=bool)
+    ends = np.sort(model.actuator_ctrlrange[rows] * scale[:, None], axis=1)
+    return Filters(
+        lag_s=np.where(on, np.maximum(model.actuator_dynprm[rows, 0], 0.0), 0.0),
+        euler=model.actuator_dyntype[rows] == int(mujoco.mjtDyn.mjDYN_FILTER),
+        late=on & ~np.array(model.actuator_actearly[rows], dtype=bool),
+        low=np.where(limited, ends[:, 0], -np.inf),
+        high=np.where(limited, ends[:, 1], np.inf),
+    )
+
+
+def drop_filters(model: mujoco.MjModel) -> None:
+    """Remove the filters of a model's actuators, for an engine whose commands pass laws before."""
+    for actuator in range(model.nu):
+        if filtered(model, actuator):
+            model.actuator_dyntype[actuator] = int(mujoco.mjtDyn.mjDYN_NONE)
+            model.actuator_actadr[actuator], model.actuator_actnum[actuator] = -1, 0
+
+
 def at_step(robot: RobotModel, step_s: float) -> RobotModel:
     """Return the robot with another physics step [s]."""
     model = copy.copy(robot.model)
     model.opt.timestep = step_s
-    return dataclasses.replace(robot, model=model)
+    setups = {name: at_step(setup, step_s) for name, setup in robot.setups.items()}
+    return dataclasses.replace(robot, model=model, setups=setups)
 
 
 def model_with(robot: RobotModel, space: ParameterSpace, theta: FloatArray) -> mujoco.MjModel:
     """Return a copy of the model with the parameters set, (K,)."""
     model = copy.copy(robot.model)
-    apply_parameters(ModelFields(model, robot.model), space, np.asarray(theta, dtype=float)[None])
+    here = present(space, robot.absent)
+    apply_parameters(ModelFields(model, robot.model), here, np.asarray(theta, dtype=float)[None])
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 

@@ -6,18 +6,24 @@ over windows of some ticks do not. All members of a population predict all windo
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.servo import delay, play, slew
+from deal_hw.sim.laws.setpoints import delay, slew
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
 SENT_MARGIN_S = 0.05
 """Least time between a window and a change of gains or limits before it [s]."""
+
+
+Sent: TypeAlias = tuple[bytes, bytes, bytes]
+"""Gains and limits that a host sends, to compare."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +94,7 @@ def setpoints(
     """Return each member's set-point over the whole episode, (N, S, A).
 
     Args:
-        batch: The members; their speed limits, command delays and plays apply.
+        batch: The members; their speed limits, command delays and laws apply.
         episode: The episode.
         latency_s: Total latency of each member, (N,) [s].
         target: Targets of each member, (N, S, A); the episode's by default.
@@ -96,7 +102,8 @@ def setpoints(
     if batch.robot.description.actuation == "motor":
         # Efforts are not slewed; before the first one the motors are off.
         efforts = np.repeat(episode.target[None], batch.count, axis=0) if target is None else target
-        return delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
+        late = delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
+        return _acting(batch, late, np.zeros_like(efforts[:, 0]), episode.step_s)
     factors = batch.servo_factor("servo_speed_limit")
     if target is None:
         # Members with the same limit have the same set-point; most spaces have one limit for all.
@@ -108,7 +115,13 @@ def setpoints(
     path = slew(np.repeat(episode.start_setpoint[None], len(factors), axis=0), target, rate)
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
     path = delay(path[member.ravel()], batch.lag_s(latency_s) / episode.step_s, start)
-    return path if batch.play is None else play(start, path, batch.play)
+    return _acting(batch, path, start, episode.step_s)
+
+
+def _acting(batch: ServoBatch, path: FloatArray, start: FloatArray, step_s: float) -> FloatArray:
+    """Return what the drives make of commands, (N, S, A), after they have held ``start`` for long."""
+    laws = batch.commands
+    return laws.act(path, laws.memory(start), step_s)[0] if laws.any else path
 
 
 def predict_windows(
@@ -119,6 +132,7 @@ def predict_windows(
     velocity: FloatArray,
     setpoint: FloatArray,
     force: FloatArray | None = None,
+    effort: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Predict all windows with all members.
 
@@ -130,11 +144,14 @@ def predict_windows(
         velocity: Velocities at the windows' starts, (W, C) or (N, W, C).
         setpoint: Set-points of the whole episode, (N, S, A), from :func:`setpoints`.
         force: Forces on the coordinates at the device periods of each window, (N, W, H * stride, C).
+        effort: Filled with the efforts that the robot would report at these samples, (N, W, H, E).
 
     Returns:
         Positions and velocities at the samples after each start, (N, W, H, C) each, around each sample's
         reference orientation; NaN where a member diverged.
     """
+    if batch.engine.windows > 1:
+        return _predict_at_once(batch, episode, windows, position, velocity, setpoint, force, effort)
     N, W, H = batch.count, len(windows), windows.length
     C = episode.position.shape[1]
     x = np.broadcast_to(position, (N, W, C))
@@ -144,14 +161,10 @@ def predict_windows(
     steps = H * windows.stride
     per_step = episode.step_s / batch.robot.step_s
     repeat = round(per_step)
-    sent: tuple[bytes, bytes, bytes] | None = None
+    sent: Sent | None = None
     for w, start in enumerate(windows.start):
         at = int(episode.sample[start])
-        now = (
-            episode.stiffness[at].tobytes(),
-            episode.damping[at].tobytes(),
-            episode.effort_limit[at].tobytes(),
-        )
+        now = _sent(episode, at)
         if now != sent:
             batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
             sent = now
@@ -163,4 +176,56 @@ def predict_windows(
             pushed = None if pushed is None else np.repeat(pushed, repeat, axis=1)
         charts = None if reference is None else reference[start + 1 : start + 1 + H]
         out_x[:, w], out_v[:, w] = batch.advance(control, windows.stride * repeat, charts, pushed)
+        if effort is not None:
+            effort[:, w] = batch.effort
     return out_x, out_v
+
+
+def _sent(episode: SampledEpisode, at: int) -> Sent:
+    """Return the gains and limits in force at a device period."""
+    return episode.stiffness[at].tobytes(), episode.damping[at].tobytes(), episode.effort_limit[at].tobytes()
+
+
+def _predict_at_once(
+    batch: ServoBatch,
+    episode: SampledEpisode,
+    windows: Windows,
+    position: FloatArray,
+    velocity: FloatArray,
+    setpoint: FloatArray,
+    force: FloatArray | None,
+    effort: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict as :func:`predict_windows`, as many windows at once as the engine takes."""
+    N, W, H = batch.count, len(windows), windows.length
+    C = episode.position.shape[1]
+    x, v = np.broadcast_to(position, (N, W, C)), np.broadcast_to(velocity, (N, W, C))
+    out_x, out_v = np.empty((N, W, H, C)), np.empty((N, W, H, C))
+    first = episode.sample[windows.start]
+    period = first[:, None] + np.arange(H * windows.stride)
+    repeat = round(episode.step_s / batch.robot.step_s)
+    for rows in _groups([_sent(episode, int(at)) for at in first], batch.engine.windows):
+        at, starts = int(first[rows[0]]), windows.start[rows]
+        batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
+        pushed = None if force is None else np.repeat(force[:, rows], repeat, axis=2)
+        reference = episode.reference
+        out_x[:, rows], out_v[:, rows] = batch.advance_windows(
+            (x[:, rows], v[:, rows]),
+            np.repeat(setpoint[:, period[rows]], repeat, axis=2),
+            windows.stride * repeat,
+            None if reference is None else reference[starts],
+            None if reference is None else reference[starts[:, None] + 1 + np.arange(H)],
+            pushed,
+        )
+        if effort is not None:
+            effort[:, rows] = batch.effort
+    return out_x, out_v
+
+
+def _groups(sent: Sequence[Sent], most: int) -> Iterator[IntArray]:
+    """Yield windows with equal gains and limits, at most so many at once, in equal parts."""
+    values: dict[Sent, list[int]] = {}
+    for window, value in enumerate(sent):
+        values.setdefault(value, []).append(window)
+    for rows in values.values():
+        yield from np.array_split(np.array(rows), -(-len(rows) // most))

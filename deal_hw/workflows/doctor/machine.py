@@ -37,6 +37,7 @@ def examine_machine(packages: Sequence[tuple[str, str]] = PACKAGES) -> Iterator[
     """Yield the findings; ``packages`` are distributions and the extras that install them."""
     yield _system()
     yield from _packages(packages)
+    yield from _gpu()
     yield _scheduling()
     yield _memory()
     yield from _clock()
@@ -58,6 +59,20 @@ def _packages(packages: Sequence[tuple[str, str]]) -> Iterator[Finding]:
         else:
             hint = f"if this computer needs it: {install_line(extra)}"
             yield Finding("packages", Severity.NOTE, f"{name} is not installed", hint)
+
+
+def _gpu() -> Iterator[Finding]:
+    """Yield whether `calibrate --engine warp` has a GPU, where its packages are installed."""
+    if not _version("mujoco-warp"):
+        return
+    from deal_hw.sim.engine.gpu import gpu_problem
+
+    problem = gpu_problem()
+    if problem:
+        hint = "look at `nvidia-smi`; `--engine mujoco` needs no GPU"
+        yield Finding("gpu", Severity.NOTE, f"{problem}: `calibrate --engine warp` cannot run", hint)
+    else:
+        yield Finding("gpu", Severity.OK, "the NVIDIA driver reports a GPU for `calibrate --engine warp`")
 
 
 def _version(name: str) -> str:

@@ -1,0 +1,204 @@
+"""Laws of joints that act between the engine's steps: friction by speed and load, effort by speed.
+
+Before each step friction and effort limits are written into the model's fields, from the speeds at the
+beginning of the step and the torques during the step before. MuJoCo solves friction as a constraint, so a
+joint that friction holds stays at rest, with any step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from deal_hw.sim.laws.friction import FrictionLaw
+from deal_hw.sim.laws.motor import effort_range
+from deal_hw.sim.parameters.fields import Fields, element_id
+from deal_hw.sim.parameters.laws import FREE_SPEED, FRICTION_KINDS, STRIBECK_SPEED
+from deal_hw.sim.parameters.values import KindValues
+from deal_hw.types import FloatArray, IntArray
+
+LEAST_FRICTION = 1e-9
+"""Friction that is written at least [N·m or N]. MuJoCo has a row of friction only where it is above 0."""
+
+
+Outputs: TypeAlias = Callable[[str], FloatArray]
+"""Returns the live values of an MjData field of N simulations, (N, ...)."""
+
+
+class StepLaws:
+    """The laws of N simulations.
+
+    Args:
+        fields: Their model fields.
+        outputs: Their states and torques.
+        dof: Degrees of freedom with a friction law, D of them.
+        friction: Their law; its Coulomb part is that of the fields.
+        actuator: Actuators with a speed without load, B of them.
+        free_speed: These speeds, (N, B) [rad/s or m/s].
+    """
+
+    def __init__(
+        self,
+        fields: Fields,
+        outputs: Outputs,
+        dof: list[int],
+        friction: dict[str, FloatArray],
+        actuator: list[int],
+        free_speed: FloatArray,
+    ) -> None:
+        model = self._model = fields.model
+        driven = [int(model.jnt_dofadr[model.actuator_trnid[a, 0]]) for a in actuator]
+        self._dof, self._actuator, self._driven = _index(dof), _index(actuator), _index(driven)
+        self._free_speed = free_speed
+        # An actuator behind a negative gear turns the other way than its joint.
+        self._turns = np.sign(model.actuator_gear[actuator, 0])
+        self._friction: FrictionLaw | None = None
+        if dof:
+            self._loss = fields.get("dof_frictionloss")
+            self._friction = FrictionLaw(coulomb=self._loss[:, dof].copy(), **friction)
+        self._limited = bool(actuator)
+        if self._limited:
+            self._range = fields.get("actuator_forcerange")
+            self.read_limits()
+        self._qvel = outputs("qvel")
+        if self.loaded:
+            # Outputs that are bound are copied after every step.
+            self._bias, self._torque = outputs("qfrc_bias"), outputs("qfrc_actuator")
+
+    @classmethod
+    def of(cls, fields: Fields, outputs: Outputs, values: KindValues) -> StepLaws | None:
+        """Return the laws that values by kind set; None where they set none."""
+        model = fields.model
+        found: dict[int, dict[str, FloatArray]] = {}
+        for kind, coefficients in FRICTION_KINDS.items():
+            for joint, value in values.get(kind, ()):
+                dof = int(model.jnt_dofadr[element_id(model, "joint", joint)])
+                found.setdefault(dof, {}).update(dict.fromkeys(coefficients, value))
+        free = {element_id(model, "actuator", name): value for name, value in values.get(FREE_SPEED, ())}
+        if not found and not free:
+            return None
+        count = len(outputs("qvel"))
+        friction = {
+            name: _columns([law.get(name, np.full(count, neutral)) for law in found.values()], count)
+            for name, neutral in COEFFICIENTS.items()
+        }
+        return cls(fields, outputs, list(found), friction, list(free), _columns(list(free.values()), count))
+
+    @property
+    def friction(self) -> FrictionLaw | None:
+        """The law of friction; None without any."""
+        return self._friction
+
+    @property
+    def dof(self) -> IntArray:
+        """Degrees of freedom with a friction law, (D,)."""
+        return np.arange(self._model.nv)[self._dof]
+
+    @property
+    def limits(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray] | None:
+        """Actuators with a speed without load and their degrees of freedom, (B,) each; None without any.
+
+        Then the signs of their gears, (B,), efforts at standstill and speeds without load, (N, B) each.
+        """
+        if not self._limited:
+            return None
+        actuator, dof = np.arange(self._model.nu)[self._actuator], np.arange(self._model.nv)[self._driven]
+        return actuator, dof, self._turns, self._stall, self._free_speed
+
+    @property
+    def loaded(self) -> bool:
+        """Whether any friction depends on a load, so that the torques of the step before count."""
+        return self._friction is not None and self._friction.loaded
+
+    def restore(self) -> None:
+        """Write the model's own values where laws have written."""
+        if self._friction is not None:
+            self._loss[:, self._dof] = self._model.dof_frictionloss[self._dof]
+        if self._limited:
+            self._range[:, self._actuator] = self._model.actuator_forcerange[self._actuator]
+
+    def restore_limits(self) -> None:
+        """Write the effort limits at standstill where the law has written."""
+        if self._limited:
+            self._range[:, self._actuator, 0] = -self._stall
+            self._range[:, self._actuator, 1] = self._stall
+
+    def read_limits(self) -> None:
+        """Take the effort limits in the fields as those at standstill."""
+        if self._limited:
+            self._stall = self._range[:, self._actuator, 1].copy()
+
+    def write(self) -> None:
+        """Write friction and limits for the next step."""
+        if self._friction is not None:
+            dof, law = self._dof, self._friction
+            if law.loaded:
+                budget = law.budget(self._qvel[:, dof], self._torque[:, dof], -self._bias[:, dof])
+            else:
+                budget = law.budget(self._qvel[:, dof])
+            self._loss[:, dof] = np.maximum(budget, LEAST_FRICTION)
+        if self._limited:
+            low, high = effort_range(self._qvel[:, self._driven] * self._turns, self._stall, self._free_speed)
+            self._range[:, self._actuator, 0], self._range[:, self._actuator, 1] = low, high
+
+
+def rollout(
+    batch: Batch, laws: StepLaws, control: FloatArray, spec: int, recorded: Sequence[str]
+) -> dict[str, FloatArray]:
+    """Advance as ``Batch.rollout`` does, with laws before each step.
+
+    Args:
+        batch: The simulations.
+        laws: Their laws.
+        control: What acts at each step, (N, S, size of ``spec``).
+        spec: The state components that it sets.
+        recorded: MjData fields to return.
+
+    Returns:
+        These fields after each step, (N, S, ...) each.
+    """
+    count, steps, _ = control.shape
+    fields = {name: batch.bind(name) for name in recorded}
+    record = {name: np.empty((count, steps, *field.shape[1:])) for name, field in fields.items()}
+    ctrl, applied = batch.bind("ctrl"), batch.bind("qfrc_applied")
+    nu = ctrl.shape[1]
+    pushed = bool(spec & int(mujoco.mjtState.mjSTATE_QFRC_APPLIED))
+    # No step came before: torques are those of this state.
+    ctrl[:] = control[:, 0, :nu]
+    if laws.loaded:
+        batch.forward()
+    for step in range(steps):
+        laws.write()
+        ctrl[:] = control[:, step, :nu]
+        if pushed:
+            applied[:] = control[:, step, nu:]
+        batch.step()
+        for name, field in fields.items():
+            record[name][:, step] = field
+    return record
+
+
+def _index(numbers: list[int]) -> slice | list[int]:
+    """Return numbers as a slice where they follow each other: a view costs less than a copy in each step."""
+    if numbers and numbers == list(range(numbers[0], numbers[0] + len(numbers))):
+        return slice(numbers[0], numbers[0] + len(numbers))
+    return numbers
+
+
+def _columns(values: list[FloatArray], count: int) -> FloatArray:
+    return np.stack(values, axis=1) if values else np.zeros((count, 0))
+
+
+COEFFICIENTS = {
+    "stribeck": 0.0,
+    "stribeck_speed": STRIBECK_SPEED,
+    "motor": 0.0,
+    "external": 0.0,
+    "motor_stribeck": 0.0,
+    "external_stribeck": 0.0,
+}
+"""Coefficients of friction that parameters set, and their values where none does."""

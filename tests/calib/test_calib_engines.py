@@ -1,0 +1,85 @@
+"""Which engine simulates what of a calibration: populations of searches the chosen one, all else MuJoCo."""
+
+from __future__ import annotations
+
+import copy
+from importlib.util import find_spec
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import run_identity
+from deal_hw.calib.data.search import Search
+from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.search.deal import Deal
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.sim.engine import batch as simulators
+from deal_hw.sim.engine.batch import BatchPool
+from deal_hw.sim.engine.engines import Engine, EngineName, MujocoEngine
+
+BUDGET = Budget(population=8, generations=2)
+
+
+@pytest.fixture
+def brief(noisy_problem: Problem) -> Problem:
+    """A second of the noisy demonstration."""
+    episode = noisy_problem.episodes[0]
+    begun = np.arange(len(episode.sample)) < round(1.0 / episode.period_s)
+    return noisy_problem.part([begun])
+
+
+def on(problem: Problem, engine: EngineName) -> Problem:
+    """Return the problem with its populations on an engine."""
+    other = copy.copy(problem)
+    other.engine, other._batches = engine, BatchPool(problem.robot, problem.space, 1)
+    return other
+
+
+def searched(problem: Problem, search: Search) -> CalibrationResult:
+    """Search two generations."""
+    return search.run(problem, BUDGET, np.random.default_rng(0), None, None)
+
+
+@pytest.mark.parametrize("search", [Eki(), Deal()], ids=lambda search: search.name)
+def test_only_populations_are_on_the_chosen_engine(
+    noisy: Any, brief: Problem, monkeypatch: pytest.MonkeyPatch, search: Search
+) -> None:
+    """The search makes one simulator there, of its population; linearisation and refinement make none."""
+    made: list[tuple[str, int]] = []
+
+    def make(
+        name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
+    ) -> Engine:
+        made.append((name, count))
+        return MujocoEngine(model, nominal, count, threads)
+
+    monkeypatch.setattr(simulators, "make_engine", make)
+    problem = on(brief, "warp")
+    searched(problem, search)
+    assert [count for name, count in made if name == "warp"] == [BUDGET.population]
+    made.clear()
+    refine(problem, noisy.theta, noisy.latency_s, (0.1,))
+    assert made and all(name == "mujoco" for name, _ in made)
+
+
+def test_a_search_is_resumed_on_its_own_engine_only(noisy_problem: Problem) -> None:
+    """The engine is a part of the run's identity: another one rounds differently."""
+    other = on(noisy_problem, "warp")
+    rng = np.random.default_rng(0)
+    assert run_identity(noisy_problem, Eki(), BUDGET, rng) != run_identity(other, Eki(), BUDGET, rng)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo Warp is not installed (extra gpu)")
+@pytest.mark.parametrize("search", [Eki(), Deal()], ids=lambda search: search.name)
+def test_a_search_on_warp_ends_beside_that_on_mujoco(brief: Problem, search: Search) -> None:
+    """Two generations of eight from one seed: a critic's training enlarges the differences of rounding."""
+    found = [searched(on(brief, engine), search) for engine in ("mujoco", "warp-cpu")]
+    space = brief.space
+    first, second = (space.normalize(result.estimate) for result in found)
+    assert not np.array_equal(first, second)
+    np.testing.assert_allclose(second, first, atol=1e-3 if search.name == "eki" else 1e-2)
